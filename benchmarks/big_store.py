@@ -1,0 +1,126 @@
+"""A store of the paper's size without logs: its simulated map, and runs whose segments meander over it."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+from pyproj import Geod, Transformer
+
+from tcpipe import __version__
+from tcpipe.formats.map_files import open_map
+from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.pipeline.maps import add_map
+from tcpipe.recipe import Recipe
+from tcpipe.simulation.scenarios import scenario
+from tcpipe.simulation.site_files import write_rasters
+from tcpipe.store import Store
+from tcpipe.tables.columns import floats
+from tcpipe.tables.levels import (
+    DATA_MODEL_VERSION,
+    GATED_TRACK,
+    LABELLED_SEGMENTS,
+    REJECTIONS,
+    TRACK,
+    Datum,
+    GatedTrack,
+    LabelledSegments,
+    Track,
+    TrackInfo,
+)
+
+RUN_ROWS = 3_300
+MARGIN_M = 12.0
+
+
+def store_of(directory: Path, samples: int) -> Store:
+    """Return a store with so many segments, about all of which lie on the map; the map is made once in a directory (2 minutes)."""
+    maps = directory / "maps"
+    if not maps.exists():
+        spec = scenario("paper")
+        (directory / "rasters").mkdir(parents=True, exist_ok=True)
+        add_map("site", store=maps, **write_rasters(directory / "rasters", spec.world, spec.rasters))
+    store = Store(directory / f"store-{samples}")
+    if not store.root.exists():
+        (store.root / "maps").mkdir(parents=True)
+        store.map_path("site").symlink_to((maps / "maps" / "site.zarr").resolve())
+        for number in range(-(-samples // RUN_ROWS)):
+            _add_run(store, number, min(RUN_ROWS, samples - number * RUN_ROWS))
+    return store
+
+
+def meander(bounds_m: tuple[float, float, float, float], count: int, *, seed: int) -> np.ndarray:
+    """Return points 1 m apart along a wandering path that turns back at the edges, shape (count + 1, 2)."""
+    rng = np.random.default_rng(seed)
+    low, high = np.array(bounds_m[:2]) + MARGIN_M, np.array(bounds_m[2:]) - MARGIN_M
+    points = np.empty((count + 1, 2))
+    points[0], course = rng.uniform(low, high), rng.uniform(-np.pi, np.pi)
+    turns, swerves = rng.normal(0.0, 0.08, count), rng.normal(0.0, 0.8, count)
+    for n in range(count):
+        course += turns[n]
+        ahead = points[n] + (np.cos(course), np.sin(course))
+        if (ahead < low).any() or (ahead > high).any():
+            to_middle = (low + high) / 2.0 - points[n]
+            course = np.arctan2(to_middle[1], to_middle[0]) + swerves[n]
+            ahead = points[n] + (np.cos(course), np.sin(course))
+        points[n + 1] = ahead
+    return points
+
+
+def _add_run(store: Store, number: int, rows: int) -> None:
+    grid = open_map(store.map_path("site")).grid
+    points = meander(grid.bounds_m, rows, seed=number)
+    lon, lat = Transformer.from_crs(grid.crs, 4326, always_xy=True).transform(*points.T)
+    azimuth_deg, _, chord_m = Geod(ellps="WGS84").inv(lon[:-1], lat[:-1], lon[1:], lat[1:])
+    rng = np.random.default_rng(number)
+    run_id = f"husky_{number:05d}-{number:08x}"
+    start_ns = 1_700_000_000_000_000_000 + number * 10**13 + np.arange(rows) * 1_200_000_000
+    power = rng.normal(155.0, 15.0, rows)
+    given = {
+        "segment_id": [f"{run_id}-{stamp}" for stamp in start_ns],
+        "run_id": [run_id] * rows,
+        "robot": ["husky"] * rows,
+        "start_ns": start_ns,
+        "end_ns": start_ns + 1_200_000_000,
+        "start_lon_deg": lon[:-1],
+        "start_lat_deg": lat[:-1],
+        "end_lon_deg": lon[1:],
+        "end_lat_deg": lat[1:],
+        "chord_m": chord_m,
+        "arc_length_m": np.ones(rows),
+        "course_rad": np.radians(90.0 - azimuth_deg),
+        "duration_s": np.full(rows, 1.2),
+        "velocity_mps": rng.normal(0.85, 0.04, rows),
+        "power_watt": power,
+        "energy_joule": power * 1.2,
+    }
+    rest = {
+        column.name: rng.uniform(0.0, 0.01, rows).astype(column.dtype.to_pandas_dtype())
+        for column in LABELLED_SEGMENTS.columns
+        if column.name not in given
+    }
+    table = LABELLED_SEGMENTS.table(**given, **rest)
+    info = TrackInfo(run_id, "husky", Datum(lon[0], lat[0], 600.0), 20.0, "smoother")
+    recipe = Recipe()
+    identity = recipe_id(recipe, "husky")
+    store.write_run_json(run_id, {"source": {"paths": [f"{run_id}.mcap"], "size_bytes": 1, "sha256": run_id}})
+    store.write_run(
+        run_id,
+        identity,
+        track=Track(TRACK.empty(), REJECTIONS.empty(), info),
+        gated=GatedTrack(GATED_TRACK.empty(), info),
+        labelled=LabelledSegments(table, info, {"kept": float(floats(table, "arc_length_m").sum())}),
+        manifest={
+            "data_model_version": DATA_MODEL_VERSION,
+            "tcpipe_version": __version__,
+            "ingest_key": ingest_key(recipe),
+            "recipe": asdict(recipe),
+            "recipe_id": identity,
+            "run_id": run_id,
+            "robot": "husky",
+            "robot_requested": None,
+            "tags": {},
+            "counts": {"segments": rows},
+            "warnings": [],
+            "damage": [],
+        },
+    )

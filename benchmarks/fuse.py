@@ -1,0 +1,259 @@
+"""CPU time and memory of the estimators, paired with compiled C++ and with filterpy: ``python benchmarks/fuse.py [--hours 6]``.
+
+The log: a robot that winds over flat ground at 1 m/s with IMU 200 Hz, wheels 50 Hz, visual odometry 30 Hz and GNSS 10 Hz: 290 events a
+second, each one prediction and one update for the 15-state filters; ``us/event`` is by these everywhere. (The error-state filter takes the
+IMU as its process input, so that it steps less often than messages come; the same log is the same work.)
+
+The compiled C++ is `eigen_ukf15.cpp`, the step of robot_localization's UKF core on the same events; it needs g++ and Eigen
+(Debian: libeigen3-dev), else it is left out. Runs are interleaved, so that a busy machine slows all; the median of the paired ratios
+counts. Compilation is not counted. The last part fuses an hour through the whole stage, from streams to track, in a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import shutil
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+from tcpipe.fusion.error_state import run_error_state
+from tcpipe.fusion.initial import find_initial_state
+from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.ukf15 import PROCESS_VARIANCE, Source, filter_forward
+from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT
+from tcpipe.geometry.datum import geodetic_from_enu
+from tcpipe.recipe import FuseConfig
+from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.fuse_inputs import prepare_inputs
+from tcpipe.tables.levels import STREAMS, Sensor, Streams
+
+REPEATS = 7
+LEVER_M = (0.2, -0.1, 0.8)
+DATUM_DEG_M = (15.0, 47.0, 500.0)
+RATES_HZ = {"imu": 200, "wheel_odometry": 50, "visual_odometry": 30, "gnss": 10}
+EIGEN = ("/usr/include/eigen3", "/usr/local/include/eigen3")
+
+
+def sources(seconds: float, lever_m: tuple[float, float, float]) -> list[Source]:
+    """Events of a robot at rest; what is measured does not change what a step costs."""
+    rng = np.random.default_rng(0)
+    found = []
+    for role, entries, std in (
+        ("imu", (3, 4, 9, 10, 11), 0.01),
+        ("wheel_odometry", (6, 7, 8), 0.05),
+        ("visual_odometry", (6, 7, 8), 0.05),
+        ("gnss", (0, 1, 2), 0.02),
+    ):
+        kind = ANTENNA if role == "gnss" and any(lever_m) else SELECT
+        hz = RATES_HZ[role]
+        stamp_ns = np.arange(1, int(seconds * hz) + 1, dtype=np.int64) * (1_000_000_000 // hz)
+        z = rng.normal(0.0, std, (stamp_ns.size, len(entries))) + (lever_m if kind == ANTENNA else 0.0)
+        lever = lever_m if kind == ANTENNA else (0.0, 0.0, 0.0)
+        found.append(Source(role, kind, entries, stamp_ns, z, np.full(z.shape, std**2), lever))
+    return found
+
+
+def ukf15_us(engine: str, seconds: float, lever_m: tuple[float, float, float] = LEVER_M) -> tuple[float, np.ndarray]:
+    """CPU microseconds an event of our 15-state filter, and its final state."""
+    events = sources(seconds, lever_m)
+    begin = time.process_time()
+    found = filter_forward(
+        events,
+        [np.inf] * len(events),
+        x=np.zeros(15),
+        P=0.01 * np.eye(15),
+        q=PROCESS_VARIANCE,
+        start_ns=0,
+        output_ns=np.arange(1, int(seconds * 20) + 1, dtype=np.int64) * 50_000_000,
+        engine=engine,
+    )
+    return 1e6 * (time.process_time() - begin) / sum(source.stamp_ns.size for source in events), found.final[0]
+
+
+def compiled_eigen(directory: Path, seconds: float) -> list[str] | None:
+    """Compile the C++ stand-in and write its events; the command to run, or None where there is no compiler or no Eigen."""
+    include = next((path for path in EIGEN if Path(path).is_dir()), None)
+    compiler = shutil.which("g++")
+    if include is None or compiler is None:
+        return None
+    program, events = directory / "eigen_ukf15", directory / "events"
+    source = Path(__file__).with_name("eigen_ukf15.cpp")
+    subprocess.run([compiler, "-O2", "-std=c++17", f"-I{include}", source, "-o", program], check=True)
+    parts = sources(seconds, (0.0, 0.0, 0.0))
+    stamp_ns = np.concatenate([part.stamp_ns for part in parts])
+    rows = np.zeros((stamp_ns.size, 17))
+    first = 0
+    for part in parts:
+        chosen, size = slice(first, first + part.stamp_ns.size), len(part.entries)
+        rows[chosen, 1], rows[chosen, 2 : 2 + size] = size, part.entries
+        rows[chosen, 7 : 7 + size], rows[chosen, 12 : 12 + size] = part.z, part.variance
+        first += part.stamp_ns.size
+    order = np.argsort(stamp_ns, kind="stable")
+    rows[order, 0] = np.diff(stamp_ns[order], prepend=0) * 1e-9
+    events.write_bytes(np.asarray(PROCESS_VARIANCE, np.float64).tobytes() + rows[order].tobytes())
+    return [str(program), str(events)]
+
+
+def eigen_us(command: list[str], seconds: float) -> tuple[float, np.ndarray]:
+    numbers = np.array(subprocess.run(command, check=True, capture_output=True, text=True).stdout.split(), float)
+    return 1e6 * numbers[0] / (seconds * sum(RATES_HZ.values())), numbers[1:]
+
+
+def made_streams(seconds: float) -> Streams:
+    """Streams of the winding drive, with noise."""
+    rng = np.random.default_rng(1)
+    grid = np.arange(0.0, seconds, 0.01)
+    rate = 0.25 * np.sin(grid / 7.0)
+    yaw = np.concatenate(([0.3], 0.3 + np.cumsum(0.005 * (rate[1:] + rate[:-1]))))
+    ahead = np.stack((np.cos(yaw), np.sin(yaw)), -1)
+    xy = np.concatenate((np.zeros((1, 2)), np.cumsum(0.005 * (ahead[1:] + ahead[:-1]), axis=0)))
+    tables = {}
+    for role, hz in RATES_HZ.items():
+        t = np.arange(0.001, seconds - 0.02, 1.0 / hz)
+        turn = np.interp(t, grid, rate)
+        columns = {
+            "imu": _imu,
+            "wheel_odometry": _odometry,
+            "visual_odometry": _odometry,
+            "gnss": _gnss,
+        }[role](t, turn, rng, np.interp(t, grid, yaw), np.stack([np.interp(t, grid, xy[:, k]) for k in (0, 1)], -1))
+        stamp_ns = np.rint(t * 1e9).astype(np.int64) + 1_700_000_000_000_000_000
+        columns |= {"stamp_ns": stamp_ns, "log_time_ns": stamp_ns, "epoch": np.zeros(t.size, np.int16)}
+        rest = {name: np.full(t.size, np.nan) for name in STREAMS[role].names() if name not in columns}
+        tables[role] = STREAMS[role].table(**columns, **rest)
+    sensors = {
+        role: Sensor(f"/{role}", "", role, "made", LEVER_M if role == "gnss" else (0.0, 0.0, 0.0), placed_by="recipe")
+        for role in tables
+    }
+    return Streams(tables, sensors, "husky")
+
+
+def _imu(t: np.ndarray, turn: np.ndarray, rng: np.random.Generator, *_: np.ndarray) -> dict[str, np.ndarray]:
+    noise = rng.normal(size=(t.size, 6))
+    values = noise * np.repeat([0.002, 0.05], 3) + np.stack((0 * t, 0 * t, turn, 0 * t, turn, 0 * t + 9.80665), -1)
+    names = [f"angular_velocity_{axis}_radps" for axis in "xyz"] + [f"linear_acceleration_{a}_mps2" for a in "xyz"]
+    return dict(zip(names, values.T, strict=True))
+
+
+def _odometry(t: np.ndarray, turn: np.ndarray, rng: np.random.Generator, *_: np.ndarray) -> dict[str, np.ndarray]:
+    velocity = rng.normal(size=(t.size, 3)) * 0.03 + [1.0, 0.0, 0.0]
+    found = {f"velocity_{axis}_mps": velocity[:, k] for k, axis in enumerate("xyz")}
+    found |= {f"velocity_var_{axis}_m2ps2": np.full(t.size, 0.03**2) for axis in "xyz"}
+    return found | {"angular_velocity_z_radps": turn + 0.02 * rng.normal(size=t.size)}
+
+
+def _gnss(
+    t: np.ndarray, _: np.ndarray, rng: np.random.Generator, yaw: np.ndarray, xy: np.ndarray
+) -> dict[str, np.ndarray]:
+    lever = np.stack(
+        (
+            np.cos(yaw) * LEVER_M[0] - np.sin(yaw) * LEVER_M[1],
+            np.sin(yaw) * LEVER_M[0] + np.cos(yaw) * LEVER_M[1],
+        ),
+        -1,
+    )
+    antenna = np.column_stack((xy + lever, np.full(t.size, LEVER_M[2]))) + 0.015 * rng.normal(size=(t.size, 3))
+    place = geodetic_from_enu(antenna, datum_deg_m=DATUM_DEG_M)
+    variance = {f"{axis}_var_m2": np.full(t.size, 0.015**2) for axis in ("east", "north", "up")}
+    return dict(zip(("lon_deg", "lat_deg", "alt_m"), place, strict=True)) | variance | {"fix_status": np.zeros(t.size)}
+
+
+class ErrorState:
+    """The error-state filter over the winding drive."""
+
+    def __init__(self, seconds: float) -> None:
+        streams = made_streams(seconds)
+        self.measurements = prepare_inputs(streams, FuseConfig()).measurements[0]
+        start_ns = int(self.measurements.imu.stamp_ns[0])
+        standing = standing_intervals(self.measurements)
+        self.initial = find_initial_state(self.measurements, standing, start_ns)
+        first, last = start_ns // 50_000_000 + 1, int(self.measurements.wheels.stamp_ns[-1]) // 50_000_000
+        self.output_ns = np.arange(first, last + 1, dtype=np.int64) * 50_000_000
+        self.events = sum(table.num_rows for table in streams.tables.values())
+
+    def us(self, *, smooth: bool) -> float:
+        """CPU microseconds a message."""
+        begin = time.process_time()
+        run_error_state(self.measurements, self.initial, output_ns=self.output_ns, smooth=smooth)
+        return 1e6 * (time.process_time() - begin) / self.events
+
+
+def print_paired(seconds: float = 600.0) -> None:
+    """Interleave every estimator and print medians and paired ratios."""
+    short, drive = 4.0, ErrorState(seconds)
+    ukf15_us("compiled", 1.0)
+    ErrorState(5.0).us(smooth=True)
+    found: dict[str, list[float]] = {}
+    with tempfile.TemporaryDirectory() as directory:
+        command = compiled_eigen(Path(directory), seconds)
+        for _ in range(REPEATS):
+            run = {
+                "15-state compiled": ukf15_us("compiled", seconds)[0],
+                "15-state filterpy": ukf15_us("filterpy", short)[0],
+                "error-state forward": drive.us(smooth=False),
+                "error-state forward + smoother": drive.us(smooth=True),
+            }
+            if command is not None:
+                run["C++ Eigen core, 15 states"] = eigen_us(command, seconds)[0]
+            for name, value in run.items():
+                found.setdefault(name, []).append(value)
+        if command is not None:
+            ours, theirs = ukf15_us("compiled", seconds, (0.0, 0.0, 0.0))[1], eigen_us(command, seconds)[1]
+            print(f"final states of ours and the C++ differ by at most {np.abs(ours - theirs).max():.1e}")
+    for name, values in found.items():
+        print(f"{name:<32} {statistics.median(values):8.2f} us/event")
+    _ratios(found)
+
+
+def _ratios(found: dict[str, list[float]]) -> None:
+    wanted = [("15-state compiled", "15-state filterpy", "at most 0.005")]
+    core = "C++ Eigen core, 15 states"
+    if core in found:
+        wanted += [
+            ("15-state compiled", core, "at most 0.25"),
+            ("error-state forward", core, "at most 0.5"),
+            ("error-state forward + smoother", core, "at most 1"),
+        ]
+    else:
+        print("no g++ or no Eigen (libeigen3-dev): not compared with C++")
+    for name, other, limit in wanted:
+        ratio = statistics.median(a / b for a, b in zip(found[name], found[other], strict=True))
+        print(f"{name} / {other}: {ratio:.4f} (wanted {limit})")
+
+
+def fuse_hours(hours: float) -> None:
+    """Fuse one long log through the stage and print its CPU time and memory."""
+    fuse_run(made_streams(20.0), FuseConfig(), run_id="warm")
+    streams = made_streams(3600.0 * hours)
+    before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    begin = time.process_time()
+    track = fuse_run(streams, FuseConfig(), run_id="long")
+    seconds = time.process_time() - begin
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(
+        f"{hours:g} h, {sum(t.num_rows for t in streams.tables.values())} messages to {track.table.num_rows} rows: "
+        f"{seconds:.1f} s of CPU, peak memory {peak_mb:.0f} MB (before fusing {before_mb:.0f} MB)"
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--hours", type=float, default=1.0, help="length of the long log")
+    parser.add_argument("--only-long", action="store_true")
+    given = parser.parse_args()
+    if given.only_long:
+        fuse_hours(given.hours)
+        return
+    print_paired()
+    subprocess.run([sys.executable, __file__, "--only-long", "--hours", str(given.hours)], check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,209 @@
+"""How true the fused track is, and whether its covariance is: ``python benchmarks/fusion_accuracy.py [--drives 24] [--only NAME]``.
+
+Simulated drives over hills with every sensor fault on; how strong each is stands in `fault_amplitudes.toml`, which was written before any
+tuning, as were the seeds. Errors are those of the standing and driving robot alike, rows within half a second of an outage's ends and
+inside it reported apart. ``xy`` is the length of the horizontal error vector, RMS; ``v`` that of the forward velocity.
+
+NEES is that of attitude, velocity and position together, 9 degrees of freedom with their whole covariance; ``inside`` the share of rows
+between the 2.5 % and 97.5 % quantiles of chi-square, ``below`` that under the upper one. Without GNSS neither position nor yaw has
+anything to be compared with. The next columns ask the same of the displacement over one second: the share of its errors within one
+and two of its deviations (68 % and 95 % are wanted). The last are the RMS of error over deviation.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import chi2
+
+from tcpipe.formats.log_file import open_log
+from tcpipe.fusion.error_state import run_error_state
+from tcpipe.fusion.initial import find_initial_state
+from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.stretches import cut_stretches, track_stamps
+from tcpipe.geometry.datum import geodetic_from_enu
+from tcpipe.geometry.rotation import inverse, product, rotate, rotation_vector_from_quat
+from tcpipe.recipe import FuseConfig, ReadConfig
+from tcpipe.simulation import Faults, Truth, read_truth, simulate
+from tcpipe.simulation.route import Wander
+from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario, small_world
+from tcpipe.simulation.sensors import Gnss, Imu, Sensors, Visual, Wheels
+from tcpipe.stages.fuse_inputs import prepare_inputs
+from tcpipe.stages.fuse_sanity import sane_inputs
+from tcpipe.stages.read import read_run
+from tcpipe.tables.levels import Streams
+
+AMPLITUDES = tomllib.loads(Path(__file__).with_name("fault_amplitudes.toml").read_text())
+STARTS_M = ((14.0, 34.0), (30.0, 20.0), (40.0, 60.0), (60.0, 30.0), (70.0, 70.0), (90.0, 55.0))
+BAND = chi2.ppf([0.025, 0.975], 9)
+MARGIN_S = 0.5
+
+
+def sensors(gnss_std_m: float, outage_s: float) -> Sensors:
+    given: dict[str, dict[str, Any]] = {name: dict(AMPLITUDES[name]) for name in ("gnss", "wheels", "imu", "visual")}
+    vertical = given["gnss"].pop("vertical_factor") * gnss_std_m
+    given["gnss"] |= {"std_m": gnss_std_m, "vertical_std_m": vertical, "outage_s": outage_s}
+    return Sensors(Gnss(**given["gnss"]), Wheels(**given["wheels"]), Imu(**given["imu"]), Visual(**given["visual"]))
+
+
+def made_drive(out: Path, seed: int, *, gnss_std_m: float, outage_s: float) -> tuple[Streams, Truth]:
+    start = STARTS_M[seed % len(STARTS_M)]
+    wander = Wander(AMPLITUDES["drive_m"], start, climbing=0.4)
+    drive = DriveSpec("drive", wander, start, sensors=sensors(gnss_std_m, outage_s), faults=Faults.every())
+    region = ((1.0, 1.0), (100.0, 1.0), (100.0, 79.0), (1.0, 79.0))
+    site = simulate(
+        out, scenario=Scenario("accuracy", small_world(), (drive,), region, RasterSpec(2.0, 2.0, 2.0)), seed=seed
+    )
+    with open_log(site.logs[0]) as log:
+        return read_run(log, ReadConfig(), robot=None), read_truth(site.truths[0])
+
+
+@dataclass
+class Errors:
+    """Errors of one drive at the track's rows: position (N, 3) [m], forward velocity, yaw; NEES; the deviations claimed of each."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    yaw: np.ndarray
+    nees: np.ndarray
+    outage: np.ndarray
+    displacement: np.ndarray
+    displacement_std: np.ndarray
+    normalized: np.ndarray
+
+
+def errors(streams: Streams, truth: Truth, *, smooth: bool) -> Errors:
+    """Fuse and compare, over every stretch."""
+    config = FuseConfig()
+    inputs, _ = sane_inputs(prepare_inputs(streams, config), streams)
+    parts = []
+    for stretch in cut_stretches(inputs.measurements):
+        output_ns = track_stamps(stretch, period_ns=50_000_000, max_gap_ns=int(config.max_gap_s * 1e9))
+        output_ns = output_ns[(output_ns > truth.stamp_ns[0]) & (output_ns < truth.stamp_ns[-1])]
+        initial = find_initial_state(stretch.measurements, standing_intervals(stretch.measurements), stretch.start_ns)
+        found = run_error_state(
+            stretch.measurements, initial, output_ns=output_ns, smooth=smooth, covariances=True,
+            gate_probability=config.gate_probability,
+        )  # fmt: skip
+        at = truth.at(output_ns)
+        position = found.position_enu_m
+        if inputs.datum_deg_m is not None:
+            lon, lat, alt = geodetic_from_enu(position, datum_deg_m=inputs.datum_deg_m)
+            scale = np.array([np.cos(np.radians(at.lat_deg)), np.ones_like(at.lat_deg)]).T * 6_371_000.0
+            position_error = np.column_stack(
+                (np.radians(np.stack((lon - at.lon_deg, lat - at.lat_deg), -1)) * scale, alt - at.alt_m)
+            )
+        else:
+            position_error = np.full_like(position, np.nan)
+        parts.append(_compared(found, at, position_error, _in_outage(stretch.measurements.gnss, output_ns)))
+    return Errors(*(np.concatenate([getattr(part, name) for part in parts]) for name in Errors.__dataclass_fields__))
+
+
+def _in_outage(gnss: Any, at_ns: np.ndarray) -> np.ndarray:
+    if gnss is None:
+        return np.zeros(at_ns.size, bool)
+    steps = np.diff(gnss.stamp_ns)
+    long = np.flatnonzero(steps > 2e9)
+    inside = np.zeros(at_ns.size, bool)
+    for k in long:
+        inside |= (at_ns > gnss.stamp_ns[k] - MARGIN_S * 1e9) & (at_ns < gnss.stamp_ns[k + 1] + MARGIN_S * 1e9)
+    return inside
+
+
+def _compared(found: Any, at: Any, position_error: np.ndarray, outage: np.ndarray) -> Errors:
+    turn = rotation_vector_from_quat(product(inverse(found.quat_xyzw), at.quat_xyzw))
+    velocity_error = found.velocity_enu_mps - at.velocity_enu_mps
+    forward = rotate(inverse(found.quat_xyzw), found.velocity_enu_mps)[:, 0] - at.forward_velocity_mps
+    error = np.column_stack((-turn, velocity_error, position_error))
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(found.covariance, error[..., None])[..., 0])
+    lag = 20
+    way = found.position_enu_m[lag:, :2] - found.position_enu_m[:-lag, :2]
+    length = np.linalg.norm(way, axis=1)
+    along = np.full(len(error), np.nan)
+    change = position_error[lag:, :2] - position_error[:-lag, :2]
+    along[:-lag] = np.where(length > 0.3, np.sum(change * way, 1) / np.maximum(length, 1e-9), np.nan)
+    yaw = -rotate(at.quat_xyzw, turn)[:, 2]
+    deviations = np.column_stack((found.position_std_m, found.forward_velocity_std_mps, found.yaw_std_rad))
+    normalized = np.column_stack((position_error, forward, yaw)) / deviations
+    return Errors(position_error, forward, yaw, nees, outage, along, found.displacement_std_m[:, 1], normalized)
+
+
+def row(name: str, drives: list[Errors], *, outage: bool | None) -> str:
+    """Format one line: RMS of all rows of all drives."""
+    joined = Errors(*(np.concatenate([getattr(d, key) for d in drives]) for key in Errors.__dataclass_fields__))
+    chosen = np.ones(joined.outage.size, bool) if outage is None else joined.outage == outage
+    if not chosen.any():
+        return f"{name:<34} (no rows)"
+
+    def rms(e: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.square(e[chosen]))))
+
+    xy, z = float(np.sqrt(2)) * rms(joined.position[:, :2]), rms(joined.position[:, 2])
+    nees = joined.nees[chosen]
+    band = np.mean((nees > BAND[0]) & (nees < BAND[1]))
+    ratio = np.abs(joined.displacement / joined.displacement_std)[chosen]
+    ratio = ratio[np.isfinite(ratio)]
+    relative = f"{np.mean(ratio < 1):4.0%} {np.mean(ratio < 2):4.0%}" if ratio.size else "   -    -"
+    spread = " ".join(f"{v:4.2f}" for v in np.sqrt(np.mean(joined.normalized[chosen] ** 2, axis=0)))
+    return (
+        f"{name:<34} {1e3 * xy:7.1f} {1e3 * z:7.1f} {1e3 * rms(joined.velocity):7.1f} "
+        f"{np.degrees(rms(joined.yaw)):7.3f} {np.mean(nees):6.1f} {np.mean(nees < BAND[1]):6.1%} {band:6.1%}  {relative}  {spread}"
+    )
+
+
+def without(streams: Streams, *roles: str) -> Streams:
+    return replace(streams, tables={role: table for role, table in streams.tables.items() if role not in roles})
+
+
+ROLES = ("imu", "wheel_odometry", "visual_odometry", "gnss")
+
+
+def cases(seeds: range, only: str) -> Iterator[tuple[str, float, float, tuple[str, ...], range]]:
+    """Yield name, sigma, outage, removed roles, seeds."""
+    found = [
+        ("RTK 1.5 cm", 0.015, 10.0, (), seeds),
+        ("RTK 5 cm", 0.05, 10.0, (), seeds),
+        ("outage of a minute", 0.015, 60.0, (), seeds[:8]),
+        *((f"without {role}", 0.015, 10.0, (role,), seeds[:8]) for role in ROLES),
+        ("GNSS and IMU alone", 0.015, 10.0, ("wheel_odometry", "visual_odometry"), seeds[:8]),
+        ("GNSS and wheels alone", 0.015, 10.0, ("imu", "visual_odometry"), seeds[:8]),
+        ("GNSS alone", 0.015, 10.0, ("imu", "visual_odometry", "wheel_odometry"), seeds[:8]),
+    ]
+    yield from (case for case in found if only in case[0])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--drives", type=int, default=24)
+    parser.add_argument("--only", default="", help="cases whose name holds this")
+    parser.add_argument("--first-seed", type=int, default=AMPLITUDES["seeds"][0])
+    parser.add_argument("--keep", type=Path, help="keep the simulated logs here")
+    given = parser.parse_args()
+    seeds = range(given.first_seed, given.first_seed + given.drives)
+    print(
+        f"{'':<34} {'xy mm':>7} {'z mm':>7} {'v mm/s':>7} {'yaw deg':>7} {'NEES':>6} {'below':>6} {'inside':>6}  "
+        f"{'displ.':>9}  error over deviation: x y z v yaw"
+    )
+    with tempfile.TemporaryDirectory() as temporary:
+        directory = temporary if given.keep is None else given.keep
+        for name, std_m, outage_s, removed, chosen in cases(seeds, given.only):
+            found: dict[str, list[Errors]] = {"forward": [], "smoothed": []}
+            for seed in chosen:
+                place = Path(directory) / f"{seed}_{std_m}_{outage_s}"
+                streams, truth = made_drive(place, seed, gnss_std_m=std_m, outage_s=outage_s)
+                for which, drives in found.items():
+                    drives.append(errors(without(streams, *removed), truth, smooth=which == "smoothed"))
+            for which, drives in found.items():
+                print(row(f"{name}, {which}", drives, outage=False), flush=True)
+            print(row(f"{name}, smoothed, in outages", found["smoothed"], outage=True), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,89 @@
+"""How true the labels are: simulate a site, ingest its logs, and compare every segment with the true metre.
+
+    python benchmarks/label_accuracy.py                      # hills12: twelve hilly minutes, every sensor fault on
+    python benchmarks/label_accuracy.py --scenario demo --seed 1
+    python benchmarks/label_accuracy.py --recipe pipelines/husky-paper.toml
+
+Nothing of this is self-consistent: the truth comes from the simulator, which shares no formula with the pipeline but rotations.
+tests/end_to_end/test_whole_pipeline.py holds the same figures under limits.
+"""
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from tcpipe import ingest
+from tcpipe.formats.recipe_toml import load_recipe
+from tcpipe.geometry.angles import wrap_to_pi
+from tcpipe.geometry.rotation import rpy_from_quat
+from tcpipe.simulation import Truth, read_truth, simulate, true_cost
+from tcpipe.store import RunDirectory, Store
+from tcpipe.tables.columns import floats, integers
+
+LABELS = {"energy_joule": "J", "power_watt": "W", "velocity_mps": "m/s", "duration_s": "s"}
+
+
+def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
+    """Yield what each figure is called, and the figure."""
+    segments, track = run.segments(), run.track().table
+    start_ns = integers(segments, "start_ns")
+    true = true_cost(truth, start_ns)
+    for label, unit in LABELS.items():
+        error = floats(segments, label) - getattr(true, label)
+        std = floats(segments, _std_name(label))
+        share = np.abs(error).sum() / np.abs(getattr(true, label)).sum()
+        within = [np.mean(np.abs(error) <= k * std) for k in (1, 2)]
+        bias = error.sum() / np.abs(getattr(true, label)).sum()
+        claimed = f"claimed deviation {std.mean():.3g} {unit}: {within[0]:.0%} of the errors within one, {within[1]:.0%} within two"
+        yield f"{label}: sum |error| / sum |truth|", f"{share:.2%} (bias {bias:+.2%}); {claimed}"
+    there = truth.at(start_ns)
+    lon, lat = floats(segments, "start_lon_deg"), floats(segments, "start_lat_deg")
+    _, _, apart_m = pyproj.Geod(ellps="WGS84").inv(lon, lat, there.lon_deg, there.lat_deg)
+    yield "start point, RMS", f"{100 * _rms(apart_m):.2f} cm"
+    kept = track["dropped_by"].to_numpy() == 0
+    along = truth.at(integers(track, "stamp_ns"))
+    speed = floats(track, "forward_velocity_mps") - along.forward_velocity_mps
+    yaw = wrap_to_pi(floats(track, "yaw_rad") - rpy_from_quat(along.quat_xyzw)[:, 2])
+    yield "forward velocity of the kept track, RMS", f"{_rms(speed[kept]):.4f} m/s"
+    yield "yaw of the kept track, RMS", f"{np.degrees(_rms(yaw[kept])):.2f} deg"
+    yield "chords, largest departure from 1 m", f"{1e3 * np.abs(floats(segments, 'chord_m') - 1).max():.6f} mm"
+    energy = run.manifest["info"]["findings"]["facts"]["label"]["energy_joule"]
+    driven_m = sum(run.manifest["ledger_m"].values())
+    yield "energy of the whole run", f"{energy / truth.energy_joule[-1] - 1:+.3%} of {truth.energy_joule[-1]:.0f} J"
+    yield "odometer", f"{driven_m / truth.distance_m[-1] - 1:+.3%} of {truth.distance_m[-1]:.1f} m"
+
+
+def _std_name(label: str) -> str:
+    quantity, unit = label.rsplit("_", 1)
+    return f"{quantity}_std_{unit}"
+
+
+def _rms(error: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(error))))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenario", default="hills12")
+    parser.add_argument("--seed", type=int, default=11)
+    parser.add_argument("--recipe", type=Path)
+    given = parser.parse_args()
+    with tempfile.TemporaryDirectory() as directory:
+        site = simulate(Path(directory) / "site", scenario=given.scenario, seed=given.seed)
+        recipe = load_recipe(given.recipe)
+        summary = ingest(site.logs, store=Path(directory) / "store", recipe=recipe)
+        if summary.exit_code:
+            sys.exit("\n".join(problem for result in summary.results for problem in result.problems))
+        for run, truth_path in zip(Store(summary.store).runs(), site.truths, strict=True):
+            print(f"{truth_path.stem}: {run.segments().num_rows} segments, estimator {recipe.fuse.estimator}")
+            for name, value in figures(run, read_truth(truth_path)):
+                print(f"  {name:<45} {value}")
+
+
+if __name__ == "__main__":
+    main()

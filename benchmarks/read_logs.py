@@ -1,0 +1,339 @@
+"""Reading a log into tables: CPU time against rosbags, rerun and the mere reading and decompressing of the chunks ("floor").
+
+Run by hand: ``python benchmarks/read_logs.py [--minutes 5] [--rerun PYTHON] [--huge GB] [--only TEXT]``. Logs are made in a temporary
+directory; reads alternate, the best of some counts; what is read is compared, message by message, before anything is timed. ``--rerun``
+names the Python of an environment in which rerun-sdk is installed (a peer that is absent is left out); ``--huge`` adds the memory it
+takes to read a log of so many GB, which needs as much room on the disk.
+"""
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from made_logs import (
+    NAVIGATION,
+    RAGGED,
+    RATES_HZ,
+    STORES,
+    by_time,
+    camera,
+    navigation,
+    ragged,
+    write_bag,
+    write_db3,
+    write_mcap,
+)
+from rosbags.highlevel import AnyReader
+
+from tcpipe.formats.log_file import open_log
+from tcpipe.formats.log_part import ByteSource, decompressed
+from tcpipe.formats.mcap_log import McapPart
+from tcpipe.pipeline.export import export
+
+REPEATS = 5
+FIELDS = {topic: field for topic, _, _, field in RATES_HZ}
+RERUN = """
+import sys, time
+from rerun.chunk import McapReader
+for line in sys.stdin:
+    path, topics = line.split()
+    start, rows = time.process_time(), 0
+    names = topics.split(",")
+    reader = McapReader(path, decoders=["ros2msg", "ros2_reflection"], include_topic_regex=[f"^{name}$" for name in names])
+    for chunk in reader.stream():
+        rows += chunk.num_rows * (str(chunk.entity_path) in names)
+    print(time.process_time() - start, rows, flush=True)
+"""
+MEMORY = """
+import sys
+from pathlib import Path
+from tcpipe.formats.log_file import open_log
+import pyarrow.parquet, rosbags.typesys
+peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024
+before, rows, largest = peak(), 0, 0
+with open_log(Path(sys.argv[1])) as log:
+    for tables in log.batches(sys.argv[2].split(","), threads=int(sys.argv[3])):
+        rows += sum(table.num_rows for table in tables.values())
+        largest = max(largest, sum(table.nbytes for table in tables.values()))
+    assert not log.damage, log.damage
+print(rows, peak() - before, largest / 2**20)
+"""
+
+
+def with_tcpipe(path: Path, topics: list[str], threads: int = 1) -> int:
+    with open_log(path) as log:
+        return sum(table.num_rows for table in log.tables(topics, threads=threads).values())
+
+
+def to_parquet(path: Path, topics: list[str]) -> int:
+    with tempfile.TemporaryDirectory() as out:
+        return sum(rows for _, _, rows in export(path, Path(out), topics=topics).files)
+
+
+def rosbags_messages(path: Path, topics: list[str]) -> Iterator[tuple[str, int, object]]:
+    with AnyReader([path], default_typestore=STORES["cdr"]) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic in topics]
+        for connection, stamp, raw in reader.messages(wanted):
+            yield connection.topic, stamp, reader.deserialize(raw, connection.msgtype)
+
+
+def with_rosbags(path: Path, topics: list[str]) -> int:
+    return sum(1 for _ in rosbags_messages(path, topics))
+
+
+def floor(path: Path, _topics: list[str]) -> int:
+    part, source = McapPart(path, path.name), ByteSource(path)
+    for chunk in part._contents.chunks:  # noqa: SLF001
+        data = source.read(chunk.data_offset, chunk.data_bytes)
+        if chunk.compression:
+            decompressed(chunk.compression, data, chunk.uncompressed_bytes)
+    return 0
+
+
+def assert_equal_content(path: Path, topics: list[str]) -> None:
+    """Compare log time and what varies in each message with what rosbags reads."""
+    found: dict[str, list[tuple[int, object]]] = {topic: [] for topic in topics}
+    for topic, stamp, message in rosbags_messages(path, topics):
+        value: object = message
+        for name in FIELDS[topic].split(".") if topic in FIELDS else ["status"]:
+            value = getattr(value, name)
+        found[topic].append((stamp, value if topic in FIELDS else [status.message for status in value]))
+    with open_log(path) as log:
+        for topic, table in log.tables(topics).items():
+            rows = found[topic]
+            assert table["log_time_ns"].to_pylist() == [stamp for stamp, _ in rows]
+            if topic in FIELDS:
+                assert table[FIELDS[topic]].to_pylist() == [value for _, value in rows]
+            else:
+                texts = [[status["message"] for status in row] for row in table["status"].to_pylist()]
+                assert texts == [value for _, value in rows]
+        assert log.damage == []
+
+
+class Rerun:
+    """rerun-sdk in its own environment."""
+
+    def __init__(self, python: str | None) -> None:
+        self.process = None
+        if (
+            python
+            and subprocess.run([python, "-c", "import rerun.chunk"], check=False, capture_output=True).returncode == 0
+        ):
+            pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
+            self.process = subprocess.Popen([python, "-W", "ignore", "-c", RERUN], **pipes)
+
+    def seconds(self, path: Path, topics: list[str], messages: int) -> float:
+        """Have it read the topics; return the CPU seconds it took."""
+        self.process.stdin.write(f"{path} {','.join(topics)}\n")
+        self.process.stdin.flush()
+        seconds, rows = self.process.stdout.readline().split()
+        assert int(rows) >= messages, (rows, messages)
+        return float(seconds)
+
+
+def best(readers: dict[str, Callable[[], object]], clock: Callable[[], float] = time.process_time) -> dict[str, float]:
+    """Call the readers in turn; return the least seconds each took (a reader that returns a float has measured itself)."""
+    times: dict[str, list[float]] = {name: [] for name in readers}
+    for _ in range(REPEATS):
+        for name, read in readers.items():
+            start = clock()
+            found = read()
+            times[name].append(found if isinstance(found, float) else clock() - start)
+    return {name: min(found) for name, found in times.items()}
+
+
+def row(name: str, target: float, ratio: float, *, at_least: bool = False, note: str = "") -> None:
+    """Print one figure beside its target."""
+    reached = ratio >= target if at_least else ratio <= target
+    sign = ">=" if at_least else "<="
+    print(f"{name:62s} {sign} {target:6.2f}   {ratio:7.2f}   {'' if reached else 'MISSED'}  {note}", flush=True)
+
+
+def compare(
+    name: str,
+    path: Path,
+    rerun: Rerun,
+    times_rosbags: float,
+    topics: list[str] = NAVIGATION,
+    *,
+    of_rerun: float | None = None,
+) -> dict[str, float]:
+    """Print the figures of one log against rosbags and, where it has a target, rerun."""
+    assert_equal_content(path, topics)
+    messages = with_tcpipe(path, topics)
+    readers: dict[str, Callable[[], object]] = {
+        "tcpipe": lambda: with_tcpipe(path, topics),
+        "rosbags": lambda: with_rosbags(path, topics),
+    }
+    if path.suffix == ".mcap":
+        readers["floor"] = lambda: floor(path, topics)
+    if rerun.process and of_rerun:
+        readers["rerun"] = lambda: rerun.seconds(path, topics, messages)
+    seconds = best(readers)
+    note = ", ".join(f"{reader} {found:.3f}" for reader, found in seconds.items()) + f" s, {messages} messages"
+    row(
+        f"{name}: times rosbags' speed", times_rosbags, seconds["rosbags"] / seconds["tcpipe"], at_least=True, note=note
+    )
+    if "rerun" in seconds:
+        row(f"{name}: of rerun's time", of_rerun, seconds["tcpipe"] / seconds["rerun"])
+    return seconds
+
+
+def read_share(path: Path) -> float:
+    """Return which share of a log's bytes is read from the disk, the page cache emptied of it."""
+    file = next(path.glob("*.db3")) if path.is_dir() else path
+    descriptor = os.open(file, os.O_RDONLY)
+    os.fsync(descriptor)
+    os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+    os.close(descriptor)
+
+    def read_bytes() -> int:
+        return int(Path("/proc/self/io").read_text().split("read_bytes: ")[1].split()[0])
+
+    before = read_bytes()
+    with_tcpipe(path, NAVIGATION)
+    return (read_bytes() - before) / file.stat().st_size
+
+
+def mcap_rows(directory: Path, minutes: float, rerun: Rerun) -> None:
+    for compression, target in (("zstd", 15), ("lz4", 15), ("none", 16)):
+        path = write_mcap(directory / "navigation.mcap", navigation(minutes), compression=compression)
+        compare(
+            f"MCAP {compression}, navigation only", path, rerun, target, of_rerun=0.8 if compression == "zstd" else None
+        )
+        if compression == "zstd":
+            salvage(path, "zstd MCAP, navigation only")
+        path.unlink()
+    path = write_mcap(
+        directory / "apart.mcap", by_time(navigation(minutes), camera(minutes)), compression="none", camera_apart=True
+    )
+    compare("MCAP none, camera in chunks of its own", path, rerun, 16)
+    row("  share of the file that is read", 0.15, read_share(path))
+    path.unlink()
+    for compression, crcs, target in (("none", False, 16), ("none", True, 0), ("lz4", True, 11)):
+        path = write_mcap(
+            directory / "camera.mcap", by_time(navigation(minutes), camera(minutes)), compression=compression, crcs=crcs
+        )
+        what = f"MCAP {compression}{'' if crcs else ' without CRC'}, camera in every chunk"
+        compare(what, path, rerun, target)
+        if not crcs:
+            row("  share of the file that is read", 0.15, read_share(path))
+        path.unlink()
+
+
+def zstd_rows(directory: Path, minutes: float, rerun: Rerun) -> None:
+    for crcs, target in ((True, 1.4), (False, 1.3)):
+        path = write_mcap(
+            directory / "camera.mcap", by_time(navigation(minutes), camera(minutes)), compression="zstd", crcs=crcs
+        )
+        what = f"zstd MCAP with camera{'' if crcs else ', without CRC'}"
+        seconds = compare(what, path, rerun, 0, of_rerun=0.75)
+        row(f"{what}: of the floor", target, seconds["tcpipe"] / seconds["floor"])
+        if crcs:
+            parquet_and_threads(path, what)
+            salvage(path, what)
+        path.unlink()
+
+
+def parquet_and_threads(path: Path, name: str) -> None:
+    seconds = best({"floor": lambda: floor(path, []), "parquet": lambda: to_parquet(path, NAVIGATION)})
+    row(f"{name} to Parquet: of the floor", 1.6, seconds["parquet"] / seconds["floor"])
+    wall = best({str(n): lambda n=n: with_tcpipe(path, NAVIGATION, n) for n in (1, 2)}, time.perf_counter)
+    row("  two threads: wall time of one", 0.65, wall["2"] / wall["1"], note=f"{wall['1']:.3f} s with one")
+
+
+def salvage(path: Path, name: str) -> None:
+    """Compare the reading of a log with that of the same without its summary."""
+    cut = path.with_name("cut.mcap")
+    part = McapPart(path, path.name)
+    last = max(part._contents.chunks, key=lambda chunk: chunk.offset)  # noqa: SLF001
+    end = last.end + last.index_bytes
+    with path.open("rb") as whole, cut.open("wb") as file:
+        while (left := end - file.tell()) > 0:
+            file.write(whole.read(min(left, 1 << 24)))
+    assert with_tcpipe(cut, NAVIGATION) == with_tcpipe(path, NAVIGATION)
+    seconds = best({"indexed": lambda: with_tcpipe(path, NAVIGATION), "salvage": lambda: with_tcpipe(cut, NAVIGATION)})
+    row(f"{name}, without summary: of the indexed read", 1.4, seconds["salvage"] / seconds["indexed"])
+    cut.unlink()
+
+
+def other_rows(directory: Path, minutes: float, rerun: Rerun) -> None:
+    for compression, target in (("lz4", 15), ("none", 15), ("bz2", 0)):
+        path = write_bag(directory / "navigation.bag", navigation(minutes, "ros1"), compression=compression)
+        compare(f".bag {compression}, navigation only", path, rerun, target)
+        path.unlink()
+    for compression, target in (("lz4", 8), ("none", 8)):
+        messages = by_time(navigation(minutes, "ros1"), camera(minutes, "ros1"))
+        path = write_bag(directory / "camera.bag", messages, compression=compression)
+        compare(f".bag {compression}, camera in every chunk", path, rerun, target)
+        path.unlink()
+    compare(".db3, navigation only", write_db3(directory / "navigation", navigation(minutes)), rerun, 7)
+    path = write_db3(directory / "camera", by_time(navigation(minutes), camera(minutes)))
+    compare(".db3 with camera", path, rerun, 7)
+    row("  share of the file that is read", 0.15, read_share(path))
+    path = write_mcap(directory / "ragged.mcap", ragged(20_000), compression="zstd")
+    compare("ragged, high-entropy topic", path, rerun, 1 / 1.2, [RAGGED])
+
+
+def start_up() -> None:
+    """Print the CPU time of ``tcpipe --help``, the Python interpreter's own included."""
+    program = "import sys; from tcpipe.cli import cli; sys.argv = ['tcpipe', '--help']; cli()"
+    found = []
+    for _ in range(REPEATS):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        found.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+    row("tcpipe --help: CPU ms", 80, 1000 * min(found))
+
+
+def memory_rows(directory: Path, gigabytes: float) -> None:
+    """Print the memory it takes to read a log of that size, and the time to inspect it."""
+    minutes = gigabytes * 1e9 / (1_690_000 * 60)
+    path = write_mcap(directory / "huge.mcap", by_time(navigation(minutes), camera(minutes)), compression="lz4")
+    size = path.stat().st_size / 1e9
+    for threads in (1, 2):
+        arguments = [sys.executable, "-c", MEMORY, str(path), ",".join(NAVIGATION), str(threads)]
+        done = subprocess.run(arguments, check=True, capture_output=True, text=True)
+        rows, peak, largest = map(float, done.stdout.split())
+        name = f"{size:.1f} GB MCAP, {threads} thread(s): peak MB over imports and row group"
+        row(name, 120, peak - largest, note=f"peak {peak:.0f}, largest row group {largest:.0f}, {rows:.0f} messages")
+    start = time.perf_counter()
+    program = f"import sys; from tcpipe.cli import cli; sys.argv = ['tcpipe', 'inspect', {str(path)!r}]; cli()"
+    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+    row(f"tcpipe inspect of {size:.1f} GB: wall s", 1.0, time.perf_counter() - start)
+    path.unlink()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--minutes", type=float, default=5.0)
+    parser.add_argument("--rerun", metavar="PYTHON")
+    parser.add_argument("--huge", type=float, metavar="GB")
+    parser.add_argument("--only", default="", metavar="TEXT", help="mcap, zstd, other, start or huge")
+    given = parser.parse_args()
+    rerun = Rerun(given.rerun)
+    with tempfile.TemporaryDirectory() as scratch:
+        directory = Path(scratch)
+        parts: dict[str, Callable[[], None]] = {
+            "mcap": lambda: mcap_rows(directory, given.minutes, rerun),
+            "zstd": lambda: zstd_rows(directory, given.minutes, rerun),
+            "other": lambda: other_rows(directory, given.minutes, rerun),
+            "start": start_up,
+        }
+        if given.huge:
+            parts["huge"] = lambda: memory_rows(directory, given.huge)
+        print(f"{'figure':62s}   {'target':>7s}  {'result':>8s}")
+        for name, run in parts.items():
+            if given.only in name:
+                run()
+
+
+if __name__ == "__main__":
+    main()

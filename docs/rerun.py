@@ -1,0 +1,112 @@
+"""Run the commands of documentation pages and write what they print back into the pages.
+
+    python docs/rerun.py docs/tutorials/first-dataset.md docs/how-to/damaged-logs.md
+
+Blocks fenced as ``console`` hold commands after ``$ ``, blocks fenced as ``pycon`` Python after ``>>> ``; the rest of such a block is
+output and is replaced. Pages given together share one empty directory, so that a later page may use what an earlier one made; it is
+shown as ~/site-a. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA). tests/end_to_end/test_docs.py runs the
+pages the same way and compares, numbers aside.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+import subprocess
+import sys
+import tempfile
+from code import InteractiveConsole
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+SHOWN = "~/site-a"
+_BLOCK = re.compile(r"^```(console|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_MARK = "\x01"
+
+
+def rerun(text: str, directory: Path) -> str:
+    """Return a page's text with the output of its blocks as it is today; they run in ``directory``, in order."""
+    console = InteractiveConsole(locals={})
+
+    def block(found: re.Match[str]) -> str:
+        kind, body = found[1], found[2]
+        said = _shell(body, directory) if kind == "console" else _python(body, directory, console)
+        return f"```{kind}\n{said.replace(str(directory), SHOWN)}```"
+
+    return _BLOCK.sub(block, text)
+
+
+def inputs(body: str, prompt: str, goes_on: Callable[[str, str], bool]) -> list[str]:
+    """Return what is typed in a block, each input with its further lines; outputs are left out.
+
+    ``goes_on(line_before, line)`` tells whether a line belongs to the input before it.
+    """
+    typed: list[list[str]] = []
+    inside = False
+    for line in body.splitlines():
+        if inside and goes_on(typed[-1][-1], line):
+            typed[-1].append(line)
+        elif inside := line.startswith(prompt):
+            typed.append([line])
+    return ["\n".join(lines) for lines in typed]
+
+
+def _shell(body: str, directory: Path) -> str:
+    shown = inputs(body, "$ ", lambda before, _: before.endswith("\\"))
+    # The exit code of a command stays readable as $? in the next one.
+    script = "".join(f"{line.removeprefix('$ ')}\nlast=$?; printf '\\001'; (exit $last)\n" for line in shown)
+    here = Path(sys.executable).parent
+    clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")}
+    env = {**clean, "PATH": f"{here}{os.pathsep}{os.environ['PATH']}", "DATA": str(_data())}
+    done = subprocess.run(
+        ["bash", "-c", script],  # the pages are ours
+        cwd=directory, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600, check=False,
+    )  # fmt: skip
+    outputs = done.stdout.split(_MARK)
+    if len(outputs) != len(shown) + 1:
+        raise RuntimeError(f"commands did not all end: {done.stdout}")
+    return "".join(f"{line}\n{_whole(said)}" for line, said in zip(shown, outputs[:-1], strict=True)).replace(
+        str(_data()), "$DATA"
+    )
+
+
+def _whole(said: str) -> str:
+    """Return output without blanks at line ends, whole lines only, and without what is said once in an installation's life."""
+    lines = [
+        line.rstrip() for line in said.strip("\n").splitlines() if not line.startswith("compiling numeric kernels")
+    ]
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _python(body: str, directory: Path, console: InteractiveConsole) -> str:
+    shown = []
+    with contextlib.chdir(directory):
+        for block in inputs(body, ">>> ", lambda _, line: line.startswith("...")):
+            said = io.StringIO()
+            with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+                for line in block.splitlines():
+                    more = console.push(line[4:])
+                if more:
+                    console.push("")
+            shown.append(f"{block}\n{_whole(said.getvalue())}")
+    return "".join(shown)
+
+
+def _data() -> Path:
+    return Path(os.environ.get("TCPIPE_TEST_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+
+
+def main(names: Sequence[str]) -> None:
+    """Rewrite the pages named."""
+    with tempfile.TemporaryDirectory() as directory:
+        here = Path(directory).resolve()
+        for name in names:
+            page = Path(name)
+            page.write_text(rerun(page.read_text(encoding="utf-8"), here), encoding="utf-8")
+            sys.stdout.write(f"ran {page}\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,130 @@
+"""The command line, one file a command. Only click is imported here; everything else waits inside the commands."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import NoReturn
+
+import click
+
+from tcpipe import __version__
+from tcpipe.cli.add_map import add_map
+from tcpipe.cli.build_dataset import build_dataset
+from tcpipe.cli.demo import demo
+from tcpipe.cli.diff import diff
+from tcpipe.cli.explain import explain
+from tcpipe.cli.export import export
+from tcpipe.cli.ingest import ingest
+from tcpipe.cli.init import init
+from tcpipe.cli.inspect import inspect
+from tcpipe.cli.process import Ended, prepare_process
+from tcpipe.cli.report import report
+from tcpipe.cli.schemas import schemas
+from tcpipe.cli.simulate import simulate
+from tcpipe.cli.verify import verify
+from tcpipe.errors import TcpipeError, UsageError, plain_line
+
+
+class _InOrder(click.Group):
+    """Lists commands in the order a user meets them."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
+        return list(self.commands)
+
+
+@click.group(cls=_InOrder, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.version_option(__version__, prog_name="tcpipe")
+@click.option("--debug", is_flag=True, help="Show where an error comes from.")
+def cli(*, debug: bool) -> None:
+    """Turn raw robot logs into datasets that a terrain-cost model can be trained on.
+
+    \b
+    tcpipe demo                                     see everything work on a simulated site
+    tcpipe inspect run.mcap                         what is in this log, and what each topic is for
+    tcpipe ingest run.mcap                          log to 1 m segments with power, velocity, time, energy
+    tcpipe add-map site --height dem.tif --ortho ortho.tif --terrain classes.tif
+    tcpipe build-dataset --split region.geojson     segments and map to samples for any trainer
+
+    Exit codes: 0 done; 1 failed; 2 usage; 3 done in part (each failure is named, the rest is complete).
+    """  # noqa: D301  \b keeps the block's lines
+
+
+for command in (
+    demo,
+    init,
+    inspect,
+    ingest,
+    add_map,
+    build_dataset,
+    report,
+    export,
+    explain,
+    verify,
+    diff,
+    schemas,
+    simulate,
+):
+    cli.add_command(command)
+
+
+def main() -> None:
+    """Run the command line: errors become plain lines and exit codes, never a traceback (unless ``--debug``)."""
+    prepare_process()
+    try:
+        _refuse_empty(sys.argv[1:])
+        code = cli.main(prog_name="tcpipe", standalone_mode=False)
+        sys.stdout.flush()
+    except (click.exceptions.Abort, KeyboardInterrupt):
+        _fail(["interrupted; nothing is half-written, the same command goes on from here"], 128 + signal.SIGINT)
+    except Ended as ended:
+        _fail([f"{ended}; nothing is half-written, the same command goes on from here"], ended.exit_code)
+    except click.UsageError as error:
+        if not sys.argv[1:]:
+            error.show()
+            sys.exit(error.exit_code)
+        command = error.ctx.command_path if error.ctx else "tcpipe"
+        _fail([f"{error.format_message().rstrip('.')} (see {command} --help)"], error.exit_code)
+    except TcpipeError as error:
+        _fail(error.problems, error.exit_code)
+    except BrokenPipeError:
+        _drop_stdout()
+        sys.exit(1)
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        _fail([f"{where}{error.strerror or error}"], 1)
+    except Exception as error:  # noqa: BLE001  the last resort
+        _fail([f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"], 1)
+    sys.exit(code if isinstance(code, int) else 0)
+
+
+def _refuse_empty(arguments: list[str]) -> None:
+    for argument in arguments:
+        if not argument or (argument.startswith("--") and argument.endswith("=")):
+            raise UsageError(f"{argument or 'an argument'} is empty; is a variable not set?")
+
+
+def _fail(problems: Sequence[str], code: int) -> NoReturn:
+    """Say what went wrong, with ``--json`` as an object on stdout too, and exit."""
+    if "--debug" in sys.argv:
+        traceback.print_exc()
+    with suppress(OSError):
+        for problem in problems:
+            click.echo(f"tcpipe: {plain_line(problem)}", err=True)
+    try:
+        if "--json" in sys.argv:
+            click.echo(json.dumps({"exit_code": code, "problems": list(problems)}, indent=2))
+        sys.stdout.flush()
+    except OSError:
+        _drop_stdout()
+    sys.exit(code)
+
+
+def _drop_stdout() -> None:
+    """Let what nobody can read go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,26 @@
+"""``tcpipe demo``: everything, on a simulated site."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import quiet_option
+
+
+@click.command(short_help="See everything work on a simulated site")
+@click.argument("directory", default="tcpipe-demo", metavar="[DIR]")
+@click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same bytes.")
+@quiet_option
+def demo(directory: str, *, seed: int, quiet: bool) -> None:
+    """Simulate a small site and two drives, run the whole pipeline on them, and say what to open.
+
+    Writes to DIR (default: tcpipe-demo): real .mcap and .bag logs, real GeoTIFFs, a store, a dataset and its report.
+    """
+    from tcpipe.cli.output import progress
+    from tcpipe.pipeline.demo import run_demo
+
+    with progress("demo", 1, quiet=quiet) as shown:
+        result = run_demo(Path(directory), seed=seed, say=shown.line)
+    click.echo(str(result))

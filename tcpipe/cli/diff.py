@@ -1,0 +1,24 @@
+"""``tcpipe diff``: what changed between two datasets, and why."""
+
+from __future__ import annotations
+
+import click
+
+from tcpipe.cli.options import json_option
+
+
+@click.command(short_help="What changed between two datasets, by cause")
+@click.argument("a", metavar="A")
+@click.argument("b", metavar="B")
+@json_option
+def diff(a: str, b: str, *, as_json: bool) -> int:
+    """Name what changed from A to B and why (log, recipe key, map, region, code), with the labels' shift; exit code 1 if they differ."""
+    from tcpipe.cli.output import print_json, say
+    from tcpipe.pipeline.diff import diff as run
+
+    found = run(a, b)
+    if as_json:
+        print_json({"same": found.same, "difference": found})
+    else:
+        say(str(found))
+    return 0 if found.same else 1

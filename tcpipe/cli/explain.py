@@ -1,0 +1,27 @@
+"""``tcpipe explain``: where a sample came from."""
+
+from __future__ import annotations
+
+import click
+
+from tcpipe.cli.options import json_option, quiet_option, store_option
+
+
+@click.command(short_help="Where a sample came from; make it again")
+@click.argument("sample_id", metavar="SAMPLE_ID")
+@click.option("--dataset", default="dataset", show_default=True, metavar="DIR", help="The dataset that holds it.")
+@store_option
+@json_option
+@quiet_option
+def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
+    """Trace SAMPLE_ID to its log, stamps, messages, gates nearby, map tiles and recipe, and make it again: exit code 1 if it differs."""
+    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.pipeline.explain import explain as run
+
+    with progress("explain", 1, quiet=quiet):
+        found = run(sample_id, dataset=dataset, store=store)
+    if as_json:
+        print_json(found)
+    else:
+        say(str(found))
+    return 1 if found.differences else 0

@@ -1,0 +1,26 @@
+"""``tcpipe init``: a commented recipe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command(short_help="Write a commented recipe")
+@click.argument("directory", default=".", metavar="[DIR]")
+def init(directory: str) -> None:
+    """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out."""
+    from tcpipe.cli.output import say
+    from tcpipe.errors import UsageError
+    from tcpipe.formats.atomic import write_text
+    from tcpipe.formats.recipe_toml import FILE_NAME, commented_toml
+
+    path = Path(directory) / FILE_NAME
+    if not path.exists():
+        write_text(path, commented_toml())
+        say(f"wrote {path}")
+    elif path.is_file() and path.read_bytes() == commented_toml().encode():
+        say(f"nothing to do: {path} is there already")
+    else:
+        raise UsageError(f"{path}: is there already and holds something else; it is never overwritten")

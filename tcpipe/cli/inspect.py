@@ -1,0 +1,203 @@
+"""``tcpipe inspect``: what a log, a map, a dataset, a run or a store holds."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tcpipe.cli.options import json_option, msgdef_option, recipe_option
+from tcpipe.cli.output import say
+
+
+@click.command(short_help="What is in a log, map, dataset or store")
+@click.argument("path", metavar="PATH")
+@click.option("--full", is_flag=True, help="Read everything: damage and gaps, not the index alone.")
+@click.option("--robot", metavar="NAME", help="Robot profile.")
+@recipe_option
+@msgdef_option
+@json_option
+def inspect(path: str, *, full: bool, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool) -> int:
+    """Show what PATH holds: a log's topics, types, rates, and which topic plays which role and why; a map; a dataset; a run; a store."""
+    from tcpipe.cli.output import print_json, ruling_recipe
+    from tcpipe.pipeline.inspect import inspect as run
+
+    ruling, _ = ruling_recipe(recipe)
+    definitions = Path(msgdef) if msgdef else None
+    found = run(path, recipe=ruling, robot=robot, full=full, message_definitions=definitions)
+    if as_json:
+        print_json(found)
+    else:
+        _PRINTERS[found["kind"]](found)
+    return _exit_code(found) if found["kind"] in ("log", "logs") else 0
+
+
+def _exit_code(found: Mapping[str, Any]) -> int:
+    logs = found.get("logs", [found])
+    failed = ["topics" not in log for log in logs]
+    if all(failed):
+        return 1
+    return 3 if any(failed) or any(log["damage"] for log in logs if "topics" in log) else 0
+
+
+def _print_logs(found: Mapping[str, Any]) -> None:
+    for log in found["logs"]:
+        _print_log(log)
+        say("")
+
+
+def _print_log(log: Mapping[str, Any]) -> None:
+    if "topics" not in log:
+        for problem in log["problems"]:
+            say(problem)
+        return
+    duration = "" if log["duration_s"] is None else f", {log['duration_s']:.1f} s"
+    say(f"{log['path']}: {log['container']}, {log['size_bytes'] / 1e6:.1f} MB{duration}")
+    say(f"robot {log['robot']}: {log['robot_why']}")
+    say("")
+    full = any("messages_read" in topic for topic in log["topics"])
+    header = ["topic", "type", "messages", "Hz", "role", "why", *(_READ_HEADER if full else [])]
+    rows = [
+        [
+            topic["name"],
+            topic["type"],
+            _text(topic["messages"]),
+            _text(topic["rate_hz"]),
+            topic["role"] or "",
+            topic["why"] or "",
+            *(_read_cells(topic) if full else []),
+        ]
+        for topic in log["topics"]
+    ]
+    _print_table(header, rows)
+    if full:
+        _print_clocks(log)
+    if log["problems"]:
+        say("to be decided:")
+    for line in log["problems"]:
+        say(f"  {line}")
+    for kind in ("warnings", "damage", "remarks"):
+        for line in log[kind]:
+            say(f"{kind.rstrip('s')}: {line}")
+
+
+_READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps"]
+
+
+def _read_cells(topic: Mapping[str, Any]) -> list[str]:
+    """Return what reading everything found of a topic, in the order of the header."""
+    kinds = ("zero", "backward", "repeated")
+    odd = [f"{topic[f'{kind}_stamps']} {kind}" for kind in kinds if topic.get(f"{kind}_stamps")]
+    values = [topic.get(name) for name in ("messages_read", "gaps", "longest_gap_s", "time", "header_minus_log_s")]
+    return [*map(_text, values), ", ".join(odd)]
+
+
+def _print_clocks(log: Mapping[str, Any]) -> None:
+    for step in log["clock_steps"]:
+        say(f"clock step: {step['step_s']:+.3f} s at log time {step['log_time_ns']} ns on {', '.join(step['topics'])}")
+    for topic in log["simulated_headers"]:
+        say(f"simulated time: the headers of {topic} are not the wall clock's")
+    for topic in log["topics"]:
+        if topic.get("time") == "log":
+            say(f"log time rules on {topic['name']}: {topic['time_why']}")
+
+
+def _print_map(found: Mapping[str, Any]) -> None:
+    size = " x ".join(f"{found[side] * found['pitch_m']:.1f} m" for side in ("cols", "rows"))
+    say(f"{found['path']}: {size} at {found['pitch_m']:g} m a pixel in {found['crs']}")
+    say("")
+    rows = [[layer, found["sources"][layer], f"{found['covered'][layer]:.1%}"] for layer in found["layers"]]
+    _print_table(["layer", "made from", "covered"], rows)
+    say("")
+    say(f"height: {found['height_min_m']:.1f} m to {found['height_max_m']:.1f} m")
+    share = found["class_share"]
+    classes = [
+        [str(c["id"]), c["name"], "yes" if c["traversable"] else "no", f"{share.get(c['name'], 0.0):.1%}"]
+        for c in found["class_table"]
+    ]
+    if "terrain" in found["layers"]:
+        say("")
+        _print_table(["id", "class", "traversable", "share"], classes)
+    for line in found["warnings"]:
+        say(f"warning: {line}")
+
+
+def _print_dataset(found: Mapping[str, Any]) -> None:
+    say(
+        f"{found['path']}: dataset {found['name']}, {found['samples']} samples of {', '.join(found['robots'])}, "
+        f"format {found['format']}, data model {found['data_model_version']}"
+    )
+    say("")
+    names = [
+        entry["name"] for entry in found["classes"] if any(entry["name"] in of for of in found["terrain"].values())
+    ]
+    rows = [
+        [split, str(found["splits"][split]), *(str(found["terrain"].get(split, {}).get(name, 0)) for name in names)]
+        for split in ("train", "test", "unseen", "buffer")
+    ]
+    _print_table(["split", "samples", *names], rows)
+    say("")
+    say(f"layers: {', '.join(found['layers'])}; labels: {', '.join(found['label']['columns'])}")
+    say(
+        f"runs: {', '.join(run['run_id'] for run in found['runs'])}; map: {', '.join(m['name'] for m in found['maps'])}"
+    )
+    for line in found["warnings"]:
+        say(f"warning: {line}")
+
+
+def _print_store(found: Mapping[str, Any]) -> None:
+    runs = len({run["run_id"] for run in found["runs"]})
+    say(f"{found['path']}: {runs} run{'' if runs == 1 else 's'}, maps: {', '.join(found['maps']) or 'none'}")
+    say("")
+    rows = [
+        [
+            run["run_id"],
+            run["recipe_id"],
+            run["robot"],
+            str(run["segments"]),
+            f"{run['distance_m']:.1f}",
+            str(run["damage"]),
+        ]
+        for run in found["runs"]
+    ]
+    _print_table(["run", "recipe", "robot", "segments", "metres", "damage"], rows)
+    for run_id in found["unfinished"]:
+        say(f"not finished: {run_id}; ingest its log again")
+
+
+def _print_run(found: Mapping[str, Any]) -> None:
+    say(f"{found['run_id']}: from {' + '.join(found['source'].get('paths', ['an unknown log']))}")
+    if found["tags"]:
+        say("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found["tags"].items())))
+    for run in found["recipes"]:
+        ledger = run["ledger_m"]
+        say("")
+        say(f"recipe {run['recipe_id']}: {run['segments']} segments of robot {run['robot']}")
+        lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
+        said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
+        say(f"{run['distance_m']:.1f} m driven: {said}" if said else "not driven")
+        for kind in ("warnings", "damage"):
+            for line in run[kind]:
+                say(f"{kind.rstrip('s')}: {line}")
+
+
+def _text(value: object) -> str:
+    return "" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
+
+
+def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    widths = [max(len(row[i]) for row in (header, *rows)) for i in range(len(header))]
+    for row in (header, *rows):
+        say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+_PRINTERS = {
+    "log": _print_log,
+    "logs": _print_logs,
+    "map": _print_map,
+    "dataset": _print_dataset,
+    "run": _print_run,
+    "store": _print_store,
+}

@@ -1,0 +1,60 @@
+"""Options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import click
+
+Command = Callable[..., Any]
+
+
+def store_option(function: Command) -> Command:
+    """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
+    return click.option(
+        "--store",
+        envvar="TCPIPE_STORE",
+        default="tcpipe-store",
+        show_default=True,
+        metavar="DIR",
+        help="Where runs and maps are kept (or TCPIPE_STORE).",
+    )(function)
+
+
+def recipe_option(function: Command) -> Command:
+    """``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
+    return click.option(
+        "--recipe",
+        type=click.Path(dir_okay=False),
+        metavar="FILE",
+        help="Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).",
+    )(function)
+
+
+def msgdef_option(function: Command) -> Command:
+    """``--msgdef``: definitions of types that a log does not define."""
+    return click.option(
+        "--msgdef",
+        type=click.Path(exists=True, file_okay=False),
+        metavar="DIR",
+        help="Directory of package/msg/Name.msg (or .idl) files for types the log does not define.",
+    )(function)
+
+
+def json_option(function: Command) -> Command:
+    """``--json``: one JSON object on stdout instead of text."""
+    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")(function)
+
+
+def quiet_option(function: Command) -> Command:
+    """``--quiet``: no progress on stderr."""
+    return click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")(function)
+
+
+def tag_values(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
+    """Turn ``K=V`` pairs into a dict; a pair without key or '=' is a usage error."""
+    for value in values:
+        if value.find("=") < 1:
+            raise click.BadParameter(f"{value!r}: wanted KEY=VALUE", ctx=context, param=parameter)
+    return dict(value.split("=", 1) for value in values)

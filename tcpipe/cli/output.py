@@ -1,0 +1,115 @@
+"""What commands print: progress on stderr, results on stdout."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import click
+
+from tcpipe.errors import plain_line
+
+if TYPE_CHECKING:
+    from tcpipe.recipe import Recipe
+
+
+def ruling_recipe(explicit: str | None) -> tuple[Recipe, str]:
+    """Return the recipe that rules here and where it comes from, for printing."""
+    from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+
+    path = find_recipe(None if explicit is None else Path(explicit), Path.cwd())
+    return load_recipe(path), "built-in defaults" if path is None else str(path)
+
+
+@contextmanager
+def progress(what: str, total: int, *, quiet: bool) -> Iterator[Progress]:
+    """Show progress on stderr: a bar on a terminal, plain lines otherwise, nothing with ``quiet``."""
+    shown = Progress(what, total, quiet=quiet)
+    handler = _Lines(shown)
+    logger = logging.getLogger("tcpipe")
+    logger.setLevel(logging.ERROR if quiet else logging.INFO)
+    logger.addHandler(handler)
+    try:
+        with shown:
+            yield shown
+    finally:
+        logger.removeHandler(handler)
+
+
+class Progress:
+    """A bar, lines, or silence; ``line`` says something, ``step`` counts one done."""
+
+    def __init__(self, what: str, total: int, *, quiet: bool) -> None:
+        self._quiet = quiet
+        self._bar: Any = None
+        if not quiet and sys.stderr.isatty():
+            from rich.console import Console
+            from rich.progress import Progress as Bar
+
+            self._bar = Bar(console=Console(stderr=True), transient=True)
+            self._task = self._bar.add_task(what, total=total)
+
+    def __enter__(self) -> Self:
+        """Start the bar."""
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Remove the bar."""
+        if self._bar is not None:
+            self._bar.stop()
+
+    def line(self, text: str) -> None:
+        """Say one line."""
+        if not self._quiet:
+            self._say(text)
+
+    def problem(self, *lines: str) -> None:
+        """Say what went wrong, also where progress is not wanted."""
+        for text in lines:
+            self._say(f"tcpipe: {text}")
+
+    def _say(self, text: str) -> None:
+        with suppress(OSError):  # nobody listening is no reason to stop
+            if self._bar is not None:
+                self._bar.console.print(plain_line(text), markup=False, highlight=False)
+            else:
+                click.echo(plain_line(text), err=True)
+
+    def expect(self, total: int) -> None:
+        """Say how many there are."""
+        if self._bar is not None:
+            self._bar.update(self._task, total=total)
+
+    def step(self) -> None:
+        """Count one done."""
+        if self._bar is not None:
+            self._bar.advance(self._task)
+
+
+class _Lines(logging.Handler):
+    """Sends what the pipeline says to the progress display."""
+
+    def __init__(self, shown: Progress) -> None:
+        super().__init__()
+        self._shown = shown
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._shown.line(record.getMessage())
+
+
+def say(text: str) -> None:
+    """Print one line of the result on stdout."""
+    click.echo(plain_line(text))
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON object on stdout."""
+    from tcpipe.formats.json_files import to_json
+
+    click.echo(to_json(value), nl=False)

@@ -1,0 +1,21 @@
+"""``tcpipe report``: one HTML page for a run, a dataset or a store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command(short_help="HTML page of a run, dataset or store")
+@click.argument("path", metavar="PATH")
+def report(path: str) -> None:
+    """Write report.html for PATH: a run directory, a dataset, or a store (one page a run). The page needs no network."""
+    from tcpipe.cli.output import say
+    from tcpipe.pipeline.report import report as run
+
+    written = run(Path(path))
+    for page in written:
+        say(str(page.path))
+    if not any(page.changed for page in written):
+        say("nothing to do: the pages are there as they would be written")

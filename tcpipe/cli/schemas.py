@@ -1,0 +1,22 @@
+"""``tcpipe schemas``: the contracts as JSON Schema."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+
+@click.command(short_help="The contracts as JSON Schema")
+@click.argument("out", metavar="OUT")
+def schemas(out: str) -> None:
+    """Write the contract of every table and of the recipe as JSON Schema, one file each, to OUT."""
+    from tcpipe.cli.output import say
+    from tcpipe.formats.atomic import write_text
+    from tcpipe.formats.contracts import contracts
+
+    wanted = {Path(out) / name: text for name, text in contracts().items()}
+    missing = {path: text for path, text in wanted.items() if not path.is_file() or path.read_bytes() != text.encode()}
+    for path, text in missing.items():
+        write_text(path, text)
+    say(f"wrote {len(missing)} schemas to {out}" if missing else f"nothing to do: {len(wanted)} schemas are in {out}")

@@ -1,0 +1,37 @@
+"""``tcpipe simulate``: a site, drives and their truth as real files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import json_option, quiet_option
+
+
+@click.command(short_help="A simulated site with its truth")
+@click.argument("out", metavar="OUT")
+@click.option(
+    "--scenario",
+    default="demo",
+    show_default=True,
+    metavar="NAME",
+    help="demo, hills12, paper, manoeuvres, tiny; see docs/reference/simulation.md.",
+)
+@click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same bytes.")
+@json_option
+@quiet_option
+def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:
+    """Write a simulated site to OUT: real .mcap and .bag logs, real GeoTIFFs, and the truth behind them."""
+    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.simulation import simulate as run
+
+    with progress("simulate", 1, quiet=quiet):
+        site = run(Path(out), scenario=scenario, seed=seed)
+    if as_json:
+        print_json(site)
+    else:
+        for path in (*site.logs, *site.rasters.values(), site.region, *site.truths):
+            say(str(path))
+        if site.unchanged:
+            say(f"nothing to do: the site is in {out} already")

@@ -1,0 +1,25 @@
+"""``tcpipe verify``: is everything still as it was written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import json_option
+
+
+@click.command(short_help="Re-read everything, compare counts and checksums")
+@click.argument("path", metavar="PATH")
+@json_option
+def verify(path: str, *, as_json: bool) -> int:
+    """Re-read the dataset, run, store or map at PATH and compare counts, checksums and contracts; exit code 1 if anything differs."""
+    from tcpipe.cli.output import print_json, say
+    from tcpipe.pipeline.verify import verify as run
+
+    found = run(Path(path))
+    if as_json:
+        print_json(found)
+    else:
+        say(str(found))
+    return 1 if found.problems else 0

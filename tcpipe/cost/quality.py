@@ -1,0 +1,82 @@
+"""Quality bits: what a user may want to know of a label before trusting it; none of them removes a segment."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.cost.noise import median_period_s
+from tcpipe.cost.power import Rail, Samples
+from tcpipe.tables.bits import Quality
+
+Floats = NDArray[np.float64]
+MIN_INSTANTANEOUS_HZ = 10.0
+MIN_AVERAGED_HZ = 2.0
+_RATE_TOLERANCE = 0.98  # a 10 Hz source is 10 Hz though its stamps jitter
+
+
+def bits(flags: dict[Quality, NDArray[np.bool_]], count: int) -> NDArray[np.uint32]:
+    """Return the flags of ``count`` segments as bits, shape (M,)."""
+    quality = np.zeros(count, dtype=np.uint32)
+    for bit, flagged in flags.items():
+        quality[flagged] |= np.uint32(bit)
+    return quality
+
+
+def low_power_rate(rails: list[Rail], *, averaged: bool) -> bool:
+    """Return whether the voltage or current of any rail comes more slowly than 10 Hz (2 Hz if averaged by its source)."""
+    slowest = max((median_period_s(s) for each in rails for s in (each.voltage, each.current)), default=0.0)
+    return (
+        1.0 / slowest < _RATE_TOLERANCE * (MIN_AVERAGED_HZ if averaged else MIN_INSTANTANEOUS_HZ) if slowest else False
+    )
+
+
+def voltage_outside(
+    rails: list[Rail], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], *, range_volt: tuple[float, float] | None
+) -> NDArray[np.bool_]:
+    """Return the spans that touch a voltage sample outside the range [V], shape (M,); none without a range."""
+    outside = np.zeros(len(start_ns), dtype=np.bool_)
+    if range_volt is not None:
+        for each in rails:
+            outside |= _touches_outside(each.voltage, start_ns, end_ns, range_volt)
+    return outside
+
+
+def _touches_outside(
+    voltage: Samples, start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], range_volt: tuple[float, float]
+) -> NDArray[np.bool_]:
+    low, high = range_volt
+    bad = np.concatenate(([0], np.cumsum((voltage.value < low) | (voltage.value > high))))
+    first = np.maximum(np.searchsorted(voltage.stamp_ns, start_ns, side="right") - 1, 0)
+    last = np.minimum(np.searchsorted(voltage.stamp_ns, end_ns, side="left") + 1, len(voltage.value))
+    return bad[last] > bad[first]
+
+
+def near(position_m: Floats, start_m: Floats, end_m: Floats, *, within_m: float) -> NDArray[np.bool_]:
+    """Return the spans of path length that have one of the positions inside or within a distance of either end, shape (M,).
+
+    Parameters
+    ----------
+    position_m : [m], shape (G,), path lengths at which gaps begin or end.
+    start_m, end_m : [m], shape (M,), path lengths of the spans.
+    within_m : [m].
+    """
+    ordered = np.sort(position_m)
+    first = np.searchsorted(ordered, start_m - within_m, side="left")
+    last = np.searchsorted(ordered, end_m + within_m, side="right")
+    return last > first
+
+
+def slipping(wheel_mps: Floats, ground_mps: Floats, *, above: float = 0.2) -> NDArray[np.bool_]:
+    """Return where wheel and body speed along the ground differ by more than a share of the wheel speed; not where it is unknown.
+
+    Parameters
+    ----------
+    wheel_mps, ground_mps : [m/s], shape (M,), means over the segment along the body's x axis: both along the slope, not horizontal.
+    """
+    return np.abs(wheel_mps - ground_mps) > above * np.abs(wheel_mps)
+
+
+def means_differ(mean_watt: Floats, power_watt: Floats, *, above: float = 0.05) -> NDArray[np.bool_]:
+    """Return where the plain mean of the power samples is off the time-weighted mean by more than a share of it; not where unknown."""
+    return np.abs(mean_watt - power_watt) > above * np.abs(power_watt)

@@ -1,0 +1,124 @@
+"""Batches of a split, epoch by epoch: numpy arrays for Keras, JAX, torch or any loop."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from tcpipe.dataset.split import Split
+
+Ints = NDArray[np.int64]
+Batch = tuple[Any, ...]
+
+_FLIPPED = ("cross_slope_rad",)
+"""Columns whose sign changes when a sample is mirrored across its direction of travel."""
+
+_POOL_PIECES = 16
+"""Pieces whose samples are shuffled among each other: 4096 samples of a Zarr dataset, 26 MB."""
+
+
+@dataclass(frozen=True, slots=True)
+class BatchRules:
+    """How batches are made: what `Split.batches` was given."""
+
+    size: int
+    shuffle: bool
+    seed: int
+    mirror: bool
+    weights: bool
+    features: tuple[str, ...]
+    drop_last: bool
+    from_disk: bool
+    shard: tuple[int, int] = (0, 1)
+    """Number of this part of the split and of all its parts."""
+
+
+class Batches:
+    """Batches of one split; iterating again is the next epoch, with its own shuffle.
+
+    Each batch is ``(patches, labels)``, or ``(patches, labels, weights)`` with ``weights``, which is what Keras takes as it is; with
+    ``features``, patches are replaced by ``(patches, features)``.
+    """
+
+    def __init__(self, split: Split, rules: BatchRules) -> None:
+        self._split = split
+        self._rules = rules
+        self._next = 0
+        number, count = rules.shard
+        self._samples: Ints = np.arange(len(split))
+        if count > 1 and rules.from_disk:
+            piece_of = split.view.stored.pieces_of(split.view.at)
+            self._samples = np.flatnonzero(np.isin(piece_of, np.unique(piece_of)[number::count]))
+        elif count > 1:
+            self._samples = self._samples[number::count]
+
+    def __len__(self) -> int:
+        """Return the number of batches in an epoch."""
+        n, size = len(self._samples), self._rules.size
+        return n // size if self._rules.drop_last else -(-n // size)
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Iterate over the next epoch."""
+        self._next += 1
+        return self.epoch(self._next - 1)
+
+    def part(self, number: int, count: int) -> Batches:
+        """Return the batches of one of ``count`` parts of the split, for processes that divide it among them."""
+        return Batches(self._split, replace(self._rules, shard=(number, count)))
+
+    def forever(self) -> Iterator[Batch]:
+        """Iterate over epoch after epoch without an end; Keras wants ``steps_per_epoch=len(batches)`` with it."""
+        return itertools.chain.from_iterable(self.epoch(number) for number in itertools.count())
+
+    def epoch(self, number: int) -> Iterator[Batch]:
+        """Iterate over one epoch; the same number gives the same batches."""
+        rules = self._rules
+        mirrors = np.random.default_rng([rules.seed, number, 1])
+        for pixels, rows, samples in self._full(np.random.default_rng([rules.seed, number])):
+            for first in range(0, len(rows), rules.size):
+                cut = slice(first, first + rules.size)
+                yield self._batch(pixels, rows[cut], samples[cut], mirrors)
+
+    def _full(self, rng: np.random.Generator) -> Iterator[tuple[dict[str, NDArray[Any]], Ints, Ints]]:
+        """Yield pixels, rows in them and the samples that these are: whole batches, but for the last ones of the epoch."""
+        rules, split, mine = self._rules, self._split, self._samples
+        layers = split.view.form.layers
+        if not rules.from_disk:
+            order = mine[rng.permutation(len(mine))] if rules.shuffle else mine
+            samples = order[: len(self) * rules.size]
+            yield split.view.stored.in_memory(layers), split.view.at[samples], samples
+            return
+        pool: dict[str, NDArray[Any]] = {}
+        left = np.empty(0, np.int64)  # samples that wait at the head of the pool for their batch to fill
+        shuffler = rng if rules.shuffle else None
+        for pool, found, which in split.view.stored.pools(
+            split.view.at[mine], layers, pieces=_POOL_PIECES, spare=rules.size, rng=shuffler
+        ):
+            rows, samples = np.append(np.arange(len(left)), found), np.append(left, mine[which])
+            full = len(rows) // rules.size * rules.size
+            yield pool, rows[:full], samples[:full]
+            left = samples[full:]
+            for pixels in pool.values():
+                pixels[: len(left)] = pixels[rows[full:]]
+        if len(left) and not rules.drop_last:
+            yield pool, np.arange(len(left)), left
+
+    def _batch(self, pixels: dict[str, NDArray[Any]], rows: Ints, samples: Ints, mirrors: np.random.Generator) -> Batch:
+        split, rules = self._split, self._rules
+        mirrored = mirrors.random(len(rows)) < 0.5 if rules.mirror else np.zeros(len(rows), np.bool_)
+        patches: Any = split.view.form.form(pixels, rows, mirrored)
+        if rules.features:
+            patches = (patches, _features(split, rules.features, samples, mirrored))
+        batch = (patches, split.labels[samples])
+        return (*batch, split.weights[samples]) if rules.weights else batch
+
+
+def _features(split: Split, names: tuple[str, ...], samples: Ints, mirrored: NDArray[np.bool_]) -> NDArray[np.float32]:
+    columns = [np.where(mirrored & (name in _FLIPPED), -1.0, 1.0) * split.column(name)[samples] for name in names]
+    return np.column_stack(columns).astype(np.float32)

@@ -1,0 +1,83 @@
+"""A dataset as a mapping of its splits."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tcpipe.dataset.pixels import StoredPixels
+from tcpipe.dataset.split import SampleColumns, Split, View
+from tcpipe.dataset.tensor import tensor_form
+from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files
+from tcpipe.tables.levels import DATA_MODEL_VERSION
+
+
+class Dataset(Mapping[str, Split]):
+    """The splits ``train``, ``test``, ``unseen`` and ``buffer`` by name (a split may be empty), and the card."""
+
+    def __init__(self, path: Path, card: Mapping[str, Any], splits: Mapping[str, Split]) -> None:
+        self.path = path
+        self.card = card
+        self._splits = dict(splits)
+
+    def __getitem__(self, name: str) -> Split:
+        """Return one split."""
+        try:
+            return self._splits[name]
+        except KeyError:
+            raise KeyError(f"{self.path}: no split {name!r}; there are {', '.join(self._splits)}") from None
+
+    def __iter__(self) -> Iterator[str]:
+        """Iterate over the names of the splits."""
+        return iter(self._splits)
+
+    def __len__(self) -> int:
+        """Return the number of splits."""
+        return len(self._splits)
+
+    def __repr__(self) -> str:
+        """Name the dataset and its splits."""
+        counts = ", ".join(f"{name} {len(split)}" for name, split in self._splits.items())
+        return f"Dataset({str(self.path)!r}: {counts})"
+
+
+def open_dataset(path: str | Path) -> Dataset:
+    """Open a dataset that ``tcpipe build-dataset`` wrote.
+
+    Parameters
+    ----------
+    path
+        Its directory, of either format.
+
+    Returns
+    -------
+    A mapping from ``train``, ``test``, ``unseen``, ``buffer`` to `Split`; patches are read when they are asked for.
+
+    Raises
+    ------
+    DatasetError
+        There is no dataset, it is of another data model, or its samples do not fit its card.
+
+    """
+    directory = Path(path)
+    card = read_card(directory)
+    if card["data_model_version"] != DATA_MODEL_VERSION:
+        raise DatasetError(
+            f"{directory}: written by data model {card['data_model_version']}, wanted {DATA_MODEL_VERSION}; build it again"
+        )
+    split = read_samples(directory, ["split"]).column("split").to_numpy()
+    if len(split) != card["samples"]:
+        raise DatasetError(
+            f"{directory}: samples.parquet has {len(split)} rows, its card says {card['samples']}; build it again"
+        )
+    files = open_patches(directory, card)
+    form = tensor_form(files.layers, files.layers, max((entry["id"] for entry in card["classes"]), default=1))
+    parts = {}
+    for name, rows in rows_in_files(card, split).items():
+        columns = SampleColumns(directory, np.flatnonzero(split == name))
+        parts[name] = Split(name, card, columns, View(StoredPixels(files, rows), np.arange(len(rows)), form))
+    return Dataset(directory, card, parts)

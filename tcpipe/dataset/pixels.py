@@ -1,0 +1,121 @@
+"""The stored layers of a split: from memory where they fit, else decoded piece by piece."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.formats.dataset_files import PatchFiles, layer_dtype
+
+Ints = NDArray[np.int64]
+Pixels = dict[str, NDArray[Any]]
+
+IN_MEMORY_BYTES = 2 << 30
+"""A split whose stored layers are smaller is kept in memory; the paper's whole dataset takes 70 MB."""
+
+CACHED_PIECES = 64
+"""Pieces kept for reading at random from a split that is not in memory."""
+
+
+class StoredPixels:
+    """Layers of N samples; ``rows`` says where each lies in the order of the files, (N,)."""
+
+    def __init__(self, files: PatchFiles, rows: Ints) -> None:
+        self.files = files
+        self.rows = rows
+        self._memory: Pixels = {}
+        self._pieces: OrderedDict[tuple[int, tuple[str, ...]], Pixels] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave pixels behind when a loader's worker process receives them."""
+        return {**self.__dict__, "_memory": {}, "_pieces": OrderedDict()}
+
+    def fit(self, layers: Sequence[str]) -> bool:
+        """Return whether the layers are kept in memory."""
+        per_pixel = sum(np.dtype(layer_dtype(layer)).itemsize for layer in layers)
+        return len(self.rows) * self.files.patch_px**2 * per_pixel <= IN_MEMORY_BYTES
+
+    def in_memory(self, layers: Sequence[str]) -> Pixels:
+        """Return the layers of all samples, read once and kept, each of shape (N, px, px)."""
+        absent = [layer for layer in layers if layer not in self._memory]
+        if absent:
+            self._memory.update(self._read(self.rows, absent))
+        return {layer: self._memory[layer] for layer in layers}
+
+    def gather(self, at: Ints, layers: Sequence[str]) -> Pixels:
+        """Return the layers of the samples ``at``, each of shape (B, px, px)."""
+        if self.fit(layers):
+            return {layer: pixels[at] for layer, pixels in self.in_memory(layers).items()}
+        return self._read(self.rows[at], layers)
+
+    def pieces_of(self, at: Ints) -> Ints:
+        """Return the piece that holds each of the samples ``at``, (M,)."""
+        return np.asarray(np.searchsorted(self.files.starts, self.rows[at], side="right") - 1)
+
+    def pools(
+        self, at: Ints, layers: Sequence[str], *, pieces: int, spare: int, rng: np.random.Generator | None
+    ) -> Iterator[tuple[Pixels, Ints, Ints]]:
+        """Yield the samples ``at`` in pools of so many pieces, each piece decoded once.
+
+        Parameters
+        ----------
+        at
+            Samples, shape (M,).
+        layers
+            Which layers.
+        pieces
+            Pieces in a pool.
+        spare
+            Rows at the head of the pool's arrays that are left to the caller, from one pool to the next.
+        rng
+            Shuffles the pieces, and the samples within each pool; None keeps the order of the files.
+
+        Yields
+        ------
+        Arrays of the pool, which the next one overwrites; rows in them, and which of ``at`` these are, both (B,).
+
+        """
+        files, rows, piece_of = self.files, self.rows[at], self.pieces_of(at)
+        order = np.argsort(piece_of, kind="stable")
+        parts = np.split(order, np.flatnonzero(np.diff(piece_of[order])) + 1) if len(order) else []
+        if rng is not None:
+            parts = [parts[number] for number in rng.permutation(len(parts))]
+        shape = (spare + min(pieces, len(parts)) * files.piece_rows, files.patch_px, files.patch_px)
+        pool = {layer: np.empty(shape, layer_dtype(layer)) for layer in layers}
+        for first in range(0, len(parts), pieces):
+            here, places = parts[first : first + pieces], []
+            for number, part in enumerate(here):
+                piece, head = int(piece_of[part[0]]), spare + number * files.piece_rows
+                files.read(piece, layers, out={layer: pixels[head:] for layer, pixels in pool.items()})
+                places.append(rows[part] - files.starts[piece] + head)
+            found, which = np.concatenate(places), np.concatenate(here)
+            shuffled = np.arange(len(found)) if rng is None else rng.permutation(len(found))
+            yield pool, found[shuffled], which[shuffled]
+
+    def _read(self, rows: Ints, layers: Sequence[str]) -> Pixels:
+        """Read the pieces that hold ``rows`` (of the files), each once."""
+        px = self.files.patch_px
+        out: Pixels = {layer: np.empty((len(rows), px, px), layer_dtype(layer)) for layer in layers}
+        piece_of = np.searchsorted(self.files.starts, rows, side="right") - 1
+        for piece in np.unique(piece_of).tolist():
+            here = np.flatnonzero(piece_of == piece)
+            pixels = self._piece(piece, tuple(layers))
+            for layer in layers:
+                out[layer][here] = pixels[layer][rows[here] - self.files.starts[piece]]
+        return out
+
+    def _piece(self, piece: int, layers: tuple[str, ...]) -> Pixels:
+        key = (piece, layers)
+        if key in self._pieces:
+            self._pieces.move_to_end(key)
+            return self._pieces[key]
+        pixels = self.files.read(piece, layers)
+        if not self.fit(layers):  # else every piece is read once and never again
+            self._pieces[key] = pixels
+            if len(self._pieces) > CACHED_PIECES:
+                self._pieces.popitem(last=False)
+        return pixels

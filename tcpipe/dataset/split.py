@@ -1,0 +1,255 @@
+"""One split: the paper's patches and labels as arrays, as batches, and as a map-style dataset for any trainer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import ArrayLike, NDArray
+
+from tcpipe.dataset.batches import Batches, BatchRules
+from tcpipe.dataset.pixels import StoredPixels
+from tcpipe.dataset.tensor import TensorForm, tensor_form
+from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_files import read_samples
+from tcpipe.tables.bits import Quality
+
+if TYPE_CHECKING:
+    from tcpipe.dataset.torch_data import TorchBatches
+
+Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+
+_MIN_STD = 0.1
+"""Standard deviations are taken as at least this share of their median, so that no sample outweighs a hundred."""
+
+
+@dataclass(slots=True)
+class SampleColumns:
+    """Columns of samples.parquet for some of its rows, read when they are asked for."""
+
+    directory: Path
+    rows: Ints
+    _read: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        """Return one column, nulls as NaN or None, shape (N,)."""
+        if name not in self._read:
+            whole = read_samples(self.directory, [name])
+            if name not in whole.column_names:
+                raise DatasetError(f"{self.directory}: its samples have no column {name!r}")
+            self._read[name] = whole.column(name).take(pa.array(self.rows)).to_numpy()
+        return self._read[name]
+
+    def table(self) -> pa.Table:
+        """Return all columns."""
+        return read_samples(self.directory).take(pa.array(self.rows))
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Which of the stored samples a split has, ``at``, (N,), and how their tensors are formed."""
+
+    stored: StoredPixels
+    at: Ints
+    form: TensorForm
+
+
+class Split:
+    """Samples of one split, in the dataset's order; every method that narrows it returns another one over the same files.
+
+    Attributes
+    ----------
+    name
+        ``train``, ``test``, ``unseen`` or ``buffer``.
+    view
+        Where its pixels come from.
+
+    """
+
+    def __init__(self, name: str, card: Mapping[str, Any], columns: SampleColumns, view: View) -> None:
+        self.name = name
+        self.view = view
+        self._card = card
+        self._columns = columns
+        self._labels: Floats | None = None
+        self._weights: Floats | None = None
+        self._patches: Floats | None = None
+
+    def __len__(self) -> int:
+        """Return the number of samples."""
+        return len(self.view.at)
+
+    def __repr__(self) -> str:
+        """Name the split, its size and its channels."""
+        return f"Split({self.name!r}: {len(self)} samples of {', '.join(self.channels)})"
+
+    def __getitem__(self, index: int) -> tuple[Floats, Floats]:
+        """Return the patch, shape (px, px, channels) in [0, 1], and the labels, shape (2,), of one sample."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"sample {index} of {len(self)} in split {self.name}")
+        patches, labels = self.batch([index])
+        return patches[0], labels[0]
+
+    def __getitems__(self, indices: Sequence[int]) -> list[tuple[Floats, Floats]]:
+        """Return many samples at once; torch's loader asks for whole batches this way."""
+        patches, labels = self.batch(indices)
+        return list(zip(patches, labels, strict=True))
+
+    def __iter__(self) -> Iterator[tuple[Floats, Floats]]:
+        """Iterate over the samples in order."""
+        return (
+            (patch, label) for patches, labels in self.batches(64) for patch, label in zip(patches, labels, strict=True)
+        )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave formed tensors behind when a loader's worker process receives the split."""
+        return {**self.__dict__, "_patches": None}
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """The tensor's channels: ortho, terrain, height, or those of them that the map has, unless others were chosen."""
+        return self.view.form.channels
+
+    @property
+    def samples(self) -> pa.Table:
+        """Every column of samples.parquet, one row a sample."""
+        return self._columns.table().take(pa.array(self.view.at))
+
+    @property
+    def labels(self) -> Floats:
+        """Power [W] and velocity [m/s], float32, shape (N, 2); the card says which velocity."""
+        if self._labels is None:
+            columns = [self.column(name) for name in self._card["label"]["columns"]]
+            self._labels = np.column_stack(columns).astype(np.float32)
+        return self._labels
+
+    @property
+    def weights(self) -> Floats:
+        """Inverse variance of each label over its mean, float32, shape (N, 2): how much it says of the ground."""
+        if self._weights is None:
+            std = np.column_stack([self.column(name) for name in ("power_std_watt", "velocity_std_mps")])
+            if len(std):
+                std = np.maximum(std, np.maximum(_MIN_STD * np.median(std, axis=0), np.finfo(np.float32).tiny))
+                self._weights = (std**-2 / np.mean(std**-2, axis=0)).astype(np.float32)
+            else:
+                self._weights = std.astype(np.float32)
+        return self._weights
+
+    @property
+    def patches(self) -> Floats:
+        """The tensor of all samples, float32 in [0, 1], shape (N, px, px, channels); formed once, then kept."""
+        if self._patches is None:
+            self._patches = self._tensor(np.arange(len(self)))
+        return self._patches
+
+    def column(self, name: str) -> NDArray[Any]:
+        """Return a column of samples.parquet, shape (N,)."""
+        return self._columns[name][self.view.at]
+
+    def layers(self, indices: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
+        """Return the stored layers of samples, each of shape (B, px, px): grey, class ids, height in steps of 0.5 mm."""
+        return self.view.stored.gather(self.view.at[indices], self.view.form.layers)
+
+    def batch(self, indices: ArrayLike) -> tuple[Floats, Floats]:
+        """Return patches, shape (B, px, px, channels), and labels, shape (B, 2), of the samples ``indices``."""
+        at = np.asarray(indices, dtype=np.int64)
+        at = np.where(at < 0, at + len(self), at)
+        patches = self._tensor(at) if self._patches is None else self._patches[at]
+        return patches, self.labels[at]
+
+    def with_channels(self, *channels: str) -> Split:
+        """Return the split with these channels: ``ortho``, ``terrain``, ``height``, ``terrain_one_hot`` (one channel a class)."""
+        form = tensor_form(channels, self.view.stored.files.layers, self.view.form.class_count)
+        return self._with(replace(self.view, form=form))
+
+    def take(self, chosen: ArrayLike) -> Split:
+        """Return some samples: their indices, or a mask of shape (N,)."""
+        return self._with(replace(self.view, at=self.view.at[np.asarray(chosen)]))
+
+    def clean(
+        self,
+        without: Iterable[str] = (),
+        *,
+        max_power_std_watt: float | None = None,
+        max_velocity_std_mps: float | None = None,
+    ) -> Split:
+        """Return the samples whose labels are trusted.
+
+        Parameters
+        ----------
+        without
+            Names of quality bits (``near_gap``, ``high_slip`` …); samples with any of them are left out.
+        max_power_std_watt, max_velocity_std_mps
+            Samples with a larger standard deviation are left out [W], [m/s].
+
+        """
+        named = {str(bit.name).lower(): int(bit) for bit in Quality}
+        unknown = [name for name in without if name not in named]
+        if unknown:
+            raise DatasetError(f"quality {', '.join(unknown)}: wanted some of {', '.join(named)}")
+        bits = sum(named[name] for name in set(without))
+        good = (self.column("quality").astype(np.int64) & bits) == 0
+        for name, limit in (("power_std_watt", max_power_std_watt), ("velocity_std_mps", max_velocity_std_mps)):
+            if limit is not None:
+                good &= self.column(name) <= limit
+        return self.take(good)
+
+    def fold(self, number: int) -> tuple[Split, Split]:
+        """Return the split without a fold of spatial cross-validation, and that fold: to fit on, and to stop early by."""
+        held = self.column("fold") == number
+        return self.take(~held), self.take(held)
+
+    def batches(
+        self,
+        size: int,
+        *,
+        shuffle: bool = False,
+        seed: int = 0,
+        mirror: bool = False,
+        weights: bool = False,
+        features: Sequence[str] = (),
+        drop_last: bool = False,
+        from_disk: bool | None = None,
+    ) -> Batches:
+        """Return batches as numpy arrays, an epoch each time they are iterated over.
+
+        Parameters
+        ----------
+        size
+            Samples in a batch.
+        shuffle, seed
+            Another order every epoch, drawn from the seed; from disk, samples are shuffled within pools of shuffled chunks.
+        mirror
+            Mirror every other sample across its direction of travel, at random: rows of the patch are reversed, its labels stay true.
+        weights
+            Third element of each batch: `weights`.
+        features
+            Columns of samples.parquet that go beside the patches: ``slope_rad``, ``cross_slope_rad`` (its sign follows the mirror) ….
+        drop_last
+            Leave out a last batch that is not full.
+        from_disk
+            Decode chunk by chunk instead of keeping the split in memory; None decides by its size.
+
+        """
+        disk = not self.view.stored.fit(self.view.form.layers) if from_disk is None else from_disk
+        return Batches(self, BatchRules(size, shuffle, seed, mirror, weights, tuple(features), drop_last, disk))
+
+    def torch_iterable(self, size: int, **rules: Any) -> TorchBatches:
+        """Return `batches` as an iterable torch dataset, for ``DataLoader(…, batch_size=None, num_workers=n)``; imports torch."""
+        from tcpipe.dataset.torch_data import TorchBatches  # noqa: PLC0415  torch only when it is asked for
+
+        return TorchBatches(self.batches(size, **rules))
+
+    def _with(self, view: View) -> Split:
+        return Split(self.name, self._card, self._columns, view)
+
+    def _tensor(self, indices: Ints) -> Floats:
+        layers = self.view.form.layers
+        if self.view.stored.fit(layers):
+            return self.view.form.form(self.view.stored.in_memory(layers), self.view.at[indices])
+        return self.view.form.form(self.layers(indices), np.arange(len(indices)))

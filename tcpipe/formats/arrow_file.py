@@ -1,0 +1,21 @@
+"""A table too large to hold: written piece by piece to an Arrow file and mapped back; rows cost memory only while they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import pyarrow as pa
+
+
+def write_pieces(path: Path, schema: pa.Schema, pieces: Iterable[pa.Table]) -> None:
+    """Write tables of one schema one after another."""
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, schema) as writer:
+        for piece in pieces:
+            writer.write_table(piece)
+
+
+def map_table(path: Path) -> pa.Table:
+    """Return the whole table as a view of the file, which must outlive it."""
+    with pa.memory_map(str(path)) as source:
+        return pa.ipc.open_file(source).read_all()

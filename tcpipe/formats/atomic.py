@@ -1,0 +1,200 @@
+"""Outputs appear whole or not at all: written under a temporary name beside their place, synced, then renamed.
+
+The directory that holds a temporary is locked as long as its writer lives. So what a killed process left behind is told from what
+another one is writing; it goes when its place is written again.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import shutil
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from tcpipe.errors import StoreError
+
+TEMPORARY_PREFIX = ".tmp-"
+"""What is left behind by a killed process begins with this; readers skip it."""
+
+_UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
+"""Errors that only writing can meet, whatever file they name."""
+
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+
+
+@contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary path; on success it is synced and renamed to ``path``, on failure removed.
+
+    Raises
+    ------
+    StoreError
+        The place cannot be written.
+    """
+    with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
+        temporary = holder / place.name
+        temporary.touch()
+        yield temporary
+        with temporary.open("rb") as stream:
+            os.fsync(stream.fileno())
+        temporary.replace(place)
+        _sync_directory(place.parent)
+
+
+@contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
+    """Yield a temporary directory; on success it takes the place of ``path`` (an old one goes), on failure it is removed.
+
+    Raises
+    ------
+    StoreError
+        The place cannot be written.
+    """
+    with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
+        temporary = holder / place.name
+        temporary.mkdir()
+        yield temporary
+        for directory, _, files in os.walk(temporary):
+            for name in files:
+                with (Path(directory) / name).open("rb") as stream:
+                    os.fsync(stream.fileno())
+        _take_place(temporary, place)
+        _sync_directory(place.parent)
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file whole or not at all."""
+    with atomic_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def exclusive(directory: Path) -> Iterator[None]:
+    """Let one process at a time through, by a lock on ``directory``; where the file system has no locks, all."""
+    descriptor = os.open(directory, os.O_RDONLY)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Turn what the operating system says while ``path`` is written into one line about ``path`` itself."""
+    try:
+        yield
+    except (OSError, StoreError) as error:
+        cause = error.__cause__ if isinstance(error, StoreError) else error
+        if not isinstance(cause, OSError):
+            raise
+        where = str(cause.filename)
+        if (
+            cause.errno in _UNWRITABLE
+            or TEMPORARY_PREFIX in where
+            or Path(where) in Path(os.path.realpath(path)).parents
+        ):
+            reason = os.strerror(cause.errno) if cause.errno else str(cause)
+            raise StoreError(f"{path}: cannot be written ({reason})") from cause
+        raise
+
+
+@contextmanager
+def _parents_of(path: Path) -> Iterator[Path]:
+    """Make the directories above ``path`` and yield its real place; those that were made go again on failure."""
+    place = Path(os.path.realpath(path))
+    missing = [parent for parent in place.parents if not parent.exists()]
+    in_the_way = next((parent for parent in place.parents if parent.exists() and not parent.is_dir()), None)
+    if in_the_way is not None:
+        raise StoreError(f"{path}: cannot be written ({in_the_way} is a file, wanted a directory)")
+    try:
+        place.parent.mkdir(parents=True, exist_ok=True)
+        yield place
+    except BaseException:
+        with suppress(OSError):
+            for parent in missing:
+                parent.rmdir()
+        raise
+
+
+@contextmanager
+def _holder_beside(place: Path) -> Iterator[Path]:
+    """Yield a new locked directory beside ``place`` and remove it in the end; what was abandoned there is removed first."""
+    prefix = f"{TEMPORARY_PREFIX}{os.fsdecode(os.fsencode(place.name)[:200])}-"
+    for entry in place.parent.iterdir():
+        if entry.name.startswith(prefix):
+            _remove_if_abandoned(entry)
+    holder, lock = _locked_directory(place.parent, prefix)
+    try:
+        yield holder
+    finally:
+        os.close(lock)
+        shutil.rmtree(holder, ignore_errors=True)
+
+
+def _locked_directory(parent: Path, prefix: str) -> tuple[Path, int]:
+    while True:
+        holder = parent / f"{prefix}{uuid.uuid4().hex[:8]}"
+        holder.mkdir()
+        with suppress(FileNotFoundError):  # another process took it for abandoned before it was locked
+            lock = os.open(holder, os.O_RDONLY)
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(lock, fcntl.LOCK_EX)
+            if holder.exists():
+                return holder, lock
+            os.close(lock)
+
+
+def _remove_if_abandoned(holder: Path) -> None:
+    with suppress(OSError):
+        lock = os.open(holder, os.O_RDONLY)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            shutil.rmtree(holder)
+        finally:
+            os.close(lock)
+
+
+def _take_place(temporary: Path, place: Path) -> None:
+    """Rename ``temporary`` to ``place``; if something is there they change places, in one step where the system can."""
+    if not place.exists():
+        try:
+            temporary.rename(place)
+        except OSError as error:
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):  # another process was faster
+                raise
+        else:
+            return
+    if _exchanged(temporary, place):
+        return
+    aside = place.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
+    place.rename(aside)
+    try:
+        temporary.rename(place)
+    except OSError:
+        aside.rename(place)
+        raise
+    aside.rename(temporary)
+
+
+def _exchanged(one: Path, other: Path) -> bool:
+    renameat2 = getattr(ctypes.CDLL(None), "renameat2", None)
+    if renameat2 is None:
+        return False
+    paths = os.fsencode(one), os.fsencode(other)
+    return bool(renameat2(_AT_FDCWD, paths[0], _AT_FDCWD, paths[1], _RENAME_EXCHANGE) == 0)
+
+
+def _sync_directory(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

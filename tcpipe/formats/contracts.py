@@ -1,0 +1,53 @@
+"""The contracts of tables and recipe as JSON Schema texts: what ``tcpipe schemas`` writes and schemas/ holds."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pyarrow as pa
+
+from tcpipe.formats.json_files import to_json
+from tcpipe.formats.recipe_toml import recipe_schema
+from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
+
+_DIALECT = "https://json-schema.org/draft/2020-12/schema"
+
+
+def contracts() -> dict[str, str]:
+    """Return file name → JSON Schema text, for every table (one row as an object) and the recipe."""
+    tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
+    found = {f"{table.name}.schema.json": to_json(_table_schema(table)) for table in tables}
+    found["recipe.schema.json"] = to_json({"$schema": _DIALECT, **recipe_schema()})
+    return found
+
+
+def _table_schema(table: TableSchema) -> dict[str, Any]:
+    return {
+        "$schema": _DIALECT,
+        "title": table.name,
+        "description": f"{table.doc} One row.",
+        "x-level": table.level,
+        "x-data-model-version": DATA_MODEL_VERSION,
+        "type": "object",
+        "additionalProperties": False,
+        "required": table.names(),
+        "properties": {column.name: _column_schema(column) for column in table.columns},
+    }
+
+
+def _column_schema(column: Column) -> dict[str, Any]:
+    kind = (
+        "string" if pa.types.is_string(column.dtype) else "integer" if pa.types.is_integer(column.dtype) else "number"
+    )
+    schema: dict[str, Any] = {
+        "type": [kind, "null"] if column.nullable else kind,
+        "description": column.doc,
+        "x-arrow-type": str(column.dtype),
+        "x-unit": column.unit,
+    }
+    if column.frame:
+        schema["x-frame"] = column.frame
+    if column.flags is not None:
+        schema["x-flags"] = {str(int(bit)): str(bit.name).lower() for bit in column.flags}
+    return schema

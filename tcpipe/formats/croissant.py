@@ -1,0 +1,151 @@
+"""Croissant 1.1 metadata (MLCommons): what the dataset's files are, and the columns of its samples."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import pyarrow as pa
+
+_CONTEXT: dict[str, Any] = {
+    "@language": "en",
+    "@vocab": "https://schema.org/",
+    "cr": "http://mlcommons.org/croissant/",
+    "dct": "http://purl.org/dc/terms/",
+    "prov": "http://www.w3.org/ns/prov#",
+    "rai": "http://mlcommons.org/croissant/RAI/",
+    "sc": "https://schema.org/",
+    "data": {"@id": "cr:data", "@type": "@json"},
+    "dataType": {"@id": "cr:dataType", "@type": "@vocab"},
+    "examples": {"@id": "cr:examples", "@type": "@json"},
+    "conformsTo": "dct:conformsTo",
+    **{
+        name: f"cr:{name}"
+        for name in (
+            "annotation",
+            "arrayShape",
+            "citeAs",
+            "column",
+            "containedIn",
+            "equivalentProperty",
+            "excludes",
+            "extract",
+            "field",
+            "fileObject",
+            "fileProperty",
+            "fileSet",
+            "format",
+            "includes",
+            "isArray",
+            "isLiveDataset",
+            "jsonPath",
+            "key",
+            "md5",
+            "parentField",
+            "path",
+            "readLines",
+            "recordSet",
+            "references",
+            "regex",
+            "repeated",
+            "replace",
+            "samplingRate",
+            "sdVersion",
+            "separator",
+            "source",
+            "subField",
+            "transform",
+            "unArchive",
+            "value",
+        )
+    },
+}
+
+_ENCODING_BY_SUFFIX = {
+    ".json": "application/json",
+    ".parquet": "application/x-parquet",
+    ".html": "text/html",
+}
+
+
+def croissant(
+    *,
+    name: str,
+    description: str,
+    licence: str,
+    creator: str,
+    files: Mapping[str, tuple[int, str]],
+    samples_file: str,
+    samples: pa.Schema,
+) -> dict[str, Any]:
+    """Return the document.
+
+    Parameters
+    ----------
+    name, description, licence, creator
+        As the recipe says; an empty one is left out.
+    files
+        Size [byte] and sha256 (hex) of every file by its path inside the dataset.
+    samples_file
+        Which of them holds the samples.
+    samples
+        Its Arrow schema; the fields' metadata give their meanings.
+
+    Returns
+    -------
+    JSON-LD as Python values.
+
+    """
+    document = {
+        "@context": _CONTEXT,
+        "@type": "sc:Dataset",
+        "conformsTo": "http://mlcommons.org/croissant/1.1",
+        "name": name,
+        "description": description,
+        "license": licence,
+        "creator": {"@type": "sc:Person", "name": creator} if creator else None,
+        "distribution": [_file_object(path, *files[path]) for path in sorted(files)],
+        "recordSet": [
+            {
+                "@type": "cr:RecordSet",
+                "@id": "samples",
+                "name": "samples",
+                "description": "One record a sample, in the order of the patches.",
+                "key": {"@id": "samples/sample_id"},
+                "field": [_field(field, samples_file) for field in samples],
+            }
+        ],
+    }
+    return {key: value for key, value in document.items() if value}
+
+
+def _file_object(path: str, size_bytes: int, sha256: str) -> dict[str, Any]:
+    suffix = path[path.rfind(".") :] if "." in path.rsplit("/", 1)[-1] else ""
+    return {
+        "@type": "cr:FileObject",
+        "@id": path,
+        "name": path,
+        "contentUrl": path,
+        "contentSize": f"{size_bytes} B",
+        "encodingFormat": _ENCODING_BY_SUFFIX.get(suffix, "application/octet-stream"),
+        "sha256": sha256,
+    }
+
+
+def _field(field: pa.Field, samples_file: str) -> dict[str, Any]:
+    metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
+    unit = f" [{metadata['unit']}]" if metadata.get("unit") else ""
+    return {
+        "@type": "cr:Field",
+        "@id": f"samples/{field.name}",
+        "name": field.name,
+        "description": metadata.get("doc", "") + unit,
+        "dataType": _data_type(field.type),
+        "source": {"fileObject": {"@id": samples_file}, "extract": {"column": field.name}},
+    }
+
+
+def _data_type(dtype: pa.DataType) -> str:
+    if pa.types.is_integer(dtype):
+        return "sc:Integer"
+    return "sc:Float" if pa.types.is_floating(dtype) else "sc:Text"

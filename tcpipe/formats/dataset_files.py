@@ -1,0 +1,375 @@
+"""The files of a dataset: its patches (Zarr or Parquet shards), its samples, its card, their checksums.
+
+::
+
+    dataset.json  croissant.json  samples.parquet  report.html
+    overview.png                                             the map, small and grey: the report's background
+    patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
+    data/<split>-00000-of-00001.parquet                      --format parquet: the same layers, a row a sample
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import DatasetError, StoreError
+from tcpipe.formats.json_files import read_json
+from tcpipe.formats.parquet import column_names, read_row_group, read_table, write_table
+from tcpipe.formats.shards import ShardedArray, open_sharded
+from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
+from tcpipe.splits.assignment import SPLITS
+from tcpipe.terrain.classes import NODATA_ID, ClassTable
+from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, LAYERS
+
+FileFormat = Literal["zarr", "parquet"]
+
+KIND = "tcpipe dataset"
+CARD = "dataset.json"
+CROISSANT = "croissant.json"
+SAMPLES = "samples.parquet"
+PATCHES = "patches.zarr"
+SHARDS = "data"
+REPORT = "report.html"
+OVERVIEW = "overview.png"
+
+CHUNK_ROWS = 256
+"""Patches that are decoded together."""
+
+SHARD_ROWS = 16_384
+"""Patches in one file."""
+
+_LEVELS: dict[Compression, int] = {"zstd": 3, "lz4": 5}
+"""Beyond these a patch takes twice the time for less than a tenth of the room."""
+
+GROUP_ROWS = 1024
+"""Patches in one row group of a Parquet shard: 6.5 MB, what a streaming reader holds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """A stored layer: its numpy type and its CF attributes, by which xarray decodes it."""
+
+    name: str
+    dtype: type[np.unsignedinteger[Any]]
+    nodata: int
+    attributes: Mapping[str, Any]
+
+
+def layers_of(names: Sequence[str], classes: ClassTable | None) -> list[Layer]:
+    """Return the description of each layer in ``names``; ``classes`` names the ids of ``terrain``."""
+    table = () if classes is None else classes.classes
+    known = {
+        "ortho": Layer(
+            "ortho",
+            np.uint8,
+            0,
+            {"long_name": "orthophoto, grey", "units": "1", "scale_factor": 1 / 255, "add_offset": 0.0},
+        ),
+        "terrain": Layer(
+            "terrain",
+            np.uint8,
+            NODATA_ID,
+            {
+                "long_name": "terrain class id",
+                "units": "1",
+                "flag_values": [entry.id for entry in table],
+                "flag_meanings": " ".join(entry.name.replace(" ", "_") for entry in table),
+            },
+        ),
+        "height": Layer(
+            "height",
+            np.uint16,
+            HEIGHT_NODATA,
+            {
+                "long_name": "height above height_min_m of the sample",
+                "units": "m",
+                "scale_factor": HEIGHT_STEP_M,
+                "add_offset": 0.0,
+                "missing_value": HEIGHT_NODATA,
+            },
+        ),
+    }
+    return [known[name] for name in names]
+
+
+@dataclass(frozen=True, slots=True)
+class Pixels:
+    """Patches to be written: row i of the dataset is what ``read(layer, slots[i : i + 1])`` returns, shape (1, px, px)."""
+
+    layers: Sequence[Layer]
+    patch_px: int
+    slots: NDArray[np.int64]
+    read: Callable[[str, NDArray[np.int64]], NDArray[Any]]
+
+
+def write_patches_zarr(
+    directory: Path,
+    pixels: Pixels,
+    sample_ids: Callable[[int, int], Sequence[str]],
+    *,
+    compression: Compression = "zstd",
+    threads: int = 1,
+) -> None:
+    """Write ``patches.zarr`` into the dataset's directory.
+
+    Parameters
+    ----------
+    directory
+        The dataset's directory.
+    pixels
+        The patches of all rows.
+    sample_ids
+        Gives the ids of the rows from one up to another.
+    compression
+        What the layers are encoded with.
+    threads
+        Chunks encoded side by side; the bytes do not depend on it.
+
+    """
+    n, px = len(pixels.slots), pixels.patch_px
+    shard = min(SHARD_ROWS, max(-(-n // CHUNK_ROWS), 1) * CHUNK_ROWS)
+    attributes = {"Conventions": "CF-1.11", "title": "patches of a tcpipe dataset, in the order of samples.parquet"}
+    group = create_group(directory / PATCHES, attributes)
+    for layer in pixels.layers:
+        add_array(
+            group,
+            layer.name,
+            shape=(n, px, px),
+            dtype=layer.dtype,
+            chunks=(CHUNK_ROWS, px, px),
+            shards=(shard, px, px),
+            dimensions=("sample", "row", "column"),
+            attributes={**layer.attributes, "coordinates": "sample_id"},
+            compression=compression,
+            level=_LEVELS[compression],
+        )
+        array = open_sharded(directory / PATCHES / layer.name)
+        for number, first in enumerate(range(0, n, shard)):
+            patches = pixels.read(layer.name, pixels.slots[first : first + shard])
+            array.write_shard((number, 0, 0), patches, threads=threads)
+    ids = add_array(
+        group,
+        "sample_id",
+        shape=(n,),
+        dtype=str,
+        chunks=(SHARD_ROWS,),
+        dimensions=("sample",),
+        fill_value="",
+        attributes={"long_name": "joins patches and samples"},
+    )
+    for first in range(0, n, SHARD_ROWS):
+        last = min(first + SHARD_ROWS, n)
+        ids[first:last] = np.array(sample_ids(first, last), dtype=object)
+    consolidate(group)
+
+
+def write_patches_parquet(
+    directory: Path,
+    pixels: Pixels,
+    samples: Callable[[NDArray[np.int64]], pa.Table],
+    split: NDArray[np.str_],
+) -> list[dict[str, Any]]:
+    """Write ``data/<split>-*.parquet``: the columns of the samples and each layer as a plain fixed-size list.
+
+    Parameters
+    ----------
+    directory
+        The dataset's directory.
+    pixels
+        The patches of all rows.
+    samples
+        Gives the rows asked for of the samples table.
+    split
+        Split of every row, shape (N,).
+
+    Returns
+    -------
+    Path inside the dataset, split and rows of every shard.
+
+    """
+    shards = []
+    for name in SPLITS:
+        here = np.flatnonzero(split == name)
+        count = -(-len(here) // SHARD_ROWS)
+        for number in range(count):
+            part = here[number * SHARD_ROWS : (number + 1) * SHARD_ROWS]
+            table = samples(part)
+            for layer in pixels.layers:
+                table = table.append_column(*_list_column(layer, pixels.read(layer.name, pixels.slots[part])))
+            path = f"{SHARDS}/{name}-{number:05d}-of-{count:05d}.parquet"
+            write_table(table, directory / path, rows_per_group=GROUP_ROWS)
+            shards.append({"path": path, "split": name, "rows": len(part)})
+    return shards
+
+
+def _list_column(layer: Layer, patches: NDArray[Any]) -> tuple[pa.Field, pa.Array]:
+    """Return a layer as a column: rows of the patch one after another."""
+    px = patches.shape[1]
+    values = pa.array(np.ascontiguousarray(patches, layer.dtype).reshape(-1))
+    metadata = {"shape": f"[{px}, {px}]", **{key: str(value) for key, value in layer.attributes.items()}}
+    dtype = pa.list_(values.type, px * px)  # plain: a tensor extension type makes other readers fail
+    column = pa.FixedSizeListArray.from_arrays(values, px * px)
+    return pa.field(layer.name, dtype, nullable=False, metadata=metadata), column
+
+
+def file_checksum(path: Path) -> tuple[int, str]:
+    """Return size [byte] and sha256 (hex) of a file."""
+    with path.open("rb") as stream:
+        return path.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def file_checksums(directory: Path) -> dict[str, tuple[int, str]]:
+    """Return size [byte] and sha256 (hex) of every file below ``directory``, by its path inside it."""
+    files = sorted(entry for entry in directory.rglob("*") if entry.is_file())
+    return {path.relative_to(directory).as_posix(): file_checksum(path) for path in files}
+
+
+def checksums_to_json(directory: Path) -> dict[str, dict[str, int | str]]:
+    """Return `file_checksums` as JSON values: ``size_bytes`` and ``sha256`` by path."""
+    found = file_checksums(directory)
+    return {path: {"size_bytes": size_bytes, "sha256": sha256} for path, (size_bytes, sha256) in found.items()}
+
+
+def read_card(directory: Path) -> dict[str, Any]:
+    """Return the card of the dataset in ``directory``; `DatasetError` if there is none."""
+    if not directory.is_dir():
+        raise DatasetError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
+    if not (directory / CARD).is_file():
+        raise DatasetError(f"{directory}: not a dataset: it has no {CARD}")
+    try:
+        card = read_json(directory / CARD)
+    except StoreError as error:
+        raise DatasetError(*error.problems) from None
+    if card.get("kind") != KIND:
+        raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {card.get('kind')!r})")
+    return card
+
+
+def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Table:
+    """Return the samples table of a dataset, or some of its columns; `DatasetError` if it cannot be read."""
+    try:
+        return read_table(directory / SAMPLES, None if columns is None else list(columns))
+    except StoreError as error:
+        raise DatasetError(*error.problems) from None
+
+
+def sample_columns(directory: Path) -> list[str]:
+    """Return the names of the columns of a dataset's samples table; `DatasetError` if it cannot be read."""
+    try:
+        return column_names(directory / SAMPLES)
+    except StoreError as error:
+        raise DatasetError(*error.problems) from None
+
+
+@dataclass(frozen=True, slots=True)
+class PatchFiles:
+    """Where a dataset's patches lie, piece by piece; a piece is what is decoded together.
+
+    ``starts`` are the first rows of the pieces and, last, the number of rows, shape (P + 1,), in the order of the files.
+    """
+
+    directory: Path
+    layers: tuple[str, ...]
+    patch_px: int
+    starts: NDArray[np.int64]
+    arrays: Mapping[str, ShardedArray] = field(default_factory=dict)
+    """Zarr: the array of each layer; a piece is a chunk."""
+    groups: tuple[tuple[str, int], ...] = ()
+    """Parquet: file and row group of each piece."""
+
+    @property
+    def piece_rows(self) -> int:
+        """Room that a piece needs; the last one may hold fewer rows."""
+        return CHUNK_ROWS if self.arrays else GROUP_ROWS
+
+    def read(
+        self, piece: int, layers: Sequence[str], out: Mapping[str, NDArray[Any]] | None = None
+    ) -> dict[str, NDArray[Any]]:
+        """Return layers of one piece, each of shape (rows, px, px); `DatasetError` if it cannot be read.
+
+        Parameters
+        ----------
+        piece, layers
+            What is read.
+        out
+            Where to, `piece_rows` or more rows a layer; None makes new arrays.
+
+        """
+        rows = int(self.starts[piece + 1] - self.starts[piece])
+        shape = (self.piece_rows, self.patch_px, self.patch_px)
+        into = {layer: np.empty(shape, layer_dtype(layer)) for layer in layers} if out is None else out
+        try:
+            if self.arrays:
+                for layer in layers:
+                    self.arrays[layer].chunk((piece, 0, 0), out=into[layer][: self.piece_rows])
+            else:
+                path, group = self.groups[piece]
+                table = read_row_group(self.directory / path, group, list(layers))
+                for layer in layers:
+                    flat = table.column(layer).combine_chunks().flatten().to_numpy()
+                    into[layer][:rows] = flat.reshape(rows, *shape[1:])
+        except StoreError as error:
+            raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
+        except (KeyError, ValueError):
+            raise DatasetError(
+                f"{self.directory}: piece {piece} of its patches is not what the card says; build it again"
+            ) from None
+        return {layer: into[layer][:rows] for layer in layers}
+
+
+def layer_dtype(layer: str) -> type[np.unsignedinteger[Any]]:
+    """Return the type in which a layer is stored."""
+    return np.uint16 if layer == "height" else np.uint8
+
+
+def open_patches(directory: Path, card: Mapping[str, Any]) -> PatchFiles:
+    """Return where the patches of a dataset lie; `DatasetError` if they are gone."""
+    layers, px = tuple(layer for layer in LAYERS if layer in card["layers"]), card["patch_px"]
+    try:
+        if card["format"] == "parquet":
+            groups = [
+                (shard["path"], group, min(GROUP_ROWS, shard["rows"] - group * GROUP_ROWS))
+                for shard in card["shards"]
+                for group in range(-(-shard["rows"] // GROUP_ROWS))
+            ]
+            starts = np.concatenate([[0], np.cumsum([rows for *_, rows in groups])]).astype(np.int64)
+            return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
+        starts = np.append(np.arange(0, card["samples"], CHUNK_ROWS), card["samples"])
+        arrays = {layer: open_sharded(directory / PATCHES / layer) for layer in layers}
+        return PatchFiles(directory, layers, px, starts, arrays)
+    except StoreError as error:
+        raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
+
+
+def zarr_sample_ids(directory: Path) -> list[str]:
+    """Return the ids beside the patches of a Zarr dataset; `DatasetError` if they cannot be read."""
+    try:
+        group: Any = open_group(directory / PATCHES)
+        return [str(name) for name in group["sample_id"][:]]
+    except StoreError as error:
+        raise DatasetError(*error.problems) from None
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise DatasetError(f"{directory / PATCHES}: its sample ids cannot be read ({error}); build it again") from None
+
+
+def rows_in_files(card: Mapping[str, Any], splits: NDArray[np.object_]) -> dict[str, NDArray[np.int64]]:
+    """Return, for every split, where its samples lie in the order of the files; ``splits`` is the samples' column, (N,)."""
+    rows = {name: np.flatnonzero(splits == name) for name in SPLITS}
+    if card["format"] == "parquet":
+        return dict(_following(rows))
+    return rows
+
+
+def _following(rows: Mapping[str, NDArray[np.int64]]) -> Iterator[tuple[str, NDArray[np.int64]]]:
+    first = 0
+    for name, here in rows.items():
+        yield name, np.arange(first, first + len(here))
+        first += len(here)

@@ -1,0 +1,194 @@
+"""Polygons from GeoJSON (RFC 7946: always WGS84, lon before lat): regions of a split, and the features of anything else drawn by hand."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+from shapely.validation import explain_validity
+
+from tcpipe.errors import RegionError
+from tcpipe.splits.regions import Regions
+
+KINDS = ("train_test", "unseen", "exclude")
+"""Values of the property ``split``; a feature without it is ``train_test``."""
+
+_GEOMETRIES = ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon", "GeometryCollection")
+_WGS84_NAMES = ("CRS84", "4326")
+_MAX_OVERLAP_M2 = 0.01
+_SHOWN = 5
+"""Problems of one kind that an error lists."""
+
+
+def read_regions(path: Path) -> Regions:
+    """Read the regions of a split, in WGS84 lon/lat [deg].
+
+    Inside (``train_test``) is the union of the polygons, unless features carry the property ``split``: ``train_test``,
+    ``unseen`` or ``exclude``. No other property is interpreted. ``exclude`` may lie over the other two and carves out of them.
+
+    Raises
+    ------
+    RegionError
+        Not GeoJSON, no polygon, empty or self-crossing geometry, coordinates that are no lon/lat, an unknown ``split``,
+        train_test and unseen over the same ground, no train_test region: all problems at once.
+
+    """
+    polygons: dict[str, list[BaseGeometry]] = {kind: [] for kind in KINDS}
+    features, problems = read_polygons(path)
+    for feature in features:
+        kind = feature.properties.get("split")
+        kind = "train_test" if kind is None else kind
+        if kind in KINDS:
+            polygons[str(kind)] += feature.polygons
+        else:
+            problems.append(f"{feature.where}: property split is {kind!r}, wanted one of {', '.join(KINDS)}")
+    if not problems and not any(polygons.values()):
+        problems.append(f"{path}: no polygon in it; draw the region that trains and tests as a polygon")
+    if not problems and not polygons["train_test"]:
+        problems.append(f"{path}: every feature is unseen or exclude: nothing could train; add a train_test polygon")
+    if not problems:
+        problems += _disagreements(path, polygons)
+    if problems:
+        raise RegionError(*shortened(problems))
+    return Regions(*(shapely.union_all(polygons[kind]) for kind in KINDS))
+
+
+@dataclass(frozen=True, slots=True)
+class PolygonFeature:
+    """A feature: where it stands (file and number), its properties, and its polygons in WGS84 lon/lat [deg]."""
+
+    where: str
+    properties: Mapping[str, Any]
+    polygons: tuple[BaseGeometry, ...]
+
+
+def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
+    """Read the polygon features of a file in their order, and one line for every unsound geometry.
+
+    Raises
+    ------
+    RegionError
+        Not GeoJSON, or in another CRS.
+
+    """
+    features: list[PolygonFeature] = []
+    problems: list[str] = []
+    for where, properties, geometry in _features(path, _document(path)):
+        features.append(PolygonFeature(where, properties, tuple(_polygons(where, geometry, problems))))
+    return features, problems
+
+
+def shortened(problems: list[str]) -> list[str]:
+    """Return the first few problems, and how many more there are."""
+    more = len(problems) - _SHOWN
+    return problems if more <= 0 else [*problems[:_SHOWN], f"… and {more} more"]
+
+
+def _document(path: Path) -> Mapping[str, Any]:
+    try:
+        document = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise RegionError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, RecursionError) as error:
+        raise RegionError(f"{path}: not GeoJSON: not JSON ({error})") from None
+    if not isinstance(document, dict) or "type" not in document:
+        raise RegionError(f"{path}: not GeoJSON: wanted an object with a 'type' such as FeatureCollection")
+    crs = json.dumps(document.get("crs"))
+    if crs != "null" and not any(name in crs for name in _WGS84_NAMES):
+        raise RegionError(
+            f"{path}: declares the CRS {crs}; GeoJSON is WGS84 lon/lat (RFC 7946): export it again as EPSG:4326"
+        )
+    return document
+
+
+def _features(path: Path, document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any], Any]]:
+    """Yield where, properties and geometry object of every feature."""
+    name = document["type"]
+    if name == "FeatureCollection" and isinstance(document.get("features"), list):
+        features = document["features"]
+    elif name == "Feature":
+        features = [document]
+    elif name in _GEOMETRIES:
+        features = [{"type": "Feature", "properties": None, "geometry": document}]
+    else:
+        raise RegionError(f"{path}: not GeoJSON: type {name!r}, wanted FeatureCollection, Feature or a geometry")
+    for number, feature in enumerate(features):
+        where = f"{path}: feature {number}"
+        if not isinstance(feature, dict) or feature.get("type") != "Feature":
+            raise RegionError(f"{where}: not GeoJSON: wanted an object of type Feature")
+        properties = feature.get("properties")
+        yield where, properties if isinstance(properties, dict) else {}, feature.get("geometry")
+
+
+def _polygons(where: str, geometry: Any, problems: list[str]) -> Iterator[BaseGeometry]:
+    """Yield the sound polygons of one geometry object; add a line to ``problems`` for every unsound one."""
+    name = geometry.get("type") if isinstance(geometry, dict) else None
+    if geometry is None or (isinstance(geometry, dict) and not geometry.get("coordinates", geometry.get("geometries"))):
+        problems.append(f"{where}: its geometry is empty; draw it or remove the feature")
+    elif name == "GeometryCollection":
+        for part in geometry["geometries"]:
+            yield from _polygons(where, part, problems)
+    elif name not in ("Polygon", "MultiPolygon"):
+        problems.append(f"{where}: geometry is {name!r}, wanted Polygon or MultiPolygon")
+    else:
+        parts = geometry["coordinates"] if name == "MultiPolygon" else [geometry["coordinates"]]
+        for rings in parts if isinstance(parts, list) else [None]:
+            found = _polygon(rings)
+            if isinstance(found, str):
+                problems.append(f"{where}: {found}")
+            else:
+                yield found
+
+
+def _polygon(rings: Any) -> BaseGeometry | str:
+    """Return the polygon, or what is wrong with it."""
+    if not isinstance(rings, list) or not rings:
+        return "its geometry is empty; draw it or remove the feature"
+    try:
+        lonlat = [np.array([position[:2] for position in ring], dtype=np.float64) for ring in rings]
+    except (TypeError, ValueError, OverflowError):
+        return "its coordinates are not rings of [lon, lat] positions"
+    for ring in lonlat:
+        problem = _ring_problem(ring)
+        if problem:
+            return problem
+    polygon = shapely.Polygon(lonlat[0], lonlat[1:])
+    if not shapely.is_valid(polygon):
+        return f"not a sound polygon: {explain_validity(polygon)} (lon lat); redraw it without crossing itself"
+    return polygon
+
+
+def _ring_problem(lonlat: np.ndarray[Any, np.dtype[np.float64]]) -> str | None:
+    if lonlat.ndim != 2 or lonlat.shape[1:] != (2,) or not np.isfinite(lonlat).all():
+        return "its coordinates are not rings of finite [lon, lat] positions"
+    lon, lat = lonlat[np.argmax(np.abs(lonlat).max(axis=1))]
+    if abs(lat) > 90 and abs(lat) <= 180 and abs(lon) <= 90:
+        return f"coordinates ({lon:g}, {lat:g}) are no lon/lat: the axes look swapped; GeoJSON is lon before lat"
+    if abs(lon) > 180 or abs(lat) > 90:
+        return (
+            f"coordinates ({lon:g}, {lat:g}) are no lon/lat degrees: they look projected; "
+            "GeoJSON is WGS84 (RFC 7946): export it again as EPSG:4326"
+        )
+    if len(lonlat) < 4 or (lonlat[0] != lonlat[-1]).any():
+        return f"a ring of {len(lonlat)} positions is not closed; a ring has at least 4 and ends where it begins"
+    return None
+
+
+def _disagreements(path: Path, polygons: Mapping[str, list[BaseGeometry]]) -> Iterator[str]:
+    train_test, unseen = shapely.union_all(polygons["train_test"]), shapely.union_all(polygons["unseen"])
+    both = shapely.intersection(train_test, unseen)
+    if shapely.is_empty(both):
+        return
+    at = shapely.point_on_surface(both)
+    overlap_m2 = shapely.area(both) * 111_320.0**2 * np.cos(np.radians(at.y))
+    if overlap_m2 > _MAX_OVERLAP_M2:
+        yield (
+            f"{path}: train_test and unseen regions overlap by {overlap_m2:.3g} m² around {at.x:.6f}, {at.y:.6f} (lon, lat); "
+            "redraw one of them, or mark the ground between as exclude"
+        )

@@ -1,0 +1,61 @@
+"""JSON documents (run.json, manifest.json, dataset.json): sorted keys, no clock, so that the same content is the same bytes."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, is_dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import write_text
+
+
+def plain(value: Any) -> Any:
+    """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
+    if is_dataclass(value) and not isinstance(value, type):
+        value = asdict(value)
+    elif isinstance(value, Enum):
+        value = value.value
+    elif hasattr(value, "tolist"):  # numpy scalars and arrays
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return str(value) if isinstance(value, Path) else value
+
+
+def to_json(value: Any) -> str:
+    """Return canonical JSON text: sorted keys, two-space indent, final newline; file names that are no text as escapes."""
+    text = json.dumps(plain(value), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as canonical JSON, whole or not at all."""
+    write_text(path, to_json(value))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read one JSON object; `StoreError` names a file that cannot be read."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path}: not a readable JSON file ({error}); remove it and run the command again") from None
+    if not isinstance(found, dict):
+        raise StoreError(
+            f"{path}: holds {type(found).__name__}, wanted a JSON object; remove it and run the command again"
+        )
+    return found
+
+
+def digest(value: Any) -> str:
+    """Return the sha256 (hex) of the canonical JSON of ``value``."""
+    return hashlib.sha256(to_json(value).encode()).hexdigest()

@@ -1,0 +1,293 @@
+"""What every log container gives: channels, and blocks of serialised messages with their times.
+
+A `LogPart` is one file of a log. `tcpipe.formats.log_file` joins the parts of a log and turns their blocks into tables.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.logs.topics import Damage
+
+MAX_CHUNK_BYTES = 1 << 30
+"""A chunk that claims to hold more than this is taken for damaged."""
+_PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO = 1 << 26, 1000
+"""What claims to hold more than both so many bytes and so many times its compressed size is taken for damaged: a bomb."""
+SEARCH_BYTES = 1 << 20
+
+_PEEK_BYTES = 1 << 14
+_GAP_BYTES = 1 << 15
+"""Pieces of a file that lie no further apart are read as one."""
+
+Int64Array = NDArray[np.int64]
+
+_Piece = TypeVar("_Piece")
+_Result = TypeVar("_Result")
+
+
+class DamageError(Exception):
+    """A piece of a file cannot be used; the text says why, plainly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One source of messages in a file: a connection, channel or topic row. None where the index does not say."""
+
+    topic: str
+    type_name: str
+    encoding: str
+    schema_encoding: str
+    definition: str
+    message_count: int | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MessageBlock:
+    """Messages of one channel inside one buffer; arrays have shape (N,). ``ordinal`` is their order within the file.
+
+    ``length`` is their length where all are equally long, else None.
+    """
+
+    channel: int
+    buffer: memoryview
+    offsets: Int64Array
+    lengths: Int64Array
+    log_time_ns: Int64Array
+    publish_time_ns: Int64Array
+    ordinal: Int64Array
+    length: int | None
+
+
+def blocks_by_channel(
+    buffer: memoryview,
+    channels: Int64Array,
+    offsets: Int64Array,
+    lengths: Int64Array,
+    *,
+    log_time_ns: Int64Array,
+    publish_time_ns: Int64Array,
+    ordinals: Int64Array,
+) -> list[MessageBlock]:
+    """Return messages as one block a channel; each channel's must lie in one piece. All arrays have shape (N,)."""
+    if not len(channels):
+        return []
+    starts = [0, *((channels[1:] != channels[:-1]).nonzero()[0] + 1).tolist()]
+    least, most = np.minimum.reduceat(lengths, starts).tolist(), np.maximum.reduceat(lengths, starts).tolist()
+    return [
+        MessageBlock(
+            int(channels[a]),
+            buffer,
+            offsets[a:b],
+            lengths[a:b],
+            log_time_ns[a:b],
+            publish_time_ns[a:b],
+            ordinals[a:b],
+            low if low == high else None,
+        )
+        for a, b, low, high in zip(starts, [*starts[1:], len(channels)], least, most, strict=True)
+    ]
+
+
+class LogPart(Protocol):
+    """One file of a log, open for reading."""
+
+    name: str
+    damage: dict[Damage, None]
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Return every channel by its number."""
+
+    @property
+    def unchecked(self) -> str:
+        """What of that which was read no checksum covers, in plain words; "" where there is nothing."""
+
+    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over.
+
+        The blocks, their order and what is noted do not depend on ``threads``.
+        """
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class ByteSource:
+    """A file read by position."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+        self.size = os.fstat(self._file.fileno()).st_size
+        self._peeked = 0, b""
+        self._scratch = threading.local()
+
+    def read(self, offset: int, size: int) -> memoryview:
+        """Return ``size`` bytes at ``offset``; raise `DamageError` where the file ends before."""
+        if size < 0 or offset + size > self.size:
+            raise DamageError(f"the file ends at byte {self.size}, inside a piece of {size} bytes")
+        data = os.pread(self._file.fileno(), size, offset)
+        while len(data) < size:
+            more = os.pread(self._file.fileno(), size - len(data), offset + len(data))
+            if not more:
+                raise DamageError(f"the file became shorter while it was read (byte {offset + len(data)})")
+            data += more
+        return memoryview(data)
+
+    def read_once(self, offset: int, size: int) -> memoryview:
+        """Return bytes as `read` does, valid only until this thread reads again: their memory, still in the cache, is used again."""
+        if size < 0 or offset + size > self.size:
+            raise DamageError(f"the file ends at byte {self.size}, inside a piece of {size} bytes")
+        held = getattr(self._scratch, "held", b"")
+        if len(held) < size:
+            held = self._scratch.held = bytearray(size)
+        view = memoryview(held)[:size]
+        found = os.preadv(self._file.fileno(), [view], offset)
+        return view if found == size else self.read(offset, size)
+
+    def peek(self, offset: int, size: int) -> bytes:
+        """Return up to ``size`` bytes at ``offset`` (fewer at the end); cheap for many small, mostly ascending reads."""
+        at, held = self._peeked  # one assignment below: threads may lose each other's piece, never mix two
+        if offset < at or offset + size > at + len(held):
+            at, held = self._peeked = offset, os.pread(self._file.fileno(), max(size, _PEEK_BYTES), offset)
+        return held[offset - at : offset - at + size]
+
+    def mapped(self, offset: int, size: int, pieces: tuple[Int64Array, Int64Array] | None = None) -> memoryview:
+        """Return a view of the file that is read where it is touched; with ``pieces`` (starts, ends), there and hardly elsewhere."""
+        if not size:
+            return memoryview(b"")
+        before = offset % mmap.ALLOCATIONGRANULARITY
+        window = mmap.mmap(self._file.fileno(), size + before, access=mmap.ACCESS_READ, offset=offset - before)
+        if pieces is not None:
+            read_only(window, pieces[0] + before, pieces[1] + before)
+        return memoryview(window)[before:]
+
+    def skips(self) -> None:
+        """Tell the system that this file is read in pieces: what follows a piece need not be read ahead."""
+        os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def read_only(window: mmap.mmap, starts: Int64Array, ends: Int64Array) -> None:
+    """Have the system read these pieces of a mapped file, shape (N,), rising, and nothing between them but short gaps."""
+    window.madvise(mmap.MADV_RANDOM)
+    if not len(starts):
+        return
+    apart = np.flatnonzero(starts[1:] - ends[:-1] > _GAP_BYTES)
+    first, last = starts[np.append(0, apart + 1)], ends[np.append(apart, len(ends) - 1)]
+    first -= first % mmap.PAGESIZE
+    for start, end in zip(first.tolist(), np.minimum(last, len(window)).tolist(), strict=True):
+        if 0 <= start < end:
+            window.madvise(mmap.MADV_WILLNEED, start, end - start)
+
+
+def in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
+    """Yield ``work(piece)`` of each piece in their order; several threads run ahead by one piece each."""
+    if threads <= 1:
+        yield from map(work, pieces)
+        return
+    ahead: deque[Future[_Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for piece in pieces:
+                ahead.append(pool.submit(work, piece))
+                if len(ahead) > threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            for waiting in ahead:
+                waiting.cancel()
+
+
+def is_bomb(compressed_bytes: int, size: int) -> bool:
+    """Return whether compressed bytes claim to hold implausibly much."""
+    return size > _PLAUSIBLE_BYTES and size > _PLAUSIBLE_RATIO * compressed_bytes
+
+
+def search_windows(start: int, end: int, overlap: int) -> Iterator[tuple[int, int, int]]:
+    """Yield (start, size to search, size to read) of pieces to search one after the other, small at first.
+
+    A search that succeeds soon stays cheap, however many there are in a file that is made to need them.
+    """
+    size = 1 << 12
+    while start < end:
+        size = min(size, end - start)
+        yield start, size, min(size + overlap, end - start)
+        start, size = start + size, min(2 * size, SEARCH_BYTES)
+
+
+def decompressed(codec: str, data: memoryview, size: int) -> memoryview:
+    """Return the ``size`` bytes that ``data`` holds.
+
+    Parameters
+    ----------
+    codec
+        ``lz4`` (frames), ``zstd`` or ``bz2``.
+    data
+        The compressed bytes.
+    size
+        How many bytes they hold.
+
+    Raises
+    ------
+    DamageError
+        The bytes do not decompress, or not to ``size``.
+    """
+    if size > MAX_CHUNK_BYTES:
+        raise DamageError(f"it claims to hold {size} bytes, more than {MAX_CHUNK_BYTES}")
+    if is_bomb(len(data), size):
+        raise DamageError(f"it claims to hold {size} bytes in {len(data)}")
+    if codec not in ("lz4", "zstd", "bz2"):
+        raise DamageError(f"its compression {codec!r} is unknown (lz4, zstd and bz2 are read)")
+    try:
+        if codec == "zstd":
+            return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec))
+        with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
+            found = stream.read_buffer(size)
+            more = stream.read(1)  # also brings the reading to the end, where checksums are compared
+    except OSError as error:
+        raise DamageError(f"it does not decompress ({error})") from None
+    if len(found) != size or more:
+        raise DamageError(f"it holds {'more' if more else f'{len(found)} bytes'}, not the {size} bytes it claims")
+    return memoryview(found)
+
+
+def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
+    """Return as many of the ``size`` bytes as the cut ``data`` still gives."""
+    pieces, found = [], 0
+    try:
+        with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
+            while found < min(size, MAX_CHUNK_BYTES) and (piece := stream.read(4096)):
+                pieces.append(piece)
+                found += len(piece)
+    except OSError:  # the cut is reached
+        pass
+    return memoryview(b"".join(pieces)[:size])
+
+
+def gathered(buffer: memoryview, offsets: Int64Array, code: str) -> Int64Array:
+    """Return the little-endian integers (numpy's ``code``: ``u2``, ``u4``, ``i8``) that lie at ``offsets``, of any alignment.
+
+    The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the sign bit, and
+    one that claims to is negative, which every check refuses.
+    """
+    kind = np.dtype("<" + code)
+    windows: NDArray[np.generic] = np.ndarray((len(buffer) - kind.itemsize + 1,), kind, buffer, 0, (1,))
+    return windows[offsets].astype(np.int64)

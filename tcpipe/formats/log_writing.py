@@ -1,0 +1,251 @@
+"""Writing logs: columns of numbers become messages in a .mcap, a ROS 1 .bag or a ROS 2 bag directory.
+
+The home of mcap's writer and of rosbags on the writing side. Every message of a stream has one layout (its strings and sequences keep
+their lengths), so that one example is serialised by rosbags and the rest are copies of its bytes with the columns patched in; where a
+field lies is found by serialising it twice with different bytes, not by a second model of the encoding.
+"""
+
+from __future__ import annotations
+
+import functools
+import shutil
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapWriter
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as Rosbag2Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_file
+from tcpipe.logs.definitions import DEFINITIONS
+
+Encoding = Literal["ros1", "cdr"]
+McapCompression = Literal["zstd", "lz4", "none"]
+BagCompression = Literal["lz4", "bz2", "none"]
+
+_CHUNK_BYTES = 1 << 20
+_MISSING_IN_ROSBAGS = {"tf2_msgs/msg/TFMessage": "geometry_msgs/TransformStamped[] transforms\n"}
+
+
+@dataclass(frozen=True, slots=True)
+class MessageStream:
+    """One topic, ready to be written.
+
+    ``columns`` hold what differs from message to message, by dotted field name, one row a message: numbers, arrays of one length
+    (second axis), or bytes of one length for strings. ``constants`` hold the rest by dotted name
+    (lists of dicts for lists of messages); what neither names is zero or empty.
+    """
+
+    topic: str
+    type_name: str
+    log_time_ns: NDArray[np.int64]
+    columns: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    constants: Mapping[str, Any] = field(default_factory=dict)
+    publish_time_ns: NDArray[np.int64] | None = None
+    latched: bool = False
+
+
+def write_mcap(
+    path: Path,
+    streams: Sequence[MessageStream],
+    *,
+    encoding: Encoding = "cdr",
+    compression: McapCompression = "zstd",
+) -> None:
+    """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 messages in MCAP (ros1)."""
+    store, version = _typestore(encoding), 1 if encoding == "ros1" else 2
+    codec = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
+    with atomic_file(path) as temporary, temporary.open("wb") as out:
+        writer = McapWriter(out, chunk_size=_CHUNK_BYTES, compression=codec[compression], enable_data_crcs=True)
+        writer.start(profile=f"ros{version}", library="tcpipe")
+        channels = []
+        for stream in streams:
+            text = store.generate_msgdef(stream.type_name, ros_version=version)[0]
+            name = stream.type_name if version == 2 else stream.type_name.replace("/msg/", "/")
+            schema = writer.register_schema(name, f"ros{version}msg", text.encode())
+            channels.append(writer.register_channel(stream.topic, encoding, schema))
+        for index, row, payload, log_time, publish_time in _in_log_order(streams, encoding):
+            writer.add_message(channels[index], log_time, payload, publish_time, row)
+        writer.finish()  # type: ignore[no-untyped-call]
+
+
+def write_bag(path: Path, streams: Sequence[MessageStream], *, compression: BagCompression = "lz4") -> None:
+    """Write a ROS 1 bag, version 2.0."""
+    store = _typestore("ros1")
+    formats = {"lz4": BagWriter.CompressionFormat.LZ4, "bz2": BagWriter.CompressionFormat.BZ2}
+    with atomic_file(path) as temporary:
+        temporary.unlink(missing_ok=True)  # rosbags insists on making it
+        writer = BagWriter(temporary)
+        if compression != "none":
+            writer.set_compression(formats[compression])
+        with writer:
+            connections = [
+                writer.add_connection(
+                    s.topic, s.type_name, typestore=store, latching=int(s.latched), callerid="/simulation"
+                )
+                for s in streams
+            ]
+            for index, _, payload, log_time, _ in _in_log_order(streams, "ros1"):
+                writer.write(connections[index], log_time, payload)
+
+
+def write_rosbag2(
+    path: Path, streams: Sequence[MessageStream], *, storage: Literal["sqlite3", "mcap"] = "sqlite3"
+) -> None:
+    """Write a ROS 2 bag directory (metadata.yaml beside one .db3 or .mcap)."""
+    store, plugin = _typestore("cdr"), {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=path.parent) as holder:
+        directory = Path(holder) / path.name  # the files inside are named after it
+        with Rosbag2Writer(directory, version=9, storage_plugin=plugin[storage]) as writer:
+            connections = [writer.add_connection(s.topic, s.type_name, typestore=store) for s in streams]
+            for index, _, payload, log_time, _ in _in_log_order(streams, "cdr"):
+                writer.write(connections[index], log_time, payload)
+        shutil.rmtree(path, ignore_errors=True)
+        directory.rename(path)
+
+
+def _in_log_order(streams: Sequence[MessageStream], encoding: Encoding) -> list[tuple[int, int, bytes, int, int]]:
+    """Return (stream, row, payload, log time, publish time) of all messages by rising log time."""
+    payloads = [_payloads(stream, encoding) for stream in streams]
+    log_times = np.concatenate([stream.log_time_ns for stream in streams])
+    publish = np.concatenate([s.log_time_ns if s.publish_time_ns is None else s.publish_time_ns for s in streams])
+    index = np.repeat(np.arange(len(streams)), [stream.log_time_ns.size for stream in streams])
+    row = np.concatenate([np.arange(stream.log_time_ns.size) for stream in streams])
+    order = np.argsort(log_times, kind="stable")
+    listed = (values[order].tolist() for values in (index, row, log_times, publish))
+    return [(i, r, payloads[i][r].tobytes(), t, p) for i, r, t, p in zip(*listed, strict=True)]
+
+
+def _payloads(stream: MessageStream, encoding: Encoding) -> NDArray[np.uint8]:
+    """Return the serialised messages, one a row."""
+    store = _typestore(encoding)
+    encode: Callable[[object, str], Any] = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
+    count = stream.log_time_ns.size
+    if not count:
+        return np.empty((0, 0), np.uint8)
+    columns = {name: values for name, values in stream.columns.items() if _has_field(store, stream.type_name, name)}
+    _check_lengths(stream.topic, columns)
+    first = {name: _value(values[0]) for name, values in columns.items()}
+    message = _message(store, stream.type_name, _nested({**stream.constants, **first}))
+
+    def serialize() -> NDArray[np.uint8]:
+        return np.frombuffer(bytes(encode(message, stream.type_name)), np.uint8)
+
+    rows = np.tile(serialize(), (count, 1))
+    for name, values in columns.items():
+        dtype = values.dtype if values.dtype.kind == "S" else np.dtype(_leaf_dtype(store, stream.type_name, name))
+        start = _place(message, name, dtype, serialize)
+        packed = np.ascontiguousarray(values.reshape(count, -1), dtype=dtype).view(np.uint8)
+        rows[:, start : start + packed.shape[1]] = packed
+    return rows
+
+
+def _check_lengths(topic: str, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Refuse what cannot be patched in: strings of several lengths, and arrays of Python objects."""
+    for name, values in columns.items():
+        ragged = values.dtype.kind == "S" and (np.char.str_len(values) != values.dtype.itemsize).any()
+        if ragged or values.dtype.kind not in "biufS":
+            raise UsageError(f"{topic}: column {name} ({values.dtype}) wants numbers, or bytes of one length")
+
+
+def _place(message: Any, name: str, dtype: np.dtype[Any], serialize: Callable[[], NDArray[np.uint8]]) -> int:
+    """Return where a field begins in the serialised message: it is written twice, with different bytes."""
+    *parents, leaf = name.split(".")
+    owner = functools.reduce(getattr, parents, message)
+    kept = getattr(owner, leaf)
+    written = []
+    for byte in (b"\x00", b"\x01"):
+        filler = np.frombuffer(byte * dtype.itemsize, dtype)[0]
+        changed = byte.decode() * len(kept) if isinstance(kept, str) else filler.item()
+        object.__setattr__(owner, leaf, np.full_like(kept, filler) if isinstance(kept, np.ndarray) else changed)
+        written.append(serialize())
+    object.__setattr__(owner, leaf, kept)
+    if written[0].size != written[1].size or not (written[0] != written[1]).any():
+        raise UsageError(f"message field {name} has no fixed place among the bytes and cannot be a column")
+    return int(np.flatnonzero(written[0] != written[1])[0])
+
+
+def _leaf_dtype(store: Typestore, type_name: str, name: str) -> str:
+    """Return the type of a number, or of the numbers of an array."""
+    parent, _, leaf = name.rpartition(".")
+    owner = _type_of(store, type_name, parent) if parent else type_name
+    fields: dict[str, Any] = dict(store.fielddefs[owner][1])
+    kind, argument = fields[leaf]
+    base = str(argument[0] if kind == Nodetype.BASE else argument[0][1][0])
+    return {"octet": "uint8", "char": "uint8"}.get(base, base)
+
+
+def _type_of(store: Typestore, type_name: str, name: str) -> str:
+    for part in name.split("."):
+        type_name = str(dict(store.fielddefs[type_name][1])[part][1])
+    return type_name
+
+
+def _has_field(store: Typestore, type_name: str, name: str) -> bool:
+    """Say whether the dialect has the field: ``header.seq`` is ROS 1 only."""
+    parent, _, leaf = name.rpartition(".")
+    owner = _type_of(store, type_name, parent) if parent else type_name
+    return leaf in dict(store.fielddefs[owner][1])
+
+
+def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    tree: dict[str, Any] = {}
+    for name, value in flat.items():
+        *parents, leaf = name.split(".")
+        branch = tree
+        for parent in parents:
+            branch = branch.setdefault(parent, {})
+        branch[leaf] = value
+    return tree
+
+
+def _value(value: Any) -> Any:
+    """Return a row of a column as rosbags wants it in a message."""
+    if isinstance(value, np.bytes_):
+        return value.decode()
+    return value if isinstance(value, np.ndarray) else value.item()
+
+
+def _message(store: Typestore, type_name: str, values: Mapping[str, Any]) -> Any:
+    """Return a message with the given values; the rest is zero or empty."""
+    made = {}
+    fields: list[tuple[str, Any]] = store.fielddefs[type_name][1]
+    for name, (kind, argument) in fields:
+        value = values.get(name)
+        if kind == Nodetype.NAME:
+            made[name] = _message(store, argument, value or {})
+        elif kind == Nodetype.BASE:
+            made[name] = value if value is not None else {"string": "", "bool": False}.get(argument[0], 0)
+        else:
+            made[name] = _elements(store, argument, value)
+    return store.types[type_name](**made)
+
+
+def _elements(store: Typestore, argument: Any, value: Any) -> Any:
+    (kind, inner), length = argument
+    if kind == Nodetype.NAME:
+        return [_message(store, inner, element) for element in (value or [])]
+    if inner[0] == "string":
+        return list(value or [])
+    dtype = {"octet": "uint8", "char": "uint8"}.get(inner[0], inner[0])
+    return np.zeros(length, dtype) if value is None else np.asarray(value, dtype)
+
+
+@functools.cache
+def _typestore(encoding: Encoding) -> Typestore:
+    store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    for name, text in {**_MISSING_IN_ROSBAGS, **DEFINITIONS}.items():
+        store.register(get_types_from_msg(text, name))
+    return store

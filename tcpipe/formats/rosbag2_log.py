@@ -1,0 +1,211 @@
+"""ROS 2 bags: a directory of .db3 or .mcap files with metadata.yaml, split, and compressed by file or by message."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from tcpipe.errors import LogError
+from tcpipe.formats.log_part import MAX_CHUNK_BYTES, Channel, LogPart, MessageBlock, is_bomb
+from tcpipe.logs.topics import Damage
+
+METADATA = "metadata.yaml"
+STORAGE_SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+_COPY_BYTES = 1 << 22
+
+
+@dataclass(frozen=True, slots=True)
+class Rosbag2Files:
+    """The storage files of a bag in order, what is wrong with their list, and how many messages metadata.yaml counts."""
+
+    paths: tuple[Path, ...]
+    damage: tuple[Damage, ...]
+    message_count: int | None = None
+
+
+def rosbag2_files(directory: Path) -> Rosbag2Files:
+    """Return the storage files of a bag directory, by metadata.yaml, or by their names where it is missing.
+
+    Raises
+    ------
+    LogError
+        The directory holds no ROS 2 bag.
+    """
+    present = storage_files(directory)
+    if not (directory / METADATA).is_file():
+        kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
+        if len(kinds) != 1:
+            found = "no .db3 or .mcap file" if not kinds else "both .db3 and .mcap files"
+            raise LogError(f"{directory}: not a ROS 2 bag: it has no {METADATA} and {found}")
+        return Rosbag2Files(
+            present,
+            (
+                Damage(
+                    directory.name,
+                    f"{METADATA} is missing; files are read in the order of their names",
+                    messages_lost=0,
+                ),
+            ),
+        )
+    information = _bag_information(directory / METADATA)
+    named = information.get("relative_file_paths")
+    listed = [Path(name).name for name in named if isinstance(name, str)] if isinstance(named, list) else []
+    paths, damage = [], []
+    for name in listed:
+        path = next((p for p in (directory / name, directory / f"{name}.zstd") if p.is_file()), None)
+        if path is None:
+            damage.append(Damage(f"{directory.name}/{name}", f"{METADATA} names this file, but it is not there"))
+        else:
+            paths.append(path)
+    for path in present:
+        if path not in paths and path.with_name(path.name.removesuffix(".zstd")) not in paths:
+            damage.append(
+                Damage(
+                    f"{directory.name}/{path.name}",
+                    f"{METADATA} does not name this file; it is read all the same",
+                    messages_lost=0,
+                )
+            )
+            paths.append(path)
+    if not paths:
+        raise LogError(
+            f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({', '.join(listed) or 'none'})"
+        )
+    count = information.get("message_count")
+    return Rosbag2Files(tuple(paths), tuple(damage), count if isinstance(count, int) else None)
+
+
+def storage_files(directory: Path) -> tuple[Path, ...]:
+    """Return the .db3 and .mcap files directly in a directory, compressed ones too, by name with numbers in order."""
+    files = [
+        path for path in directory.iterdir() if path.name.endswith(STORAGE_SUFFIXES) and not path.name.startswith(".")
+    ]
+    return tuple(sorted((path for path in files if path.is_file()), key=_natural))
+
+
+def is_one_bag(directory: Path) -> bool:
+    """Return whether a directory is one ROS 2 bag: by metadata.yaml, or by files named after it as the recorder does."""
+    if (directory / METADATA).is_file():
+        return True
+    files = storage_files(directory)
+    kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in files}
+    named = re.compile(re.escape(directory.name) + r"(_\d+)?\.(db3|mcap)(\.zstd)?")
+    return len(kinds) == 1 and all(named.fullmatch(path.name) for path in files)
+
+
+def decompressed_file(path: Path, directory: Path) -> Path:
+    """Decompress a zstd file into ``directory`` and return its copy; of a cut one, as much as can be had."""
+    copy = Path(directory, path.name.removesuffix(".zstd"))
+    size, written = path.stat().st_size, 0
+    with copy.open("wb") as target:
+        try:
+            with pa.input_stream(str(path), compression="zstd") as stream:
+                while block := stream.read(_COPY_BYTES):
+                    target.write(block)
+                    written += len(block)
+                    if is_bomb(size, written):
+                        raise LogError(
+                            f"{path}: {size} bytes hold more than {written}; it is taken for a bomb, not a log"
+                        )
+        except OSError:  # cut or damaged: what follows reads what there is, and says so
+            pass
+    return copy
+
+
+class MessageDecompressing:
+    """A part whose messages are zstd frames each (``compression_mode: MESSAGE``); others pass as they are."""
+
+    def __init__(self, part: LogPart) -> None:
+        self._part = part
+        self.name, self.damage = part.name, part.damage
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Return every channel by its number."""
+        return self._part.channels
+
+    @property
+    def unchecked(self) -> str:
+        """What was read that no checksum covers."""
+        return self._part.unchecked
+
+    def close(self) -> None:
+        """Close the file."""
+        self._part.close()
+
+    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels, decompressed."""
+        compressed: dict[int, bool] = {}
+        for block in self._part.blocks(wanted, threads=threads):
+            if block.channel not in compressed:
+                compressed[block.channel] = _is_compressed(block)
+            yield self._decompressed(block) if compressed[block.channel] else block
+
+    def _decompressed(self, block: MessageBlock) -> MessageBlock:
+        payloads, kept = [], []
+        for row, (offset, length) in enumerate(zip(block.offsets.tolist(), block.lengths.tolist(), strict=True)):
+            payload = _unframed(block.buffer[offset : offset + length])
+            if payload is not None:
+                payloads.append(payload)
+                kept.append(row)
+        lost = len(block.offsets) - len(kept)
+        if lost:
+            topic = self.channels[block.channel].topic
+            self.damage[Damage(self.name, "messages do not decompress", topic=topic, messages_lost=lost)] = None
+        lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+        rows = np.array(kept, np.int64)
+        return MessageBlock(
+            block.channel,
+            memoryview(b"".join(payloads)),
+            np.cumsum(lengths) - lengths,
+            lengths,
+            block.log_time_ns[rows],
+            block.publish_time_ns[rows],
+            block.ordinal[rows],
+            None,
+        )
+
+
+def _is_compressed(block: MessageBlock) -> bool:
+    """Return whether the first message begins like a zstd frame, as no CDR message can."""
+    return bool(len(block.offsets)) and bytes(block.buffer[block.offsets[0] : block.offsets[0] + 4]) == ZSTD_MAGIC
+
+
+def _unframed(frame: memoryview) -> bytes | None:
+    pieces: list[bytes] = []
+    found = 0
+    try:
+        with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(frame)), "zstd") as stream:
+            while piece := stream.read(_COPY_BYTES):
+                pieces.append(piece)
+                found += len(piece)
+                if found > MAX_CHUNK_BYTES or is_bomb(len(frame), found):
+                    return None
+    except OSError:
+        return None
+    return b"".join(pieces)
+
+
+def _bag_information(path: Path) -> dict[str, Any]:
+    try:
+        document = YAML(typ="safe").load(path.read_text(errors="replace"))
+        information = document["rosbag2_bagfile_information"]
+    except (YAMLError, KeyError, TypeError, ValueError):
+        information = None
+    if not isinstance(information, dict):
+        raise LogError(f"{path}: not the {METADATA} of a ROS 2 bag: it holds no rosbag2_bagfile_information")
+    return information
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]

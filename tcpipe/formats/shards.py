@@ -1,0 +1,196 @@
+"""Chunks of sharded Zarr v3 arrays, read and written directly: the same bytes as zarr's, without a millisecond of machinery a chunk.
+
+A shard is a file: encoded chunks one after another, then an index of (offset, size) pairs, each chunk and the index followed by its
+CRC-32C (`Zarr sharding codec 1.0 <https://zarr-specs.readthedocs.io/en/latest/v3/codecs/sharding-indexed/index.html>`_). Descriptions
+are written by `tcpipe.formats.zarr_arrays`; what is written here is read by zarr, xarray and GDAL, and the other way round.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import google_crc32c
+import numcodecs
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.errors import StoreError
+
+_CRC_BYTES = 4
+_ABSENT = 2**64 - 1
+"""Offset of a chunk that is all fill value."""
+
+_BLOSC_SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class ShardedArray:
+    """An array on disk, by its chunks; ``chunk_shape`` divides ``shard_shape``."""
+
+    path: Path
+    shape: tuple[int, ...]
+    chunk_shape: tuple[int, ...]
+    shard_shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    fill: float
+    sparse: bool
+    """A shard without a file is all fill value, as in Zarr; otherwise it is damage."""
+    codec: Any
+    """What encodes and decodes a chunk, beneath its checksum."""
+    _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
+
+    def chunk(self, index: tuple[int, ...], out: NDArray[Any] | None = None) -> NDArray[Any]:
+        """Return a chunk, whole even where the array ends inside it: shape ``chunk_shape``; in ``out``, contiguous, where it is given.
+
+        Raises
+        ------
+        StoreError
+            Its shard is gone or damaged.
+
+        """
+        per_shard = self.per_shard
+        shard = tuple(i // n for i, n in zip(index, per_shard, strict=True))
+        out = np.empty(self.chunk_shape, self.dtype) if out is None else out
+        path = self._shard_path(shard)
+        try:
+            with path.open("rb", buffering=0) as file:
+                place = tuple(i % n for i, n in zip(index, per_shard, strict=True))
+                offset, size = (int(value) for value in self._index(shard, file.fileno())[place])
+                if offset == _ABSENT:
+                    out[...] = self.fill
+                    return out
+                data = _checked(os.pread(file.fileno(), size, offset), size)
+                self.codec.decode(data, out=out)
+        except FileNotFoundError:
+            if not self.sparse:
+                raise StoreError(f"{path}: is gone") from None
+            out[...] = self.fill
+        except (OSError, RuntimeError, ValueError) as error:
+            raise StoreError(f"{path}: chunk {index} is damaged ({error})") from None
+        return out
+
+    def window(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+        """Return rows ``row0:row1`` and columns ``col0:col1`` of an array of two axes; `StoreError` as `chunk`."""
+        high, wide = self.chunk_shape
+        row1, col1 = min(row1, self.shape[0]), min(col1, self.shape[1])
+        out = np.empty((row1 - row0, col1 - col0), self.dtype)
+        for i, j in product(range(row0 // high, -(-row1 // high)), range(col0 // wide, -(-col1 // wide))):
+            top, left = max(i * high, row0), max(j * wide, col0)
+            bottom, right = min((i + 1) * high, row1), min((j + 1) * wide, col1)
+            part = self.chunk((i, j))[top - i * high : bottom - i * high, left - j * wide : right - j * wide]
+            out[top - row0 : bottom - row0, left - col0 : right - col0] = part
+        return out
+
+    def write_shard(self, shard: tuple[int, ...], values: NDArray[Any], *, threads: int = 1) -> None:
+        """Write a shard from its corner on; what ``values`` leave of its last chunks is fill value.
+
+        Parameters
+        ----------
+        shard
+            Number of the shard along each axis.
+        values
+            At most ``shard_shape``.
+        threads
+            Chunks that are encoded side by side; the bytes do not depend on it.
+
+        """
+        values = np.asarray(values, self.dtype)
+        places = list(product(*(range(-(-n // c)) for n, c in zip(values.shape, self.chunk_shape, strict=True))))
+        index = np.full((*self.per_shard, 2), _ABSENT, np.uint64)
+        path = self._shard_path(shard)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("wb") as file, ThreadPoolExecutor(threads) as pool:
+            encoded = map if threads == 1 else pool.map
+            for place, data in zip(places, encoded(lambda place: self._encoded(values, place), places), strict=True):
+                index[place] = file.tell(), len(data) + _CRC_BYTES
+                file.write(data)
+                file.write(_crc(data))
+            table = index.astype("<u8").tobytes()
+            file.write(table)
+            file.write(_crc(table))
+
+    def _encoded(self, values: NDArray[Any], place: tuple[int, ...]) -> bytes:
+        cut = tuple(slice(i * c, (i + 1) * c) for i, c in zip(place, self.chunk_shape, strict=True))
+        chunk = values[cut]
+        if chunk.shape != self.chunk_shape:
+            whole = np.full(self.chunk_shape, self.fill, self.dtype)
+            whole[tuple(slice(n) for n in chunk.shape)] = chunk
+            chunk = whole
+        return bytes(self.codec.encode(np.ascontiguousarray(chunk)))
+
+    @property
+    def per_shard(self) -> tuple[int, ...]:
+        """Chunks in a shard along each axis."""
+        return tuple(s // c for s, c in zip(self.shard_shape, self.chunk_shape, strict=True))
+
+    def _shard_path(self, shard: tuple[int, ...]) -> Path:
+        return self.path.joinpath("c", *(str(i) for i in shard))
+
+    def _index(self, shard: tuple[int, ...], descriptor: int) -> NDArray[np.uint64]:
+        """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
+        if shard not in self._indices:
+            per_shard = self.per_shard
+            size = 16 * math.prod(per_shard) + _CRC_BYTES
+            end = os.fstat(descriptor).st_size
+            table = _checked(os.pread(descriptor, size, max(end - size, 0)), size)
+            self._indices[shard] = np.frombuffer(table, "<u8").reshape(*per_shard, 2)
+        return self._indices[shard]
+
+
+def open_sharded(path: Path, *, sparse: bool = False) -> ShardedArray:
+    """Return the array whose description is ``path``/zarr.json; `StoreError` if it is none that this program writes."""
+    try:
+        described = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        sharding = described["codecs"][0]["configuration"]
+        names = [codec["name"] for codec in sharding["codecs"]]
+        index_names = [codec["name"] for codec in sharding["index_codecs"]]
+        if names[0] != "bytes" or names[2:] != ["crc32c"] or index_names != ["bytes", "crc32c"]:
+            raise ValueError(f"codecs {names}")  # noqa: TRY301  told below
+        return ShardedArray(
+            path=path,
+            shape=tuple(described["shape"]),
+            chunk_shape=tuple(sharding["chunk_shape"]),
+            shard_shape=tuple(described["chunk_grid"]["configuration"]["chunk_shape"]),
+            dtype=np.dtype(described["data_type"]),
+            fill=float(described["fill_value"]),
+            sparse=sparse,
+            codec=_codec(sharding["codecs"][1]),
+        )
+    except FileNotFoundError:
+        raise StoreError(f"{path}: is gone") from None
+    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
+        raise StoreError(f"{path}: not an array that can be read ({error})") from None
+
+
+def _codec(described: dict[str, Any]) -> Any:
+    """Return the codec that a description asks for; it decodes all its settings."""
+    name, how = described["name"], described["configuration"]
+    if name == "zstd":
+        return numcodecs.Zstd(level=how["level"], checksum=how["checksum"])
+    if name == "blosc":
+        return numcodecs.Blosc(
+            cname=how["cname"],
+            clevel=how["clevel"],
+            shuffle=_BLOSC_SHUFFLES[how["shuffle"]],
+            blocksize=how["blocksize"],
+        )
+    raise ValueError(f"codec {name}")
+
+
+def _crc(data: bytes) -> bytes:
+    checksum: int = google_crc32c.value(data)
+    return checksum.to_bytes(_CRC_BYTES, "little")
+
+
+def _checked(data: bytes, size: int) -> bytes:
+    """Return the data without its checksum; `ValueError` if it does not agree."""
+    if len(data) != size or _crc(data[:-_CRC_BYTES]) != data[-_CRC_BYTES:]:
+        raise ValueError("its checksum does not agree")
+    return data[:-_CRC_BYTES]

@@ -1,0 +1,355 @@
+"""The .db3 files of ROS 2: SQLite tables of topics and messages, all schema versions; a cut file gives what can still be had.
+
+SQLite has no checksums: a byte flipped inside a message is not noticed here.
+"""
+
+from __future__ import annotations
+
+import itertools
+import mmap
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from tcpipe.errors import LogError
+from tcpipe.formats.log_part import Channel, Int64Array, MessageBlock, in_order, read_only
+from tcpipe.formats.sqlite_pages import MAGIC, PageReader, Rows, UnusualError
+from tcpipe.logs.topics import Damage, normalized_type_name
+
+__all__ = ["MAGIC", "SqlitePart"]
+
+_ROWS = 1024
+_MAPPED_BYTES = 1 << 26
+_KEPT_ROWS = 1 << 18
+"""Where the rows of a file lie is found once, and kept for its reading, if they are no more than these (56 bytes each)."""
+_SPILLED_BYTES = 1 << 24
+"""Messages larger than a page are copied together in pieces of about this size."""
+_FILL = b"\xd5\x7e\xc3\x99"
+"""Pages that a cut file lacks are filled with this: as a page it is invalid, so SQLite stops there; as the end of a long message it
+is recognised."""
+_FILLED_BYTES, _MAX_BYTES = 1 << 28, 1 << 42
+"""Behind so many such bytes a cut file is made as long as it says it was by a hole; one that says more than the second is refused."""
+_BELOW, _ABOVE = -(2**63), 2**63 - 1
+_ROW_TYPES = [int, int, int, int, bytes]
+_BROKEN = (sqlite3.Error, UnicodeDecodeError)
+"""What a broken database raises; the second where even the name in its complaint is broken."""
+_Row = tuple[int, int, int, int, bytes]
+"""Row id, topic, log time, publish time, data."""
+
+
+class SqlitePart:
+    """One .db3 file, open for reading."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.name = name
+        self.damage: dict[Damage, None] = {}
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._table: _MessageTable | None = None
+        self._broken = ""
+        self._cut = False
+        try:
+            self._database = self._open(path)
+            self._database.text_factory = lambda text: text.decode(errors="backslashreplace")
+            self._refuse_views(path)
+            self._table = None if self._scratch else _message_table(path, self._database)
+            self.channels = self._channels()
+        except _BROKEN as error:
+            self.close()
+            raise LogError(
+                f"{path}: its table of topics cannot be read ({error}); nothing can be had from it"
+            ) from None
+
+    def close(self) -> None:
+        """Close the file, and remove its copy where one was needed."""
+        if hasattr(self, "_database"):
+            self._database.close()
+        if self._table:
+            self._table.close()
+        if self._scratch:
+            self._scratch.cleanup()
+
+    @property
+    def unchecked(self) -> str:
+        """What was read that no checksum covers."""
+        return "a .db3 carries no checksum"
+
+    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted topics, some thousand rows at a time: page by page, or by SQLite where that cannot be."""
+        topics = sorted(wanted & self.channels.keys())
+        if not topics:
+            return
+        read_until = _BELOW
+        if self._table:
+            try:
+                for rows in self._table.rows(threads=threads):
+                    yield from self._table.blocks(rows, topics)
+                    read_until = int(rows.ids[-1]) if len(rows.ids) else read_until
+            except UnusualError:
+                self._table = None
+            else:
+                return
+        for found in self._rows(topics, read_until):
+            yield from _blocks(found)
+
+    def _open(self, path: Path) -> sqlite3.Connection:
+        """Open without locking; a cut file, or one with an unmerged journal, through a copy."""
+        with path.open("rb") as file:
+            head = file.read(100)
+        page_bytes = int.from_bytes(head[16:18], "big")
+        page_bytes = 65536 if page_bytes == 1 else page_bytes
+        size, wanted = path.stat().st_size, page_bytes * int.from_bytes(head[28:32], "big")
+        if wanted > _MAX_BYTES:
+            raise LogError(f"{path}: it has {size} bytes and claims to have {wanted}; nothing can be had from it")
+        journal = path.with_name(path.name + "-wal")
+        if size >= wanted and not (journal.exists() and journal.stat().st_size):
+            return sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
+        self._scratch = tempfile.TemporaryDirectory(prefix="tcpipe-")
+        copy = Path(self._scratch.name, path.name)
+        shutil.copyfile(path, copy)
+        if size >= wanted:
+            shutil.copyfile(journal, copy.with_name(journal.name))
+        else:
+            self._cut = True
+            self._note(f"the file ends at byte {size} of {wanted}", bytes_lost=wanted - size)
+            with copy.open("r+b") as file:
+                file.seek(size // page_bytes * page_bytes)
+                for _ in range(file.tell(), min(wanted, size + _FILLED_BYTES), page_bytes):
+                    file.write(_FILL * (page_bytes // len(_FILL)))
+                file.truncate(wanted)
+        return sqlite3.connect(copy)
+
+    def _refuse_views(self, path: Path) -> None:
+        """Refuse a file whose topics or messages are no plain tables: what else there is may compute without end."""
+        query = "SELECT name, type, rootpage FROM sqlite_schema WHERE lower(name) IN ('topics', 'messages', 'message_definitions')"
+        for name, kind, root in self._database.execute(query):
+            if kind != "table" or not root:
+                raise LogError(f"{path}: its {name!r} is no plain table; nothing can be had from it")
+
+    def _channels(self) -> dict[int, Channel]:
+        definitions = self._definitions()
+        spans = self._spans()
+        channels = {}
+        for number, topic, type_name, encoding in self._database.execute(
+            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
+        ):
+            schema_encoding, definition = definitions.get(type_name, ("", ""))
+            count, start_ns, end_ns = spans.get(number, (0, None, None))
+            channels[int(number)] = Channel(
+                str(topic),
+                normalized_type_name(str(type_name)),
+                str(encoding),
+                schema_encoding,
+                definition,
+                count,
+                start_ns,
+                end_ns,
+            )
+        return channels
+
+    def _definitions(self) -> dict[str, tuple[str, str]]:
+        """Return encoding and text of each type's definition; files older than ROS 2 Iron hold none."""
+        try:
+            rows = self._database.execute(
+                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            )
+            return {name: (str(encoding), str(text or "")) for name, encoding, text in rows}
+        except _BROKEN:
+            return {}
+
+    def _spans(self) -> dict[int, tuple[int, int, int]]:
+        """Return count, first and last log time by topic; in a broken file, of the messages that can be reached."""
+        if self._table:
+            try:
+                return self._table.spans()
+            except UnusualError:
+                self._table = None
+        query = "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id"
+        try:
+            return {
+                topic: (count, start, end)
+                for topic, count, start, end in self._database.execute(query)
+                if isinstance(start, int) and isinstance(end, int)
+            }
+        except _BROKEN:
+            spans: dict[int, tuple[int, int, int]] = {}
+            for rows in self._reachable("SELECT id, topic_id, timestamp, timestamp, x'' FROM messages WHERE TRUE"):
+                for _, topic, stamp, _, _ in rows:
+                    count, start, end = spans.get(topic, (0, stamp, stamp))
+                    spans[topic] = (count + 1, min(start, stamp), max(end, stamp))
+            return spans
+
+    def _rows(self, topics: list[int], above: int) -> Iterator[list[_Row]]:
+        """Yield the topics' messages in the order they were written, those with ids above ``above``."""
+        columns = {row[1] for row in self._database.execute("PRAGMA table_info(messages)")}
+        publish = "send_timestamp" if "send_timestamp" in columns else "timestamp"
+        wanted = ",".join(map(str, topics))
+        return self._reachable(
+            f"SELECT id, topic_id, timestamp, {publish}, data FROM messages WHERE topic_id IN ({wanted})",  # noqa: S608
+            above,
+        )
+
+    def _reachable(self, query: str, low: int = _BELOW) -> Iterator[list[_Row]]:
+        """Yield a query's rows by ascending id; past a broken page, upward to it and downward to it."""
+        high = _ABOVE
+        for rows in self._until_broken(f"{query} AND id > ? AND id < ? ORDER BY id ASC", low, high):
+            low = rows[-1][0]
+            yield rows
+        if not self._broken:
+            return
+        broken, above = self._broken, []
+        for rows in self._until_broken(f"{query} AND id > ? AND id < ? ORDER BY id DESC", low, high):
+            high = rows[-1][0]
+            above.append(rows[::-1])
+        span = f"between message {low} and {'the end' if high == _ABOVE else f'message {high}'}"
+        self._note(f"messages {span} cannot be read ({broken})")
+        yield from above[::-1]
+
+    def _until_broken(self, query: str, low: int, high: int) -> Iterator[list[_Row]]:
+        """Yield a query's rows in blocks until its end, or until the database breaks (then ``_broken`` says how)."""
+        self._broken, unsound = "", 0
+        try:
+            cursor = self._database.execute(query, (low, high))
+        except _BROKEN as error:
+            self._broken = str(error)
+            return
+        while not self._broken:
+            rows: list[_Row] = []
+            try:
+                rows.extend(itertools.islice(cursor, _ROWS))  # what came before an error stays
+            except _BROKEN as error:
+                self._broken = str(error)
+            sound = self._sound(rows)
+            unsound += len(rows) - len(sound)
+            if sound:
+                yield sound
+            if len(rows) < _ROWS:
+                break
+        if unsound:
+            self._note("rows that are no messages, or whose end is lost", messages_lost=unsound)
+
+    def _sound(self, rows: list[_Row]) -> list[_Row]:
+        """Return the rows that are messages; in a cut file, those whose last bytes are the file's own."""
+        if rows and not self._cut:
+            kinds = [set(map(type, column)) for column in zip(*rows, strict=True)]
+            if kinds[:4] == [{int}] * 4 and kinds[4] == {bytes}:
+                return rows
+        return [
+            row for row in rows if [type(v) for v in row] == _ROW_TYPES and not (self._cut and _FILL in row[4][-7:])
+        ]
+
+    def _note(self, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
+        self.damage[Damage(self.name, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
+
+
+class _MessageTable:
+    """The table of messages of a clean file, read page by page."""
+
+    def __init__(self, path: Path, root: int, columns: list[str]) -> None:
+        with path.open("rb") as file:
+            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self._map.madvise(mmap.MADV_RANDOM)
+        self._data = memoryview(self._map)
+        self._pages = PageReader(self._data)
+        self._leaves = self._pages.leaves(root)
+        self._columns = len(columns)
+        self._kept: list[Rows] | None = None
+        publish = "send_timestamp" if "send_timestamp" in columns else "timestamp"
+        self._integers = (columns.index("topic_id"), columns.index("timestamp"), columns.index(publish))
+
+    def rows(self, *, threads: int = 1) -> Iterator[Rows]:
+        """Yield all rows, some thousand at a time; `UnusualError` ends it."""
+        if self._kept is not None:
+            yield from self._kept
+            return
+        last, touched = _BELOW, 0
+        for rows in in_order(self._rows, self._leaves, threads=threads):
+            if len(rows.ids):
+                if rows.ids[0] <= last:
+                    raise UnusualError
+                last = int(rows.ids[-1])
+            yield rows
+            touched += int(rows.lengths.sum())
+            if touched > _MAPPED_BYTES:  # every page that was ever read counts as this process's memory
+                self._map.madvise(mmap.MADV_DONTNEED)
+                touched = 0
+
+    def _rows(self, leaves: Int64Array) -> Rows:
+        starts = np.sort(leaves - 1) * self._pages.page_bytes  # messages larger than a page lie between the leaves
+        read_only(self._map, starts, starts + self._pages.page_bytes)
+        return self._pages.rows(leaves, self._columns, self._integers)
+
+    def spans(self) -> dict[int, tuple[int, int, int]]:
+        """Return count, first and last log time by topic."""
+        spans: dict[int, tuple[int, int, int]] = {}
+        found: list[Rows] = []
+        count_all = 0
+        for rows in self.rows():
+            count_all += len(rows.ids)
+            if count_all <= _KEPT_ROWS:
+                found.append(rows)
+            topic, log_time_ns, _ = rows.integers
+            for number in np.unique(topic).tolist():
+                stamps = log_time_ns[topic == number]
+                count, start, end = spans.get(number, (0, _ABOVE, _BELOW))
+                spans[number] = count + len(stamps), min(start, int(stamps.min())), max(end, int(stamps.max()))
+        self._kept = found if count_all <= _KEPT_ROWS else None
+        return spans
+
+    def blocks(self, rows: Rows, topics: list[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of the topics: where they lie whole in the file, from there, else copied together."""
+        for topic in topics:
+            of = rows.integers[0] == topic
+            whole = of & (rows.overflow == 0)
+            if whole.any():
+                yield self._block(rows.chosen(np.flatnonzero(whole)), self._data, rows.offsets[whole])
+            spilled = np.flatnonzero(of & ~whole)
+            parts = np.cumsum(rows.lengths[spilled]) // _SPILLED_BYTES
+            for part in np.unique(parts).tolist():
+                chosen = rows.chosen(spilled[parts == part])
+                yield self._block(chosen, *self._pages.blobs(chosen))
+
+    def close(self) -> None:
+        """Leave the file; views that are still held keep it mapped."""
+        del self._pages, self._data
+
+    @staticmethod
+    def _block(rows: Rows, buffer: memoryview, offsets: Int64Array) -> MessageBlock:
+        topic, log_time_ns, publish_time_ns = rows.integers
+        return MessageBlock(int(topic[0]), buffer, offsets, rows.lengths, log_time_ns, publish_time_ns, rows.ids, None)
+
+
+def _message_table(path: Path, database: sqlite3.Connection) -> _MessageTable | None:
+    """Return the table of messages for reading by page; None where it is not as ROS 2 makes it."""
+    found = database.execute(
+        "SELECT rootpage, sql FROM sqlite_schema WHERE type = 'table' AND name = 'messages'"
+    ).fetchall()
+    columns = database.execute("PRAGMA table_xinfo(messages)").fetchall()
+    if len(found) != 1 or not columns or "WITHOUT" in str(found[0][1]).upper():
+        return None
+    names = [str(name) for _, name, *_ in columns]
+    keys = [(name, str(kind).upper()) for _, name, kind, _, _, key, _ in columns if key]
+    plain = all(not hidden for *_, hidden in columns) and {"topic_id", "timestamp", "data"} <= set(names)
+    if not plain or keys != [("id", "INTEGER")] or (names[0], names[-1]) != ("id", "data"):
+        return None
+    try:
+        return _MessageTable(path, int(found[0][0]), names)
+    except UnusualError:
+        return None
+
+
+def _blocks(rows: list[_Row]) -> Iterator[MessageBlock]:
+    """Yield rows from SQLite as one block a topic."""
+    numbers, channels, log_ns, publish_ns, payloads = zip(*rows, strict=True)
+    lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+    offsets = np.cumsum(lengths) - lengths
+    buffer = memoryview(b"".join(payloads))
+    ordinal, channel = np.array(numbers, np.int64), np.array(channels, np.int64)
+    log, publish = np.array(log_ns, np.int64), np.array(publish_ns, np.int64)
+    for topic in np.unique(channel).tolist():
+        of = channel == topic
+        yield MessageBlock(topic, buffer, offsets[of], lengths[of], log[of], publish[of], ordinal[of], None)

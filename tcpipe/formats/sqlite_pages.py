@@ -1,0 +1,257 @@
+"""The pages of a clean SQLite file, read without SQLite: https://www.sqlite.org/fileformat2.html, sections 1.5 to 2.1.
+
+A table is a B-tree of pages; its leaves hold rows as cells: payload size and row id (varints), then the payload: a header of varints that
+give each column's type, then the columns. What does not fit in a page goes on in a chain of overflow pages. All cells of many leaves are
+parsed at once here, so that a message costs no step of its own. Whatever is out of the ordinary raises `UnusualError`; the caller then
+leaves the file to SQLite.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.formats.log_part import Int64Array, gathered
+
+MAGIC = b"SQLite format 3\0"
+
+_HEADER_BYTES = 100
+_LEAF, _INTERIOR = 0x0D, 0x05
+_LEAF_HEAD, _INTERIOR_HEAD = 8, 12
+_MAX_DEPTH = 20
+_LEAVES_AT_ONCE = 4096
+_SMALL_BYTES = np.array([0, 1, 2, 3, 4, 6, 8, 8, 0, 0], np.int64)
+"""Bytes of a column by its serial type: NULL, integers, a float, and the constants 0 and 1."""
+_FIRST_BLOB = 12
+_CELL_HEAD = 32
+"""Bytes of a cell that hold all its varints, of a table of few columns."""
+
+
+class UnusualError(Exception):
+    """The file is not of the plain kind that is read here."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Rows of a table: row id and integer columns, and where the blob lies.
+
+    ``offsets`` is where the blob begins in the file, ``lengths`` its size, ``local`` how many bytes of it lie there; the rest is in the
+    overflow chain that begins at page ``overflow`` (0 where there is none). All of shape (N,).
+    """
+
+    ids: Int64Array
+    integers: tuple[Int64Array, ...]
+    offsets: Int64Array
+    lengths: Int64Array
+    local: Int64Array
+    overflow: Int64Array
+
+    def chosen(self, which: Int64Array) -> Rows:
+        """Return the rows of these numbers."""
+        integers = tuple(values[which] for values in self.integers)
+        rest = (of[which] for of in (self.offsets, self.lengths, self.local, self.overflow))
+        return Rows(self.ids[which], integers, *rest)
+
+
+class PageReader:
+    """One file, as pages."""
+
+    def __init__(self, data: memoryview) -> None:
+        self._data = data
+        head = bytes(data[:_HEADER_BYTES])
+        page_bytes = int.from_bytes(head[16:18], "big")
+        self.page_bytes = 65536 if page_bytes == 1 else page_bytes
+        self._usable = self.page_bytes - (head[20] if len(head) > 20 else 0)
+        pages = int.from_bytes(head[28:32], "big")
+        plain = (
+            head.startswith(MAGIC)
+            and self.page_bytes >= 512
+            and self.page_bytes.bit_count() == 1
+            and self._usable >= 480
+            and head[24:28] == head[92:96]  # else the page count is not to be trusted
+            and pages * self.page_bytes == len(data)
+        )
+        if not plain:
+            raise UnusualError
+        self._octets: NDArray[np.uint8] = np.frombuffer(data, np.uint8)
+        self._pages = self._octets.reshape(pages, self.page_bytes)
+
+    def leaves(self, root: int) -> list[Int64Array]:
+        """Return the numbers of a table's leaf pages, given its root's, by rising row id, in groups of some thousand.
+
+        Raises
+        ------
+        UnusualError
+            Something does not look as a plain table does.
+        """
+        level = np.array([root], np.int64)
+        for _ in range(_MAX_DEPTH):
+            self._check(level)
+            if (level == 1).any():
+                break
+            if self._pages[level[0] - 1, 0] == _LEAF:  # all leaves lie equally deep
+                return [level[start : start + _LEAVES_AT_ONCE] for start in range(0, len(level), _LEAVES_AT_ONCE)]
+            counts, cells = self._cells(level, _INTERIOR, _INTERIOR_HEAD)
+            children = np.empty(len(cells) + len(level), np.int64)
+            last = np.cumsum(counts + 1) - 1
+            left = np.ones(len(children), np.bool_)
+            left[last] = False
+            children[left] = _big_endian(self._data, cells)
+            children[last] = _big_endian(self._data, (level - 1) * self.page_bytes + 8)
+            level = children
+        raise UnusualError
+
+    def rows(self, leaves: Int64Array, columns: int, integers: tuple[int, ...]) -> Rows:
+        """Return the rows on leaf pages.
+
+        Parameters
+        ----------
+        leaves
+            Numbers of the pages.
+        columns
+            How many columns a row has: the first is the row id, the last the blob.
+        integers
+            Columns that are integers.
+
+        Raises
+        ------
+        UnusualError
+            Something does not look as in a plain table.
+        """
+        _, cells = self._cells(leaves, _LEAF, _LEAF_HEAD)
+        page_ends = cells // self.page_bytes * self.page_bytes + self._usable
+        numbers, ends = _varints(self._heads(cells), 3 + columns)
+        sizes, ids, header_bytes, *kinds = numbers
+        payloads = cells + ends[1]
+        local_ends = payloads + self._local_bytes(sizes)
+        spilled = local_ends < payloads + sizes
+        _expect(local_ends + 4 * spilled <= page_ends)
+        positions = [payloads + header_bytes]
+        for kind in kinds:
+            positions.append(positions[-1] + _column_bytes(kind))
+        blobs = positions[-2]
+        _expect((cells + ends[-1] == positions[0]) & (positions[-1] == payloads + sizes) & (blobs <= local_ends))
+        _expect((kinds[-1] >= _FIRST_BLOB) & (kinds[-1] % 2 == 0))
+        _expect(ids[1:] > ids[:-1])
+        overflow = np.zeros(len(cells), np.int64)
+        if spilled.any():
+            overflow[spilled] = _big_endian(self._data, local_ends[spilled])
+        found = {column: self._integers(positions[column + 1], kinds[column]) for column in set(integers)}
+        values = tuple(found[column] for column in integers)
+        return Rows(ids, values, blobs, payloads + sizes - blobs, local_ends - blobs, overflow)
+
+    def blobs(self, rows: Rows) -> tuple[memoryview, Int64Array]:
+        """Return the blobs of rows, overflow and all, in one buffer, and where each begins there."""
+        starts = np.cumsum(rows.lengths) - rows.lengths
+        buffer = np.empty(int(rows.lengths.sum()), np.uint8)
+        for start, offset, local in zip(starts.tolist(), rows.offsets.tolist(), rows.local.tolist(), strict=True):
+            buffer[start : start + local] = self._octets[offset : offset + local]
+        room = self._usable - 4
+        windows: NDArray[np.void] = np.ndarray((max(len(buffer) - room + 1, 0),), f"V{room}", buffer, 0, (1,))
+        going = rows.overflow > 0
+        pages, left, to = rows.overflow[going], (rows.lengths - rows.local)[going], (starts + rows.local)[going]
+        while len(pages):
+            self._check(pages)
+            full = left >= room
+            windows[to[full]] = np.ascontiguousarray(self._pages[pages[full] - 1, 4 : self._usable]).view(f"V{room}")[
+                :, 0
+            ]
+            for page, size, at in zip(pages[~full].tolist(), left[~full].tolist(), to[~full].tolist(), strict=True):
+                buffer[at : at + size] = self._pages[page - 1, 4 : 4 + size]
+            going = left > room
+            pages, left, to = (
+                _big_endian(self._data, (pages[going] - 1) * self.page_bytes),
+                left[going] - room,
+                to[going] + room,
+            )
+        return buffer.data, starts
+
+    def _cells(self, pages: Int64Array, kind: int, head_bytes: int) -> tuple[Int64Array, Int64Array]:
+        """Return the number of cells of each page of a kind, and the file offset of each cell."""
+        starts = (pages - 1) * self.page_bytes
+        _expect(self._octets[starts] == kind)
+        counts = _swapped(gathered(self._data, starts + 3, "u2"))
+        _expect(head_bytes + 2 * counts <= self._usable)
+        owners = np.repeat(starts, counts)
+        within = np.arange(len(owners)) - np.repeat(np.cumsum(counts) - counts, counts)
+        pointers = _swapped(gathered(self._data, owners + head_bytes + 2 * within, "u2"))
+        _expect((pointers >= head_bytes) & (pointers <= self._usable - 4))
+        return counts, owners + pointers
+
+    def _local_bytes(self, sizes: Int64Array) -> Int64Array:
+        """Return how many bytes of each payload lie in the leaf (section 1.6 of the format)."""
+        most, least = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
+        fitting = least + (sizes - least) % (self._usable - 4)
+        return np.where(sizes <= most, sizes, np.where(fitting <= most, fitting, least))
+
+    def _heads(self, cells: Int64Array) -> NDArray[np.uint8]:
+        """Return the first bytes of each cell, shape (N, _CELL_HEAD); at the file's very end zeros follow."""
+        last = len(self._octets) - _CELL_HEAD
+        windows: NDArray[np.void] = np.ndarray((last + 1,), f"V{_CELL_HEAD}", self._data, 0, (1,))
+        heads = windows[np.minimum(cells, last)].view(np.uint8).reshape(-1, _CELL_HEAD)
+        for row in np.flatnonzero(cells > last).tolist():
+            short = self._octets[cells[row] :]
+            heads[row] = 0
+            heads[row, : len(short)] = short
+        return heads
+
+    def _integers(self, ends: Int64Array, kinds: Int64Array) -> Int64Array:
+        """Return integer columns that end at ``ends``: big-endian two's complement of 1 to 8 bytes, or a constant."""
+        constant = (kinds == 8) | (kinds == 9)
+        _expect(((kinds >= 1) & (kinds <= 6)) | constant)
+        unused_bits = 64 - 8 * _SMALL_BYTES[np.minimum(kinds, 6)]
+        values = gathered(self._data, ends - 8, "i8").byteswap() << unused_bits >> unused_bits
+        return np.where(constant, kinds - 8, values) if constant.any() else values
+
+    def _check(self, pages: Int64Array) -> None:
+        _expect((pages >= 1) & (pages <= len(self._pages)))
+
+
+def _varints(heads: NDArray[np.uint8], count: int) -> tuple[Int64Array, Int64Array]:
+    """Return the first ``count`` varints of each row of ``heads``, and where each ends, shapes (count, N).
+
+    Rows whose varints are equally long go together, so that a byte of all of them is one column.
+    """
+    numbers, ends = np.zeros((2, count, len(heads)), np.int64)
+    alike: list[tuple[slice | Int64Array, int, int]] = [(slice(None), 0, 0)] if len(heads) else []
+    while alike:
+        rows, number, at = alike.pop()
+        if number == count:
+            continue
+        if at == heads.shape[1]:
+            raise UnusualError
+        octets = heads[rows, at]
+        numbers[number, rows] = numbers[number, rows] << 7 | octets & 0x7F
+        ends[number, rows] = at + 1
+        going = octets >= 0x80
+        if going.all():
+            alike.append((rows, number, at + 1))
+        elif not going.any():
+            alike.append((rows, number + 1, at + 1))
+        else:
+            every = np.arange(len(heads))[rows]
+            alike += [(every[going], number, at + 1), (every[~going], number + 1, at + 1)]
+    return numbers, ends
+
+
+def _expect(plain: NDArray[np.bool_]) -> None:
+    if not plain.all():
+        raise UnusualError
+
+
+def _swapped(values: Int64Array) -> Int64Array:
+    """Return 16-bit integers, read in the wrong byte order, in the right one."""
+    return values >> 8 | (values & 0xFF) << 8
+
+
+def _big_endian(data: memoryview, offsets: Int64Array) -> Int64Array:
+    """Return the big-endian 32-bit integers at ``offsets``."""
+    return gathered(data, offsets, "u4").astype(np.uint32).byteswap().astype(np.int64)
+
+
+def _column_bytes(kinds: Int64Array) -> Int64Array:
+    """Return the size of columns by their serial types; 10 and 11 are not used in files."""
+    _expect((kinds < 10) | (kinds >= _FIRST_BLOB))
+    return np.where(kinds < _FIRST_BLOB, _SMALL_BYTES[np.minimum(kinds, 9)], (kinds - _FIRST_BLOB) // 2)

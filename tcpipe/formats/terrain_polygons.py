@@ -1,0 +1,183 @@
+"""Terrain drawn by hand: GeoJSON polygons with a property ``class``, as QGIS saves an annotated orthophoto.
+
+The property is a class name of the class table (case, '_' and '-' do not matter), or a number: a value of the table, as in a raster,
+else an id. Where polygons overlap, the later feature lies on top, as it was drawn. A map pixel has the class of the polygon that its
+centre lies in; ground outside all polygons has no data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from tcpipe.errors import MapError, RegionError
+from tcpipe.formats.geojson import PolygonFeature, read_polygons, shortened
+from tcpipe.formats.geotiff import burn_polygons
+from tcpipe.formats.map_layers import Tally
+from tcpipe.terrain.classes import ClassScheme, name_key
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.projection import Projection, area_of
+
+PROPERTY = "class"
+"""The property that tells a polygon's class, in any case."""
+
+SUFFIXES = (".geojson", ".json")
+"""A terrain file that ends so is polygons."""
+
+_EDGE_STEP_DEG = 0.001
+"""Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
+
+_SEEN_OVERLAP_M2 = 1.0
+"""Polygons of different classes that overlap by more than this are said."""
+
+
+@dataclass(frozen=True, slots=True)
+class PolygonLayer:
+    """Polygons as the terrain layer: in the map's CRS, in the order they are drawn, with their class ids."""
+
+    path: Path
+    polygons: NDArray[np.object_]
+    ids: NDArray[np.uint8]
+    warnings: tuple[str, ...]
+    _tree: shapely.STRtree = field(repr=False)
+    tally: Tally = field(default_factory=Tally)
+
+    @property
+    def role(self) -> str:
+        """Always ``terrain``."""
+        return "terrain"
+
+    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
+        """Return class ids of a part of the map, shape (rows, cols); 0 where no polygon is."""
+        left, top = grid.x_min_m + col0 * grid.pitch_m, grid.y_max_m - row0 * grid.pitch_m
+        box = shapely.box(left, top - rows * grid.pitch_m, left + cols * grid.pitch_m, top)
+        drawn = np.sort(self._tree.query(box))
+        affine = (grid.pitch_m, 0.0, left, 0.0, -grid.pitch_m, top)
+        return burn_polygons(self.polygons[drawn], self.ids[drawn], affine=affine, rows=rows, cols=cols)
+
+    def nothing(self) -> str | None:
+        """No reason of its own: `place_polygons` has seen that they reach the map."""
+        return None
+
+    def notes(self) -> list[str]:
+        """Return what was noticed when they were placed."""
+        return list(self.warnings)
+
+
+def place_polygons(
+    path: Path, scheme: ClassScheme, crs: CRS, bounds_m: tuple[float, float, float, float]
+) -> PolygonLayer:
+    """Read terrain polygons and carry them into a map's CRS.
+
+    Parameters
+    ----------
+    path
+        The GeoJSON file.
+    scheme
+        The class table, and the values that stand for its ids.
+    crs, bounds_m
+        The map's CRS, and x min, y min, x max, y max in it.
+
+    Raises
+    ------
+    MapError
+        Not GeoJSON, another CRS, unsound geometry, a class that the table does not have, or nothing on the map: all problems at once.
+    """
+    try:
+        features, problems = read_polygons(path)
+    except RegionError as error:
+        raise MapError(*error.problems) from None
+    ids = [_class_id(feature, scheme, problems) for feature in features]
+    if not features:
+        problems.append(f"{path}: no polygon in it; draw the terrain as polygons")
+    if problems:
+        raise MapError(*shortened(problems))
+    flat = [polygon for feature in features for polygon in feature.polygons]
+    id_of_each = np.repeat(np.array(ids, np.uint8), [len(feature.polygons) for feature in features])
+    projection = Projection(CRS.from_epsg(4326), crs, area_of(crs, bounds_m))
+    polygons = _carried(path, np.array(flat, dtype=object), projection, bounds_m)
+    on_map = ~shapely.is_empty(polygons)
+    polygons, id_of_each = polygons[on_map], id_of_each[on_map]
+    doubt = projection.doubt()
+    warnings = [f"{path.name}: {doubt}; its polygons may be off by that"] if doubt else []
+    warnings += _overlaps(path, polygons, id_of_each, scheme)
+    return PolygonLayer(path, polygons, id_of_each, tuple(warnings), shapely.STRtree(polygons))
+
+
+def _class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
+    """Return a feature's class id; 0, and a line in ``problems``, where it has none."""
+    given = _property(feature.properties)
+    if given is None:
+        there = ", ".join(sorted(feature.properties)) or "none"
+        problems.append(
+            f"{feature.where}: has no property {PROPERTY!r} that names its terrain (its properties: {there})"
+        )
+        return 0
+    by_name = {name_key(entry.name): entry.id for entry in scheme.table.classes}
+    found = by_name.get(name_key(str(given)))
+    number = _integer(given)
+    if found is None and number is not None:
+        known = {entry.id: entry.id for entry in scheme.table.classes} | dict(scheme.id_by_value)
+        found = known.get(number)
+    if found is None:
+        names = ", ".join(entry.name for entry in scheme.table.classes)
+        problems.append(f"{feature.where}: {PROPERTY} {given!r} is not in the class table ({names})")
+    return found or 0
+
+
+def _property(properties: Mapping[str, Any]) -> Any:
+    return next((value for name, value in properties.items() if name.casefold() == PROPERTY), None)
+
+
+def _integer(given: Any) -> int | None:
+    try:
+        number = float(given)
+    except (TypeError, ValueError):
+        return None
+    return int(number) if number.is_integer() and not isinstance(given, bool) else None
+
+
+def _carried(
+    path: Path, polygons: NDArray[np.object_], projection: Projection, bounds_m: tuple[float, float, float, float]
+) -> NDArray[np.object_]:
+    """Return the polygons in the map's CRS, empty where they are not on the map; `MapError` if none is."""
+    west, south, east, north = projection.area_deg
+    margin_deg = max(east - west, north - south, _EDGE_STEP_DEG)
+    near = shapely.box(west - margin_deg, south - margin_deg, east + margin_deg, north + margin_deg)
+    cut = shapely.segmentize(shapely.intersection(polygons, near), _EDGE_STEP_DEG)
+    placed = shapely.transform(cut, projection.forward)
+    on_map = shapely.intersects(placed, shapely.box(*bounds_m))
+    if on_map.any():
+        return np.asarray(np.where(on_map, placed, shapely.Polygon()))
+    lon, lat = shapely.get_coordinates(polygons).mean(axis=0)
+    swapped = shapely.transform(polygons, lambda lonlat: lonlat[:, ::-1])
+    if shapely.intersects(swapped, shapely.box(west, south, east, north)).any():
+        raise MapError(
+            f"{path}: none of its polygons is on the map, but would be with the axes swapped: GeoJSON is lon before lat (RFC 7946)"
+        )
+    raise MapError(
+        f"{path}: none of its polygons is on the map: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
+        f"the map covers {west:.5f} to {east:.5f}, {south:.5f} to {north:.5f}"
+    )
+
+
+def _overlaps(path: Path, polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> Iterator[str]:
+    """Say how much ground polygons of different classes share."""
+    below, above = shapely.STRtree(polygons).query(polygons, predicate="intersects")
+    pairs = (below < above) & (ids[below] != ids[above])
+    below, above = below[pairs], above[pairs]
+    shared_m2 = shapely.area(shapely.intersection(polygons[below], polygons[above]))
+    if shared_m2.sum() > _SEEN_OVERLAP_M2:
+        worst = int(np.argmax(shared_m2))
+        names = [scheme.table.name(int(ids[part[worst]])) for part in (above, below)]
+        yield (
+            f"{path.name}: polygons of different classes overlap by {shared_m2.sum():.0f} m² (most of it {names[0]} over {names[1]}); "
+            "the later in the file lies on top"
+        )

@@ -1,0 +1,1 @@
+"""Sensor fusion: state, process, measurements, gating, filters and smoother."""

@@ -1,0 +1,418 @@
+"""The default estimator: error-state unscented filter forward, unscented smoother backward (kernels and equations: error_state_kernel).
+
+Memory is bounded: the forward pass keeps a checkpoint per block of events; on the way back each block is filtered once more, this time
+with everything kept, and smoothed. The second pass repeats the arithmetic of the first exactly, gates included.
+
+Gates recover. A sensor that has been refused many times in a row and for a long time (GNSS 15 s, 5 s without visual odometry or IMU;
+odometry 5 s, 0.3 s where nothing else tells velocity) is taken to be right and the filter wrong: the covariance is lifted by the
+innovation before that update, which the smoother sees as process noise. Until then a multipath jump or a slipping wheel costs nothing but
+listed refusals. Where more than a tenth of all fixes is refused, the receiver's variance is not what they scatter by (a wrong claim, or
+a clock that is off): it is raised by 16 or 256 if that lets them in again, and the facts say so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from tcpipe.errors import FusionError
+from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.signals import median_period_ns
+from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.timeline import Timeline, build_timeline, turn_sources
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix
+
+_BLOCK = 2048
+_KEPT_BLOCKS = 24
+"""Blocks whose forward pass is kept at once: about 2.2 kB an event, 0.11 GB."""
+
+_Store = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+_ROLES = {kernel.GNSS_POSITION: GNSS, kernel.WHEEL_VELOCITY: WHEELS, kernel.VISUAL_VELOCITY: VISUAL}
+_DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
+_DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2}
+_NEVER = 1e18
+_MANY_REFUSED = 0.1
+_GNSS_FACTORS = (16.0, 256.0)
+_WHEEL_SCALE_TIME_S = 30.0
+_WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
+_VISUAL_SCALE_STD = 0.05
+_LOCK_OUT = {
+    kernel.GNSS_POSITION: (5.0, 15.0, 5.0),
+    kernel.WHEEL_VELOCITY: (5.0, 5.0, 0.3),
+    kernel.VISUAL_VELOCITY: (5.0, 5.0, 0.3),
+}
+"""Refusals in a row, and seconds since the last accepted measurement, after which a gate reopens; the seconds where no other sensor
+of velocity is heard."""
+
+
+def run_error_state(
+    measurements: Measurements,
+    initial: InitialState,
+    *,
+    output_ns: NDArray[np.int64],
+    gate_probability: float = 0.999,
+    smooth: bool = True,
+    covariances: bool = False,
+) -> Trajectory:
+    """Filter and smooth one stretch.
+
+    Parameters
+    ----------
+    measurements : at least one of GNSS, wheels and visual odometry.
+    initial : state at the first measurement.
+    output_ns : [ns], shape (N,), increasing: the wanted stamps.
+    gate_probability : a measurement less likely than 1 minus this is refused.
+    smooth : False gives the forward filter.
+    covariances : keep the covariance of every state as well.
+
+    Returns
+    -------
+    States at ``output_ns``, base_link in ENU.
+
+    Raises
+    ------
+    FusionError
+        The estimate is not finite.
+    """
+    timeline = build_timeline(measurements, standing_intervals(measurements), output_ns)
+    run = _Run(timeline, measurements, gate_probability, lags=_lags(output_ns), covariances=covariances)
+    outputs = run.smoothed(initial) if smooth else run.filtered(initial)
+    if run.refused_share(kernel.GNSS_POSITION) > _MANY_REFUSED:
+        softer = _softened(run, initial, measurements, gate_probability)
+        if softer is not None:
+            run, outputs = softer, (softer.smoothed(initial) if smooth else softer.filtered(initial))
+    if not np.isfinite(outputs).all():
+        raise FusionError("fusion: the estimate is not finite; look at the streams' values with tcpipe inspect --full")
+    return _trajectory(timeline, outputs, run, output_ns)
+
+
+def _softened(run: _Run, initial: InitialState, measurements: Measurements, gate_probability: float) -> _Run | None:
+    """Return a run whose GNSS variances are raised until few fixes are refused; None where that does not help."""
+    for factor in _GNSS_FACTORS:
+        variance = run.timeline.variance.copy()
+        variance[run.timeline.kind == kernel.GNSS_POSITION] *= factor
+        trial = _Run(
+            replace(run.timeline, variance=variance),
+            measurements,
+            gate_probability,
+            lags=run.lags,
+            covariances=run.covariances,
+            gnss_factor=factor,
+        )
+        trial.filtered(initial)
+        if trial.refused_share(kernel.GNSS_POSITION) <= _MANY_REFUSED:
+            return trial
+    return None
+
+
+@dataclass(slots=True)
+class _Memory:
+    """What the filter carries from event to event."""
+
+    x: NDArray[np.float64]
+    P: NDArray[np.float64]
+    refused: NDArray[np.float64]
+    silent: NDArray[np.float64]
+
+    def copy(self) -> _Memory:
+        return _Memory(self.x.copy(), self.P.copy(), self.refused.copy(), self.silent.copy())
+
+
+class _Run:
+    """One timeline with its constants and what the gates said."""
+
+    def __init__(
+        self,
+        timeline: Timeline,
+        measurements: Measurements,
+        gate_probability: float,
+        *,
+        lags: Sequence[int],
+        covariances: bool = False,
+        gnss_factor: float = 1.0,
+    ) -> None:
+        self.lags = lags
+        self.covariances = covariances
+        self._width = 111 if covariances else 30
+        self.timeline = timeline
+        self.gnss_factor = gnss_factor
+        count = timeline.stamp_ns.size
+        self.nis = np.full(count, np.nan)
+        self.verdict = np.zeros(count, np.int8)
+        self.repairs = 0.0
+        self.displacement_variance_m2 = np.full((timeline.output.max() + 1, len(DISPLACEMENT_LAGS_S)), np.nan)
+        self.gates = np.full(8, np.inf)
+        for kind in (*_ROLES, kernel.STANDING, kernel.STANDING_RATE):
+            self.gates[kind] = chdtri(_DOF[kind], 1 - gate_probability)
+        self._levers = np.zeros((8, 3))
+        for kind, source in (
+            (kernel.GNSS_POSITION, measurements.gnss),
+            (kernel.WHEEL_VELOCITY, measurements.wheels),
+            (kernel.SIDEWAYS, measurements.wheels),
+            (kernel.VISUAL_VELOCITY, measurements.visual),
+        ):
+            if source is not None:
+                self._levers[kind] = source.lever_arm_m
+        self._densities = process_noise(measurements)
+        self._lock_out = np.full((8, 3), _NEVER)
+        for kind, limits in _LOCK_OUT.items():
+            self._lock_out[kind] = limits
+        if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
+            self._lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
+        if measurements.imu is None and not turn_sources(measurements):  # nothing but GNSS tells how it turns
+            self._lock_out[kernel.GNSS_POSITION, 1:] = 1.0
+        # Without GNSS nothing tells how long a metre of odometry is; an accelerometer has a scale and an alignment of its own.
+        self.unseen_scale_std = 0.0
+        if measurements.gnss is None:
+            self.unseen_scale_std = _WHEEL_SCALE_STD if measurements.visual is None else _VISUAL_SCALE_STD
+        self.last: _Memory
+
+    def refused_share(self, kind: int) -> float:
+        """Share of the measurements of a kind that the gate refused."""
+        verdict = self.verdict[self.timeline.kind == kind]
+        return float(np.mean(verdict == kernel.REFUSED)) if verdict.size else 0.0
+
+    def filtered(self, initial: InitialState) -> NDArray[np.float64]:
+        """Forward states at the wanted stamps, rows as `error_state_kernel` saves them."""
+        outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
+        memory = _start(initial)
+        self._forward(0, self.timeline.stamp_ns.size, memory, outputs, None)
+        self.last = memory
+        return outputs
+
+    def smoothed(self, initial: InitialState) -> NDArray[np.float64]:
+        """Smoothed states at the wanted stamps."""
+        count = self.timeline.stamp_ns.size
+        outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
+        edges = [*range(0, count, _BLOCK), count]
+        blocks = list(pairwise(edges))
+        memory = _start(initial)
+        checkpoints: list[_Memory] = []
+        kept: dict[int, _Store] = {}
+        for index, (first, last) in enumerate(blocks):
+            checkpoints.append(memory.copy())
+            if index >= len(blocks) - _KEPT_BLOCKS:
+                kept[index] = self._store(first, last)
+            self._forward(first, last, memory, outputs, kept.get(index))
+        self.last = memory
+        adjoint, information = np.zeros(kernel.N), np.zeros((kernel.N, kernel.N))
+        links = _links(self.lags)
+        for index in range(len(blocks) - 1, -1, -1):
+            first, last = blocks[index]
+            if index not in kept:
+                kept[index] = self._store(first, last)
+                self._forward(first, last, checkpoints[index], outputs, kept[index])
+            kernel.smooth_block(
+                first,
+                last,
+                self.timeline.output,
+                kept.pop(index),
+                adjoint,
+                information,
+                outputs,
+                links,
+                self.displacement_variance_m2,
+            )
+        return outputs
+
+    def _store(self, first: int, last: int) -> _Store:
+        """Return room for what the smoother wants of some events."""
+        events, wanted = last - first, int(np.count_nonzero(self.timeline.output[first:last] >= 0))
+        n = kernel.N
+        return np.empty((events, 12, 9)), np.empty((events, 2, 3, n)), np.empty((events, 24)), np.empty((wanted, n, n))
+
+    def _forward(
+        self,
+        first: int,
+        last: int,
+        memory: _Memory,
+        outputs: NDArray[np.float64],
+        store: _Store | None,
+    ) -> None:
+        t = self.timeline
+        self.repairs += kernel.filter_block(
+            first,
+            last,
+            t.dt_s,
+            t.kind,
+            t.mode,
+            t.value,
+            t.variance,
+            t.turn_rate_radps,
+            t.force_mps2,
+            t.turn_rate_now_radps,
+            t.output,
+            self._levers,
+            self._densities,
+            self.gates,
+            self._lock_out,
+            memory.x,
+            memory.P,
+            memory.refused,
+            memory.silent,
+            store is not None,
+            store or self._store(0, 0),
+            self.nis,
+            self.verdict,
+            outputs,
+        )
+
+
+def _links(lags: Sequence[int]) -> tuple[NDArray[Any], ...]:
+    """Return what the smoother remembers to link each wanted stamp to those ``lags`` rows later, in the kernel's order.
+
+    The chain from the event at hand to the next wanted stamp; by node and row (a ring) the chains over the node's lag; by row the columns
+    of I - L P that belong to the position, and east, north with their smoothed covariance; by node the two nodes whose product it is;
+    the nodes' lags; the nodes wanted. The first node is one row; a longer one is made of its halves.
+    """
+    nodes: dict[int, tuple[int, int]] = {}
+
+    def add(lag: int) -> None:
+        if lag not in nodes:
+            halves = (lag - lag // 2, lag // 2)
+            for half in halves if lag > 1 else ():
+                add(half)
+            nodes[lag] = halves
+
+    for lag in (1, *lags):
+        add(lag)
+    index = {lag: k for k, lag in enumerate(nodes)}
+    recipe = np.array([[index.get(half, 0) for half in halves] for halves in nodes.values()])
+    size = max(nodes) + 1
+    n = kernel.N
+    chains = np.zeros((len(nodes), size, n, n))
+    wanted = np.array([index[lag] for lag in lags])
+    return np.eye(n), chains, np.zeros((size, n, 2)), np.zeros((size, 6)), recipe, np.array(list(nodes)), wanted
+
+
+def process_noise(measurements: Measurements) -> NDArray[np.float64]:
+    """Return the noise densities by process mode [unit²/s], and the decay of the wheels' scale [1/s], shape (4, 18).
+
+    White noise of standard deviation s at f Hz has the density s²/f; somewhat more stands for scale and alignment errors of the IMU.
+    Biases, scales and the velocity of a robot without IMU wander: their densities are what such robots do in a second. Slip comes and goes,
+    so the wheels' scale returns to one; where only the wheels and the camera tell speed, neither is known to be right on average, and it
+    wanders freely.
+    """
+    density = np.empty((4, kernel.N + 1))
+    density[:, 0:3] = 0.01
+    density[:, 3:6] = (1e-4) ** 2
+    density[:, 6:9] = (1.5e-3) ** 2  # a milli-g or two in a minute, as uncooled MEMS units drift
+    density[:, 9:12] = 1.0
+    density[:, 12:15] = 1e-8
+    density[:, 15] = 2 * _WHEEL_SCALE_STD**2 / _WHEEL_SCALE_TIME_S
+    density[:, 17] = 0.0 if measurements.gnss is None and measurements.visual is not None else 1 / _WHEEL_SCALE_TIME_S
+    density[:, 16] = 0.002**2
+    density[kernel.FLAT_TURN, 2] = 8e-3 if turn_sources(measurements) else 0.02
+    density[kernel.VISUAL_TURN, 2] = 5e-4
+    if measurements.visual is not None and measurements.visual.turn_rate_radps is not None:
+        density[kernel.VISUAL_TURN, 0:2] = 5e-4
+    imu = measurements.imu
+    if imu is not None:
+        rate_hz = 1e9 / median_period_ns(imu.stamp_ns)
+        density[kernel.GYRO_TURN :, 0:3] = 1.5 * imu.gyro_std_radps**2 / rate_hz + 1e-8
+        density[kernel.INERTIAL, 9:12] = 1.1 * imu.accelerometer_std_mps2**2 / rate_hz + 1e-6
+    return density
+
+
+def _start(initial: InitialState) -> _Memory:
+    x = np.zeros(kernel.NX)
+    rotation = matrix_from_quat(initial.quat_xyzw)
+    x[0:9] = rotation.ravel()
+    x[9:12] = initial.gyro_bias_radps
+    x[15:18] = initial.velocity_enu_mps
+    x[18:21] = initial.position_enu_m
+    P = np.zeros((kernel.N, kernel.N))
+    P[0:3, 0:3] = rotation.T @ np.diag(np.square([initial.tilt_std_rad] * 2 + [initial.yaw_std_rad])) @ rotation
+    index = np.arange(3, kernel.N)
+    P[index, index] = np.concatenate(
+        (
+            np.full(3, initial.gyro_bias_std_radps**2),
+            np.full(3, 0.15**2),
+            np.full(3, initial.velocity_std_mps**2),
+            initial.position_std_m**2,
+            [_WHEEL_SCALE_STD**2, _VISUAL_SCALE_STD**2],
+        )
+    )
+    return _Memory(x, P, np.zeros(8), np.zeros(8))
+
+
+def _trajectory(
+    timeline: Timeline, outputs: NDArray[np.float64], run: _Run, output_ns: NDArray[np.int64]
+) -> Trajectory:
+    rotation = outputs[:, 0:9].reshape(-1, 3, 3)
+    scale_std, speed_mps = run.unseen_scale_std, np.linalg.norm(outputs[:, 15:18], axis=1)
+    bias = np.where(timeline.output_has_gyro[:, None], outputs[:, 9:12], 0.0)
+    return Trajectory(
+        stamp_ns=output_ns,
+        position_enu_m=outputs[:, 18:21].copy(),
+        quat_xyzw=quat_from_matrix(rotation),
+        velocity_enu_mps=outputs[:, 15:18].copy(),
+        angular_velocity_radps=timeline.output_rate_radps - bias,
+        position_std_m=np.sqrt(outputs[:, 23:26]),
+        yaw_std_rad=np.sqrt(outputs[:, 26]),
+        forward_velocity_std_mps=np.hypot(np.sqrt(outputs[:, 27]), scale_std * speed_mps),
+        rejections=_rejections(timeline, run),
+        displacement_std_m=np.hypot(
+            _displacement_std_m(run, output_ns), scale_std * speed_mps[:, None] * DISPLACEMENT_LAGS_S
+        ),
+        facts=_facts(timeline, run),
+        covariance=outputs[:, 30:].reshape(-1, 9, 9) if run.covariances else None,
+    )
+
+
+def _lags(output_ns: NDArray[np.int64]) -> list[int]:
+    """Rows that each of `DISPLACEMENT_LAGS_S` spans."""
+    period_s = median_period_ns(output_ns) * 1e-9 if output_ns.size > 1 else 1.0
+    return [max(1, round(lag_s / period_s)) for lag_s in DISPLACEMENT_LAGS_S]
+
+
+def _displacement_std_m(run: _Run, output_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    std = np.sqrt(run.displacement_variance_m2)
+    for column, (lag, lag_s) in enumerate(zip(_lags(output_ns), DISPLACEMENT_LAGS_S, strict=True)):
+        step_s = (output_ns[lag:] - output_ns[:-lag]) * 1e-9
+        std[: step_s.size, column][np.abs(step_s - lag_s) > 0.1 * lag_s] = np.nan  # across a gap
+    return std
+
+
+def _rejections(timeline: Timeline, run: _Run) -> Rejections:
+    refused = np.flatnonzero((run.verdict == kernel.REFUSED) & np.isin(timeline.kind, list(_ROLES)))
+    kind = timeline.kind[refused]
+    return Rejections(
+        stamp_ns=timeline.stamp_ns[refused],
+        role=np.array([_ROLES[int(k)] for k in kind], np.str_),
+        reason=np.full(refused.size, "gate"),
+        normalized_innovation_squared=run.nis[refused],
+        threshold=run.gates[kind],
+    )
+
+
+def _facts(timeline: Timeline, run: _Run) -> dict[str, Any]:
+    facts: dict[str, Any] = {"nis_mean": {}, "measurements": {}, "rejected": {}, "reopened": {}}
+    for kind, role in _ROLES.items():
+        of_kind = timeline.kind == kind
+        if of_kind.any():
+            accepted = of_kind & (run.verdict == kernel.ACCEPTED)
+            mean = float(run.nis[accepted].mean()) / _DOF[kind] if accepted.any() else None
+            facts["nis_mean"][role] = mean
+            facts["measurements"][role] = int(of_kind.sum())
+            facts["rejected"][role] = int((of_kind & (run.verdict == kernel.REFUSED)).sum())
+            facts["reopened"][role] = int((of_kind & (run.verdict == kernel.REOPENED)).sum())
+    x, deviation = run.last.x, np.sqrt(np.diag(run.last.P))
+    facts["events"] = int(timeline.stamp_ns.size)
+    facts["standing_updates"] = int((timeline.kind == kernel.STANDING).sum())
+    facts["gnss_variance_factor"] = run.gnss_factor
+    facts["covariance_repairs"] = int(run.repairs)
+    facts["gyro_bias_radps"] = x[9:12].tolist()
+    facts["accelerometer_bias_mps2"] = x[12:15].tolist()
+    facts["wheel_scale"], facts["wheel_scale_std"] = float(1 + x[21]), float(deviation[15])
+    facts["visual_scale"], facts["visual_scale_std"] = float(1 + x[22]), float(deviation[16])
+    return facts

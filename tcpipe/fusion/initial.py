@@ -1,0 +1,271 @@
+"""Where a stretch starts: position, attitude and gyroscope bias, found offline from all that follows.
+
+Yaw comes from the course over ground: the path that the odometry and the gyroscope draw from an arbitrary yaw is laid over the GNSS fixes
+by the rotation that fits best (the planar case of Wahba's problem: the angle of the sum of products of complex numbers). At least
+5 m at 0.2 m/s or more are asked for, ten standard deviations of the fixes where that is longer. Since the odometry's velocity has a
+sign, a run may start in reverse; since the path is drawn, it may start with a turn. Roll and pitch come from the specific force,
+or from the unit's own orientation where the two agree.
+
+Source: B. K. P. Horn, "Closed-form solution of absolute orientation using unit quaternions", JOSA A 4 (4), 1987 (section 2.B, planar).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
+from tcpipe.fusion.signals import integral, interval_means, seconds
+from tcpipe.fusion.timeline import turn_sources
+from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
+
+_MIN_COURSE_M = 5.0
+_MIN_COURSE_STD = 10.0
+_MIN_SPEED_MPS = 0.2
+_MAX_WINDOW_NS = 120_000_000_000
+_WINDOW_STEP_NS = 2_000_000_000
+_TILT_AGREES_RAD = 0.2
+_GYRO_BIAS_STD_RADPS = 0.02
+_UNKNOWN_YAW_STD_RAD = 0.6  # the sigma points of a wider one would meet behind the robot
+
+
+def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64], start_ns: int) -> InitialState:
+    """Return the state at ``start_ns``, the first stamp of the stretch.
+
+    Parameters
+    ----------
+    measurements : of one stretch.
+    standing_ns : [ns], shape (K, 2), when the robot stands.
+    start_ns : [ns].
+    """
+    bias, bias_std = _gyro_bias(measurements.imu, standing_ns)
+    roll, pitch, tilt_std = _tilt(measurements.imu, standing_ns, start_ns)
+    path = _Path(measurements, start_ns, bias)
+    yaw, yaw_std, heading_from = _yaw(measurements, path, start_ns, bias_std)
+    quat = quat_from_rpy(roll, pitch, yaw)
+    position, position_std = _position(measurements.gnss, path, quat, yaw)
+    velocity, velocity_std = path.start_velocity(yaw, pitch)
+    return InitialState(
+        position_enu_m=position,
+        position_std_m=position_std,
+        quat_xyzw=quat,
+        tilt_std_rad=tilt_std,
+        yaw_std_rad=yaw_std,
+        velocity_enu_mps=velocity,
+        velocity_std_mps=velocity_std,
+        gyro_bias_radps=bias,
+        gyro_bias_std_radps=bias_std,
+        heading_from=heading_from,
+    )
+
+
+def _gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
+    if imu is None or standing_ns.size == 0:
+        return np.zeros(3), _GYRO_BIAS_STD_RADPS
+    inside = (imu.stamp_ns >= standing_ns[0, 0]) & (imu.stamp_ns <= standing_ns[0, 1])
+    if inside.sum() < 10:
+        return np.zeros(3), _GYRO_BIAS_STD_RADPS
+    mean: NDArray[np.float64] = imu.angular_velocity_radps[inside].mean(0)
+    return mean, max(0.002, imu.gyro_std_radps / np.sqrt(inside.sum()))
+
+
+def _tilt(
+    imu: InertialMeasurements | None, standing_ns: NDArray[np.int64], start_ns: int
+) -> tuple[float, float, float]:
+    """Roll and pitch [rad] at the start, and their standard deviation."""
+    if imu is None or imu.stamp_ns.size == 0:
+        return 0.0, 0.0, 0.15
+    stands = standing_ns.size > 0 and standing_ns[0, 0] < start_ns + 2_000_000_000
+    end = int(standing_ns[0, 1]) if stands else start_ns + 1_500_000_000
+    oriented = np.flatnonzero(np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns) & (imu.stamp_ns <= end))
+    own = rpy_from_quat(imu.quat_xyzw[oriented[0]]) if oriented.size else None
+    if not imu.accelerometer_usable:
+        return (0.0, 0.0, 0.15) if own is None else (float(own[0]), float(own[1]), 0.05)
+    stamp_s = seconds(imu.stamp_ns, start_ns)
+    span_s = np.array([(standing_ns[0, 0] if stands else start_ns) - start_ns, end - start_ns]) * 1e-9
+    fx, fy, fz = interval_means(stamp_s, imu.specific_force_mps2, span_s[:1], span_s[1:])[0]
+    roll, pitch = float(np.arctan2(fy, fz)), float(np.arctan2(-fx, np.hypot(fy, fz)))
+    if own is not None and max(abs(own[0] - roll), abs(own[1] - pitch)) < _TILT_AGREES_RAD and not stands:
+        return float(own[0]), float(own[1]), 0.05
+    return roll, pitch, 0.03 if stands else 0.08
+
+
+class _Path:
+    """The path drawn by odometry and gyroscope from the origin with yaw zero: a function of time, held outside the odometry."""
+
+    def __init__(self, measurements: Measurements, start_ns: int, bias: NDArray[np.float64]) -> None:
+        self.start_ns = start_ns
+        self._yaw_s, self._yaw_rate = _yaw_rate_samples(measurements, start_ns, bias)
+        source = _speed_source(measurements)
+        self.known = source is not None
+        self._lever = np.zeros(2) if measurements.gnss is None else np.asarray(measurements.gnss.lever_arm_m)[:2]
+        if source is None:
+            return
+        self._stamp_s = seconds(source.stamp_ns, start_ns)
+        self._speed = source.velocity_mps[:, 0]
+        yaw = self.yaw(self._stamp_s)
+        self._velocity = self._speed[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
+
+    def yaw(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Yaw turned since the start [rad]."""
+        if self._yaw_s.size == 0:
+            return np.zeros(at_s.size)
+        turned = integral(self._yaw_s, self._yaw_rate, at_s) - integral(self._yaw_s, self._yaw_rate, np.zeros(1))
+        return turned[:, 0]
+
+    def antenna(self, at_s: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Antenna east + i north [m] as drawn."""
+        antenna = np.asarray(complex(*self._lever) * np.exp(1j * self.yaw(at_s)), np.complex128)
+        if self.known:
+            start = integral(self._stamp_s, self._velocity, np.zeros(1))
+            xy = integral(self._stamp_s, self._velocity, at_s) - start
+            antenna += xy[:, 0] + 1j * xy[:, 1]
+        return antenna
+
+    def length(self, until_s: float) -> float:
+        """Metres driven since the start."""
+        if not self.known:
+            return max(until_s, 0.0)
+        speed = np.abs(self._speed)[:, None]
+        return float(np.diff(integral(self._stamp_s, speed, np.array([0.0, max(until_s, 0.0)])), axis=0)[0, 0])
+
+    def start_velocity(self, yaw: float, pitch: float) -> tuple[NDArray[np.float64], float]:
+        """Velocity at the start [m/s] and its standard deviation."""
+        if not self.known:
+            return np.zeros(3), 1.0
+        speed = float(np.median(self._speed[:5]))
+        return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), 0.3
+
+
+def _yaw_rate_samples(
+    measurements: Measurements, start_ns: int, bias: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    imu = measurements.imu
+    if imu is not None and imu.stamp_ns.size:
+        return seconds(imu.stamp_ns, start_ns), imu.angular_velocity_radps[:, 2:] - bias[2]
+    sources = turn_sources(measurements)
+    if not sources:
+        return np.empty(0), np.empty((0, 1))
+    source = sources[-1]
+    known = np.isfinite(source.yaw_rate_radps)
+    return seconds(source.stamp_ns[known], start_ns), source.yaw_rate_radps[known, None]
+
+
+def _speed_source(measurements: Measurements) -> BodyVelocities | None:
+    for source in (measurements.wheels, measurements.visual):
+        if source is not None and source.stamp_ns.size:
+            return source
+    return None
+
+
+def _yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:
+    """Yaw at the start [rad], its standard deviation, and where it is from."""
+    own = _own_yaw(measurements.imu, start_ns)
+    if measurements.gnss is None or measurements.gnss.stamp_ns.size == 0:
+        return (0.0, 0.01, "local frame") if own is None else (own, 0.01, "orientation")
+    fit = _course_fit(measurements.gnss, path, start_ns)
+    if fit is not None:
+        std = float(np.hypot(np.hypot(fit.yaw_std_rad, 0.03), bias_std * fit.centre_s))
+        return fit.yaw_rad, min(std, _UNKNOWN_YAW_STD_RAD), "course over ground"
+    return (0.0, _UNKNOWN_YAW_STD_RAD, "unknown") if own is None else (own, _UNKNOWN_YAW_STD_RAD, "orientation")
+
+
+def _own_yaw(imu: InertialMeasurements | None, start_ns: int) -> float | None:
+    if imu is None:
+        return None
+    oriented = np.flatnonzero(np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns))
+    return float(rpy_from_quat(imu.quat_xyzw[oriented[0]])[2]) if oriented.size else None
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    yaw_rad: float
+    yaw_std_rad: float
+    residual_m: float
+    centre_s: float
+
+
+def _course_fit(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
+    """Find the first window of fixes that the drawn path fits; the best of all where none fits well."""
+    stamp_s = seconds(gnss.stamp_ns, start_ns)
+    east_north = _smoothed(gnss.position_enu_m[:, 0]) + 1j * _smoothed(gnss.position_enu_m[:, 1])
+    noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
+    wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
+    drawn = path.antenna(stamp_s)
+    best: _Fit | None = None
+    first_of_next = gnss.stamp_ns[0]
+    for first in range(gnss.stamp_ns.size):
+        if gnss.stamp_ns[first] < first_of_next:
+            continue
+        first_of_next = gnss.stamp_ns[first] + _WINDOW_STEP_NS
+        last = int(np.searchsorted(gnss.stamp_ns, gnss.stamp_ns[first] + _MAX_WINDOW_NS, "right"))
+        far = np.flatnonzero(np.abs(east_north[first:last] - east_north[first]) >= wanted)
+        if far.size == 0:
+            continue
+        inside = slice(first, first + int(far[0]) + 1)
+        if stamp_s[inside][-1] - stamp_s[first] > wanted / _MIN_SPEED_MPS and not path.known:
+            continue
+        fit = _fit(east_north[inside], drawn[inside], stamp_s[inside], noise) if path.known else None
+        if not path.known:
+            return _course(east_north[inside], path.yaw(stamp_s[inside]), stamp_s[inside])
+        if fit is None:
+            continue
+        if fit.residual_m <= max(3 * noise, 0.05 * wanted):
+            return fit
+        best = fit if best is None or fit.residual_m < best.residual_m else best
+    return best
+
+
+def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Take the running median of five: single outliers vanish."""
+    if values.size < 5:
+        return values
+    padded = np.concatenate((values[:1], values[:1], values, values[-1:], values[-1:]))
+    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
+
+
+def _fit(
+    fixes: NDArray[np.complex128],
+    drawn: NDArray[np.complex128],
+    stamp_s: NDArray[np.float64],
+    noise_m: float,
+) -> _Fit | None:
+    """Lay the drawn path over the fixes by the rotation (and scale) that fits best."""
+    a, b = fixes - fixes.mean(), drawn - drawn.mean()
+    extent2 = float(np.sum(np.abs(b) ** 2))
+    if extent2 < 1.0 or np.sqrt(extent2 / fixes.size) < 0.2 * np.sqrt(np.sum(np.abs(a) ** 2) / fixes.size):
+        return None  # the odometry stands while the fixes move
+    product = np.sum(a * np.conj(b))
+    residual = float(np.sqrt(np.mean(np.abs(a - product / extent2 * b) ** 2)))
+    std = max(noise_m, residual) / np.sqrt(extent2 / min(fixes.size, 10))
+    return _Fit(float(np.angle(product)), float(std), residual, float(stamp_s.mean()))
+
+
+def _course(fixes: NDArray[np.complex128], turned: NDArray[np.float64], stamp_s: NDArray[np.float64]) -> _Fit:
+    """Without odometry: each step between fixes goes forward, turned back by the yaw turned until then."""
+    middle = 0.5 * (turned[1:] + turned[:-1])
+    return _Fit(float(np.angle(np.sum(np.diff(fixes) * np.exp(-1j * middle)))), 0.2, 0.0, float(stamp_s.mean()))
+
+
+def _position(
+    gnss: Positions | None, path: _Path, quat: NDArray[np.float64], yaw: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """base_link at the start and its standard deviation: the median of what the first fixes say, the drawn way taken off."""
+    if gnss is None or gnss.stamp_ns.size == 0:
+        return np.zeros(3), np.full(3, 1e-3)
+    few = slice(0, min(10, gnss.stamp_ns.size))
+    at_s = seconds(gnss.stamp_ns[few], path.start_ns)
+    drawn = path.antenna(at_s) * np.exp(1j * yaw)
+    position = np.array(
+        [
+            np.median(gnss.position_enu_m[few, 0] - drawn.real),
+            np.median(gnss.position_enu_m[few, 1] - drawn.imag),
+            np.median(gnss.position_enu_m[few, 2]) - rotate(quat, gnss.lever_arm_m)[2],
+        ]
+    )
+    driven = path.length(float(at_s[-1]))
+    std: NDArray[np.float64] = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
+    std += np.array([0.1, 0.1, 0.2]) * max(driven, 1.0)
+    return position, std

@@ -1,0 +1,128 @@
+"""Measurements as the estimators take them: plain arrays in base_link axes and in the ENU plane of the datum, every number usable.
+
+What the stage has already done when one of these exists: units and frames converted, mounting rotations applied (lever arms are kept
+beside the values, since they act through the attitude), unusable rows taken out and counted, unknown or absurd variances replaced
+and floored. Rows are sorted by stamp, without repetitions. Both estimators take the same `Measurements` and return a
+`tcpipe.fusion.trajectory.Trajectory`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+GNSS, IMU, WHEELS, VISUAL = "gnss", "imu", "wheel_odometry", "visual_odometry"
+"""Roles, as they stand in the rejections table."""
+
+NO_LEVER_ARM = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Positions:
+    """GNSS: positions of an antenna.
+
+    Attributes
+    ----------
+    stamp_ns : [ns], shape (N,), int64, increasing.
+    position_enu_m : [m], shape (N, 3), antenna in the ENU plane of the datum.
+    variance_m2 : [m²], shape (N, 3), east, north, up; floored, never unknown.
+    lever_arm_m : [m], position of the antenna in base_link.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    position_enu_m: NDArray[np.float64]
+    variance_m2: NDArray[np.float64]
+    lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
+
+
+@dataclass(frozen=True, slots=True)
+class BodyVelocities:
+    """Odometry: velocity of a point of the body, in base_link axes.
+
+    Attributes
+    ----------
+    stamp_ns : [ns], shape (N,), int64, increasing. Middle of the interval where a velocity comes from two poses.
+    velocity_mps : [m/s], shape (N, 3), velocity of the point at ``lever_arm_m``. Wheels: only x is measured, y and z are NaN.
+    variance_m2ps2 : [m²/s²], shape (N, 3); NaN exactly where the velocity is.
+    yaw_rate_radps : [rad/s], shape (N,), about base_link's z; NaN where the source gives none.
+    yaw_rate_var : [rad²/s²], shape (N,); NaN exactly where the yaw rate is.
+    lever_arm_m : [m], the measured point in base_link.
+    turn_rate_radps : [rad/s], shape (N, 3), about all three axes of base_link, z as in ``yaw_rate_radps``; None where the source is flat
+        (wheels) or gives none.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    velocity_mps: NDArray[np.float64]
+    variance_m2ps2: NDArray[np.float64]
+    yaw_rate_radps: NDArray[np.float64]
+    yaw_rate_var: NDArray[np.float64]
+    lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
+    turn_rate_radps: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class InertialMeasurements:
+    """IMU, rotated into base_link axes by its mounting.
+
+    Attributes
+    ----------
+    stamp_ns : [ns], shape (N,), int64, increasing.
+    angular_velocity_radps : [rad/s], shape (N, 3), base_link axes.
+    specific_force_mps2 : [m/s²], shape (N, 3), base_link axes; +g along the upward axis at rest.
+    quat_xyzw : shape (N, 4), enu_from_base_link by the unit's own attitude filter; NaN where absent. Yaw may be magnetic or offset.
+    gyro_std_radps, accelerometer_std_mps2 : white noise at the unit's rate, one axis.
+    accelerometer_usable : False where the specific force is not one (gravity removed, other units): the gyroscope alone is used.
+    lever_arm_m : [m], where the specific force is felt; zero once it is moved to base_link, as the error-state filter wants it.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    angular_velocity_radps: NDArray[np.float64]
+    specific_force_mps2: NDArray[np.float64]
+    quat_xyzw: NDArray[np.float64]
+    gyro_std_radps: float
+    accelerometer_std_mps2: float
+    accelerometer_usable: bool = True
+    lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
+
+
+@dataclass(frozen=True, slots=True)
+class Measurements:
+    """All measurements of one stretch of one clock epoch without a long gap; a role that the log lacks is None.
+
+    At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body velocity are
+    zero to within this.
+    """
+
+    gnss: Positions | None = None
+    imu: InertialMeasurements | None = None
+    wheels: BodyVelocities | None = None
+    visual: BodyVelocities | None = None
+    nonholonomic_std_mps: float = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class InitialState:
+    """Where a stretch starts, found offline from all of its data (`tcpipe.fusion.initial`).
+
+    Attributes
+    ----------
+    position_enu_m, position_std_m : [m], shape (3,), base_link.
+    quat_xyzw : shape (4,), enu_from_base_link.
+    tilt_std_rad, yaw_std_rad : standard deviation of roll and pitch, and of yaw.
+    velocity_enu_mps, velocity_std_mps : [m/s], shape (3,) and scalar.
+    gyro_bias_radps : [rad/s], shape (3,); zero where the robot never stands.
+    heading_from : how yaw was found: ``course over ground``, ``orientation``, ``local frame`` or ``unknown``.
+    """
+
+    position_enu_m: NDArray[np.float64]
+    position_std_m: NDArray[np.float64]
+    quat_xyzw: NDArray[np.float64]
+    tilt_std_rad: float
+    yaw_std_rad: float
+    velocity_enu_mps: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    velocity_std_mps: float = 0.3
+    gyro_bias_radps: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    gyro_bias_std_radps: float = 0.02
+    heading_from: str = "unknown"

@@ -1,0 +1,262 @@
+"""From a stream's columns to measurements: base_link axes, the datum's plane, usable variances, one row a stamp.
+
+Rows that say nothing (no velocity and no pose to make one from, a fix at 0, 0, a sample beyond any sensor's range) are left out and
+returned, so that they can be listed. A variance that is unknown, zero, negative or not finite is replaced by the recipe's, one that is
+too good to be true is raised to a floor: a zero covariance is not trust.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Positions
+from tcpipe.fusion.signals import median_period_ns
+from tcpipe.geometry.datum import enu_from_geodetic
+from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate, rotation_vector_from_quat
+
+Columns = Mapping[str, NDArray[np.float64]]
+"""Columns of a stream by name, null as NaN."""
+
+_NO_TRUST = 1e6
+"""Larger variances, of a kilometre or a kilometre a second, are cut to this: as little trust, and differences keep their digits."""
+_VELOCITY_FLOOR_MPS = 0.02
+_YAW_RATE_STD_RADPS = 0.1
+_YAW_RATE_FLOOR_RADPS = 0.02
+_MAX_VELOCITY_MPS = 50.0
+_MAX_INCREMENT_S = 1.0
+_MAX_RATE_RADPS = 100.0
+_MAX_FORCE_MPS2 = 1000.0
+_GRAVITY_BAND_MPS2 = (8.0, 12.0)
+_DATUM_FIXES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """How a stream was prepared: stamps of rows without use, rows of a repeated stamp, variances replaced; and remarks for people."""
+
+    invalid_ns: NDArray[np.int64]
+    repeated: int = 0
+    variances_replaced: int = 0
+    remarks: tuple[str, ...] = ()
+
+
+def find_datum(
+    lon_deg: NDArray[np.float64], lat_deg: NDArray[np.float64], alt_m: NDArray[np.float64]
+) -> tuple[float, float, float] | None:
+    """Return longitude [deg], latitude [deg], height [m]: the median of the first ten fixes; None where there is none."""
+    usable = np.flatnonzero(_is_fix(lon_deg, lat_deg, alt_m))[:_DATUM_FIXES]
+    if usable.size == 0:
+        return None
+    first = lon_deg[usable[0]]
+    turned = (lon_deg[usable] - first + 180.0) % 360.0 - 180.0  # fixes on both sides of the date line
+    lon = (first + float(np.median(turned)) + 180.0) % 360.0 - 180.0
+    return float(lon), float(np.median(lat_deg[usable])), float(np.median(alt_m[usable]))
+
+
+def _is_fix(
+    lon_deg: NDArray[np.float64], lat_deg: NDArray[np.float64], alt_m: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    fix: NDArray[np.bool_] = np.isfinite(lon_deg) & np.isfinite(lat_deg) & np.isfinite(alt_m)
+    fix &= (np.abs(lat_deg) <= 90) & (np.abs(lon_deg) <= 360) & ~((lon_deg == 0) & (lat_deg == 0))
+    return fix
+
+
+def positions(
+    stamp_ns: NDArray[np.int64],
+    columns: Columns,
+    *,
+    datum_deg_m: tuple[float, float, float],
+    lever_arm_m: tuple[float, float, float],
+    default_std_m: float,
+    floor_std_m: float,
+) -> tuple[Positions, Prepared]:
+    """Prepare GNSS fixes (columns of the role gnss); unknown variances: ``default_std_m`` horizontally, twice that vertically."""
+    lon, lat, alt = columns["lon_deg"], columns["lat_deg"], columns["alt_m"]
+    usable, repeated = _usable(stamp_ns, _is_fix(lon, lat, alt))
+    variance = np.stack([columns[f"{axis}_var_m2"] for axis in ("east", "north", "up")], -1)[usable]
+    default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
+    variance, replaced = _variances(variance, default, floor_std_m**2)
+    fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
+    prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
+    return Positions(stamp_ns[usable], fixes, variance, lever_arm_m), prepared
+
+
+def body_velocities(
+    stamp_ns: NDArray[np.int64],
+    columns: Columns,
+    *,
+    xyz_m: tuple[float, float, float],
+    quat_xyzw: tuple[float, float, float, float],
+    default_std_mps: float,
+    only_forward: bool,
+) -> tuple[BodyVelocities, Prepared]:
+    """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry).
+
+    Its twist is taken where it has one. A twist that is empty, or zero throughout while the poses move, is none: the velocity is then
+    that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two.
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,). columns : by name, null as NaN.
+    xyz_m, quat_xyzw : base_link_from_sensor of the child frame.
+    default_std_mps : [m/s], where the variance is unknown.
+    only_forward : wheels measure only the velocity along base_link's x.
+    """
+    pose = _matrix(columns, ("x_m", "y_m", "z_m"))
+    velocity = _matrix(columns, [f"velocity_{axis}_mps" for axis in "xyz"])
+    rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
+    variance = _matrix(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
+    remarks: tuple[str, ...] = ()
+    if not _has_twist(velocity, pose):
+        quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
+        stamp_ns, velocity, rate = _increments(stamp_ns, pose, quat)
+        variance = np.full_like(velocity, np.nan)
+        yaw_rate_var = np.full(stamp_ns.size, np.nan)
+        remarks = ("no twist: pose increments are used",)
+    else:
+        yaw_rate_var = columns["yaw_rate_var"]
+    turned = rotate(quat_xyzw, velocity)
+    measured = np.isfinite(turned[:, 0] if only_forward else turned.sum(1)) & (np.abs(turned) < _MAX_VELOCITY_MPS).all(
+        1
+    )
+    usable, repeated = _usable(stamp_ns, measured)
+    # Off-diagonal terms that the rotation makes are dropped.
+    variance = variance[usable] @ (matrix_from_quat(quat_xyzw) ** 2).T
+    variance, replaced = _variances(variance, np.full(3, default_std_mps**2), _VELOCITY_FLOOR_MPS**2)
+    turn_rate = rotate(quat_xyzw, rate)[usable]
+    yaw_rate = turn_rate[:, 2]
+    floor = _YAW_RATE_FLOOR_RADPS**2
+    yaw_rate_var = _variances(yaw_rate_var[usable, None], np.array([_YAW_RATE_STD_RADPS**2]), floor)[0][:, 0]
+    turned = turned[usable]
+    if only_forward:
+        turned[:, 1:] = np.nan
+        variance[:, 1:] = np.nan
+    yaw_rate_var[~np.isfinite(yaw_rate)] = np.nan
+    spatial = None if only_forward or not np.isfinite(turn_rate).all() else turn_rate
+    made = BodyVelocities(stamp_ns[usable], turned, variance, yaw_rate, yaw_rate_var, xyz_m, spatial)
+    return made, Prepared(stamp_ns[~measured], repeated, replaced, remarks)
+
+
+def inertial(
+    stamp_ns: NDArray[np.int64],
+    columns: Columns,
+    *,
+    xyz_m: tuple[float, float, float],
+    quat_xyzw: tuple[float, float, float, float],
+    gyro_std_radps: float,
+    accelerometer_std_mps2: float,
+) -> tuple[InertialMeasurements, Prepared]:
+    """Prepare an IMU (columns of the role imu): turned into base_link axes, its specific force checked for being one.
+
+    The specific force is moved to base_link: what the unit feels beyond base_link, since it sits off it and the robot turns, is taken
+    off. The noise is the one given or, where that is larger, what the samples show: the second difference of white noise has sqrt(6)
+    times its standard deviation, and motion too fast for the unit's rate counts as noise.
+    """
+    rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
+    force = _matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
+    # NaN compares false.
+    good: NDArray[np.bool_] = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
+    usable, repeated = _usable(stamp_ns, good)
+    orientation = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"])[usable])
+    norm = float(np.median(np.linalg.norm(force[usable], axis=1))) if usable.size else 0.0
+    low, high = _GRAVITY_BAND_MPS2
+    remarks: tuple[str, ...] = ()
+    if usable.size and not low <= norm <= high:
+        wanted = "wanted about 9.81 (gravity included, SI units)"
+        remarks = (
+            f"median specific force is {norm:.2f} m/s², {wanted}: only the gyroscope is used, roll and pitch are weak",
+        )
+    turn = rotate(quat_xyzw, rate[usable])
+    made = InertialMeasurements(
+        stamp_ns[usable],
+        turn,
+        rotate(quat_xyzw, force[usable]) - _lever_acceleration(stamp_ns[usable], turn, np.asarray(xyz_m)),
+        product(orientation, inverse(quat_xyzw)),
+        max(gyro_std_radps, _white_noise(rate[usable])),
+        max(accelerometer_std_mps2, _white_noise(force[usable])),
+        not remarks,
+    )
+    return made, Prepared(stamp_ns[~good], repeated, 0, remarks)
+
+
+def _lever_acceleration(
+    stamp_ns: NDArray[np.int64], turn_radps: NDArray[np.float64], lever_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Acceleration of the unit against base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
+
+    The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time,
+    cancels out, as that of any derivative.
+    """
+    if stamp_ns.size < 5 or not lever_m.any():
+        return np.zeros_like(turn_radps)
+    smooth = np.pad(turn_radps, ((2, 2), (0, 0)), mode="edge")
+    slope = (2 * (smooth[4:] - smooth[:-4]) + smooth[3:-1] - smooth[1:-3]) / (10e-9 * median_period_ns(stamp_ns))
+    acceleration: NDArray[np.float64] = np.cross(slope, lever_m) + np.cross(turn_radps, np.cross(turn_radps, lever_m))
+    return acceleration
+
+
+def _white_noise(values: NDArray[np.float64]) -> float:
+    """Estimate the standard deviation of white noise on a signal (N, 3), the largest of its axes; 0 for fewer than three samples."""
+    if values.shape[0] < 3:
+        return 0.0
+    second = np.diff(values, n=2, axis=0)
+    return float(np.sqrt(np.mean(second**2, axis=0) / 6).max())
+
+
+def _matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> NDArray[np.float64]:
+    return np.stack([columns[name] for name in names], -1)
+
+
+def _usable(stamp_ns: NDArray[np.int64], good: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
+    """Return rows in order of time, one a stamp (the first of equals), and how many repeated one."""
+    rows = np.flatnonzero(good)
+    _, first = np.unique(stamp_ns[rows], return_index=True)
+    return rows[first], int(rows.size - first.size)
+
+
+def _variances(
+    variance: NDArray[np.float64], default: NDArray[np.float64], floor: float
+) -> tuple[NDArray[np.float64], int]:
+    """Return usable variances (N, k) and how many rows had one replaced."""
+    known = np.isfinite(variance) & (variance > 0)
+    filled = np.clip(np.where(known, variance, default), floor, _NO_TRUST)
+    return filled, int((~known).any(1).sum())
+
+
+def _has_twist(velocity_mps: NDArray[np.float64], pose_m: NDArray[np.float64]) -> bool:
+    """Whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
+    known = np.isfinite(velocity_mps).all(1)
+    if not known.any():
+        return False
+    posed = pose_m[np.isfinite(pose_m).all(1)]
+    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > 0.1
+    return bool((velocity_mps[known] != 0).any()) or not moves
+
+
+def _increments(
+    stamp_ns: NDArray[np.int64], pose_m: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Velocity and angular velocity in the child frame, in the middle of each two successive poses."""
+    posed = np.flatnonzero(np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
+    _, first = np.unique(stamp_ns[posed], return_index=True)
+    stamp, position, quat = stamp_ns[posed][first], pose_m[posed][first], quat_xyzw[posed][first]
+    step_ns = np.diff(stamp)
+    step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
+    turn = rotation_vector_from_quat(product(inverse(quat[:-1]), quat[1:]))
+    half_way = _half_way(quat[:-1], quat[1:])
+    velocity = rotate(inverse(half_way), np.diff(position, axis=0)) / step_s
+    near = step_s[:, 0] <= _MAX_INCREMENT_S
+    return stamp[:-1][near] + step_ns[near] // 2, velocity[near], (turn / step_s)[near]
+
+
+def _half_way(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation half-way between two: the normalised sum of the quaternions of one hemisphere."""
+    sign = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -1.0, 1.0)
+    return normalized(a + sign * b)
+
+
+__all__ = ["Columns", "Prepared", "body_velocities", "find_datum", "inertial", "positions"]

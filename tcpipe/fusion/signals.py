@@ -1,0 +1,90 @@
+"""Sampled signals between their samples: integrals, means, values at other stamps, and gaps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def seconds(stamp_ns: NDArray[np.int64] | int, zero_ns: int) -> NDArray[np.float64]:
+    """Return the time since ``zero_ns`` [s]; the difference is taken before rounding."""
+    return np.asarray(np.asarray(stamp_ns, np.int64) - zero_ns, np.float64) * 1e-9
+
+
+def integral(
+    stamp_s: NDArray[np.float64], values: NDArray[np.float64], at_s: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the integral, from the first sample on, of the piecewise-linear signal through the samples.
+
+    Parameters
+    ----------
+    stamp_s : [s], shape (N,), increasing, N >= 1.
+    values : [u], shape (N, k). Before the first and after the last sample they are held.
+    at_s : [s], shape (M,).
+
+    Returns
+    -------
+    [u s], shape (M, k).
+    """
+    step = np.diff(stamp_s)
+    area = 0.5 * (values[1:] + values[:-1]) * step[:, None]
+    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(area, axis=0)))
+    index = np.clip(np.searchsorted(stamp_s, at_s, "right") - 1, 0, stamp_s.size - 1)
+    after = (at_s - stamp_s[index])[:, None]
+    later = np.minimum(index + 1, stamp_s.size - 1)
+    inside = (index < stamp_s.size - 1) & (after[:, 0] > 0)
+    slope = np.where(
+        inside[:, None],
+        (values[later] - values[index]) / np.where(later > index, stamp_s[later] - stamp_s[index], 1.0)[:, None],
+        0.0,
+    )
+    partial: NDArray[np.float64] = total[index] + after * (values[index] + 0.5 * after * slope)
+    return partial
+
+
+def interval_means(
+    stamp_s: NDArray[np.float64],
+    values: NDArray[np.float64],
+    start_s: NDArray[np.float64],
+    end_s: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the mean of the piecewise-linear signal over each interval, shape (M, k); its value where the interval is empty."""
+    width = (end_s - start_s)[:, None]
+    mean = (integral(stamp_s, values, end_s) - integral(stamp_s, values, start_s)) / np.where(width > 0, width, 1.0)
+    return np.where(width > 0, mean, at(stamp_s, values, end_s))
+
+
+def at(stamp_s: NDArray[np.float64], values: NDArray[np.float64], at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, k) samples interpolated linearly, shape (M, k); held outside."""
+    return np.stack([np.interp(at_s, stamp_s, values[:, k]) for k in range(values.shape[1])], -1)
+
+
+def in_gap(
+    stamp_ns: NDArray[np.int64], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], *, longest_ns: int
+) -> NDArray[np.bool_]:
+    """Return whether each interval touches a stretch between samples longer than ``longest_ns``, or lies outside the samples.
+
+    Half that long outside the first and last sample is still inside.
+    """
+    if stamp_ns.size == 0:
+        return np.ones(start_ns.size, np.bool_)
+    margin = longest_ns // 2
+    outside = (start_ns < stamp_ns[0] - margin) | (end_ns > stamp_ns[-1] + margin)
+    long = np.concatenate(([0], np.cumsum(np.diff(stamp_ns) > longest_ns)))  # long gaps before each sample
+    before = np.clip(np.searchsorted(stamp_ns, start_ns, "right") - 1, 0, stamp_ns.size - 1)
+    after = np.clip(np.searchsorted(stamp_ns, end_ns, "left"), 0, stamp_ns.size - 1)
+    touches: NDArray[np.bool_] = outside | (long[after] > long[before])
+    return touches
+
+
+def hold_last(
+    stamp_ns: NDArray[np.int64], values: NDArray[np.float64], at_ns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the last value at or before each stamp, shape (M,); NaN before the first."""
+    index = np.searchsorted(stamp_ns, at_ns, "right") - 1
+    return np.where(index >= 0, values[np.maximum(index, 0)] if values.size else np.nan, np.nan)
+
+
+def median_period_ns(stamp_ns: NDArray[np.int64]) -> int:
+    """Return the median time between samples [ns], at least 1; 1 for fewer than two samples."""
+    return max(1, int(np.median(np.diff(stamp_ns)))) if stamp_ns.size > 1 else 1

@@ -1,0 +1,90 @@
+"""Cutting a run into stretches that are fused one by one, and the stamps of the track in each.
+
+A clock epoch is a stretch of its own: nothing is integrated across a step of the clock. So is what follows a pause of all sensors
+longer than 5 s (a paused recording): whatever happened meanwhile, the estimator does not carry its certainty over.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.signals import in_gap, median_period_ns
+
+_PAUSE_NS = 5_000_000_000
+_Source = TypeVar("_Source", Positions, BodyVelocities, InertialMeasurements)
+
+
+@dataclass(frozen=True, slots=True)
+class Stretch:
+    """One stretch: its clock epoch, first and last stamp [ns] of a motion measurement, and its measurements."""
+
+    epoch: int
+    start_ns: int
+    end_ns: int
+    measurements: Measurements
+
+
+def cut_stretches(
+    measurements: Mapping[int, Measurements],
+) -> list[Stretch]:
+    """Return the stretches of measurements given by clock epoch, in order of epoch and time; those without motion are left out."""
+    found = []
+    for epoch in sorted(measurements):
+        whole = measurements[epoch]
+        stamp = _stamps(whole, with_imu=True)
+        if stamp.size == 0:
+            continue
+        pause = np.flatnonzero(np.diff(stamp) > _PAUSE_NS)
+        first = stamp[np.concatenate(([0], pause + 1))]
+        last = stamp[np.concatenate((pause, [stamp.size - 1]))]
+        for start, end in zip(first.tolist(), last.tolist(), strict=True):
+            part = _within(whole, start, end)
+            motion = _stamps(part, with_imu=False)
+            if motion.size > 1:
+                found.append(Stretch(epoch, int(motion[0]), int(motion[-1]), part))
+    return found
+
+
+def track_stamps(stretch: Stretch, *, period_ns: int, max_gap_ns: int) -> NDArray[np.int64]:
+    """Return the multiples of the period inside a stretch [ns], those left out that lie in a gap of motion measurements.
+
+    A gap is a time without any of GNSS, wheels and visual odometry longer than ``max_gap_ns`` and than 2.5 times their usual spacing:
+    the IMU alone does not bear a track. A gap is a step in the stamps.
+    """
+    first = -(-stretch.start_ns // period_ns) * period_ns
+    stamp = np.arange(first, stretch.end_ns + 1, period_ns, dtype=np.int64)
+    motion = _stamps(stretch.measurements, with_imu=False)
+    longest = max(max_gap_ns, int(2.5 * median_period_ns(motion)))
+    return stamp[~in_gap(motion, stamp, stamp, longest_ns=longest)]
+
+
+def _stamps(measurements: Measurements, *, with_imu: bool) -> NDArray[np.int64]:
+    sources = [measurements.gnss, measurements.wheels, measurements.visual]
+    stamps = [source.stamp_ns for source in (*sources, measurements.imu if with_imu else None) if source is not None]
+    return np.unique(np.concatenate(stamps)) if stamps else np.empty(0, np.int64)
+
+
+def _within(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
+    return replace(
+        whole,
+        gnss=_part(whole.gnss, start_ns, end_ns),
+        imu=_part(whole.imu, start_ns, end_ns),
+        wheels=_part(whole.wheels, start_ns, end_ns),
+        visual=_part(whole.visual, start_ns, end_ns),
+    )
+
+
+def _part(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
+    """Return the rows between two stamps."""
+    if source is None:
+        return None
+    inside = (source.stamp_ns >= start_ns) & (source.stamp_ns <= end_ns)
+    values = {field.name: getattr(source, field.name) for field in fields(source)}
+    rows: dict[str, Any] = {name: value[inside] for name, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(source, **rows) if inside.any() else None

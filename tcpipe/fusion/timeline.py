@@ -1,0 +1,259 @@
+"""Everything that happens to the error-state filter, sorted by time: measurements, constraints, and the stamps that are wanted.
+
+Late messages are no problem offline: events are sorted by stamp of measurement. The IMU is not an event but an input: each event
+carries the mean angular velocity and specific force since the event before, integrated through the IMU's samples. So the filter takes
+one step from event to event, at most 50 ms, whatever the IMU's rate.
+
+Constraints are events of our own making:
+
+- sideways and vertical body velocity are about zero (a wheeled robot), folded into the wheels' events, else 10 times a second. The
+  error of this constraint (side slip, a lever arm to the turning centre) lasts, so it must not be counted as white at 50 Hz with a
+  small deviation: that locks GNSS out. Its information is that of 0.15 m/s ten times a second, whatever the wheels' rate; so is the
+  wheels' own, whose error, slip, lasts as well.
+- standing (`tcpipe.fusion.standing`): zero velocity, and the gyroscope shows its bias, five times a second.
+- level, where no accelerometer tells up from down: roll and pitch are small. A slope lasts, so 20° are counted once in four seconds: as 40°
+  once a second.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
+
+_MAX_STEP_NS = 50_000_000
+_NONHOLONOMIC_HZ = 10.0
+_STANDING_NS = 200_000_000
+_STANDING_STD_MPS = 0.01
+_LEVEL_NS = 1_000_000_000
+_LEVEL_STD_RAD = 0.7
+_MIN_INPUT_GAP_NS = 100_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """Events in order of time, as `tcpipe.fusion.error_state_kernel.filter_block` takes them.
+
+    Attributes
+    ----------
+    stamp_ns : [ns], shape (E,). dt_s : [s], since the event before. kind, mode : see the kernel.
+    value, variance : shape (E, 3); unused entries are 0 and 1.
+    turn_rate_radps, force_mps2 : mean over the time since the event before, shape (E, 3).
+    turn_rate_now_radps : at the event, shape (E, 3).
+    output : row of the wanted stamps, or -1.
+    output_rate_radps : angular velocity around each wanted stamp, shape (N, 3), bias not taken off; and whether a gyroscope says so.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    dt_s: NDArray[np.float64]
+    kind: NDArray[np.int8]
+    mode: NDArray[np.int8]
+    value: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    turn_rate_radps: NDArray[np.float64]
+    force_mps2: NDArray[np.float64]
+    turn_rate_now_radps: NDArray[np.float64]
+    output: NDArray[np.int64]
+    output_rate_radps: NDArray[np.float64]
+    output_has_gyro: NDArray[np.bool_]
+
+
+def build_timeline(
+    measurements: Measurements, standing_ns: NDArray[np.int64], output_ns: NDArray[np.int64]
+) -> Timeline:
+    """Merge measurements, constraints and wanted stamps.
+
+    Parameters
+    ----------
+    measurements : of one stretch.
+    standing_ns : [ns], shape (K, 2), from `tcpipe.fusion.standing.standing_intervals`.
+    output_ns : [ns], shape (N,), increasing.
+    """
+    parts = _measured(measurements)
+    start = min(int(part[0][0]) for part in parts if part[0].size)
+    end = max(int(part[0][-1]) for part in parts if part[0].size)
+    parts += _constraints(measurements, standing_ns, start, end)
+    parts.append(_plain(output_ns, kernel.PREDICT))
+    parts.append(_plain(_fillers(np.concatenate([part[0] for part in parts])), kernel.PREDICT))
+    stamp = np.concatenate([part[0] for part in parts])
+    kind = np.concatenate([np.full(part[0].size, part[1], np.int8) for part in parts])
+    output = np.full(stamp.size, -1, np.int64)
+    fillers = parts[-1][0].size
+    output[stamp.size - fillers - output_ns.size : stamp.size - fillers] = np.arange(output_ns.size)
+    # Wanted stamps come last among events of one stamp: they see every measurement of their time.
+    order = np.lexsort((np.where(output >= 0, 1, 0), stamp))
+    stamp, kind, output = stamp[order], kind[order], output[order]
+    before = np.concatenate((stamp[:1], stamp[:-1]))
+    rate, force, mode = _inputs(measurements, before, stamp, start)
+    rate_now, _, _ = _inputs(measurements, stamp, stamp, start)
+    half = (median_period_ns(output_ns) if output_ns.size > 1 else _MAX_STEP_NS) // 2
+    around, _, around_mode = _inputs(measurements, output_ns - half, output_ns + half, start)
+    return Timeline(
+        stamp,
+        np.asarray(stamp - before, np.float64) * 1e-9,
+        kind,
+        mode,
+        np.concatenate([part[2] for part in parts])[order],
+        np.concatenate([part[3] for part in parts])[order],
+        rate,
+        force,
+        rate_now,
+        output,
+        around,
+        around_mode >= kernel.GYRO_TURN,
+    )
+
+
+_Part = tuple[NDArray[np.int64], int, NDArray[np.float64], NDArray[np.float64]]
+
+
+def _plain(stamp_ns: NDArray[np.int64], kind: int) -> _Part:
+    return stamp_ns, kind, np.zeros((stamp_ns.size, 3)), np.ones((stamp_ns.size, 3))
+
+
+def _constant(stamp_ns: NDArray[np.int64], kind: int, std: tuple[float, float, float]) -> _Part:
+    return stamp_ns, kind, np.zeros((stamp_ns.size, 3)), np.tile(np.square(std), (stamp_ns.size, 1))
+
+
+def _measured(measurements: Measurements) -> list[_Part]:
+    parts: list[_Part] = []
+    gnss, wheels, visual = measurements.gnss, measurements.wheels, measurements.visual
+    if gnss is not None and gnss.stamp_ns.size:
+        parts.append((gnss.stamp_ns, kernel.GNSS_POSITION, gnss.position_enu_m, gnss.variance_m2))
+    if wheels is not None and wheels.stamp_ns.size:
+        parts.append(_wheels(wheels, measurements.nonholonomic_std_mps))
+    if visual is not None and visual.stamp_ns.size:
+        parts.append((visual.stamp_ns, kernel.VISUAL_VELOCITY, visual.velocity_mps, visual.variance_m2ps2))
+    return parts
+
+
+def _wheels(wheels: BodyVelocities, nonholonomic_std_mps: float) -> _Part:
+    rate_hz = 1e9 / median_period_ns(wheels.stamp_ns) if wheels.stamp_ns.size > 1 else _NONHOLONOMIC_HZ
+    together = max(1.0, rate_hz / _NONHOLONOMIC_HZ)
+    value = np.zeros_like(wheels.velocity_mps)
+    variance = np.full_like(value, nonholonomic_std_mps**2 * together)
+    value[:, 0], variance[:, 0] = wheels.velocity_mps[:, 0], wheels.variance_m2ps2[:, 0] * together
+    return wheels.stamp_ns, kernel.WHEEL_VELOCITY, value, variance
+
+
+def _constraints(measurements: Measurements, standing_ns: NDArray[np.int64], start: int, end: int) -> list[_Part]:
+    parts: list[_Part] = []
+    if measurements.wheels is None or measurements.wheels.stamp_ns.size == 0:
+        grid = np.arange(start, end, int(1e9 / _NONHOLONOMIC_HZ), dtype=np.int64)
+        std = measurements.nonholonomic_std_mps
+        parts.append((grid, kernel.SIDEWAYS, np.zeros((grid.size, 3)), np.tile([std**2, std**2, 1.0], (grid.size, 1))))
+    imu = measurements.imu
+    if imu is None or not imu.accelerometer_usable:
+        grid = np.arange(start, end, _LEVEL_NS, dtype=np.int64)
+        parts.append(_constant(grid, kernel.LEVEL, (_LEVEL_STD_RAD, _LEVEL_STD_RAD, 1.0)))
+    if imu is not None and standing_ns.size:
+        grid = np.concatenate([np.arange(a, b, _STANDING_NS, dtype=np.int64) for a, b in standing_ns])
+        grid = grid[(grid >= start) & (grid <= end)]
+        parts.append(_constant(grid, kernel.STANDING, (_STANDING_STD_MPS,) * 3))
+        parts.append(_standing_rate(imu, grid))
+    return parts
+
+
+def _standing_rate(imu: InertialMeasurements, grid: NDArray[np.int64]) -> _Part:
+    """Measure the gyroscope's bias, while the robot stands, by its mean around each stamp."""
+    zero = int(imu.stamp_ns[0])
+    stamp_s, centre_s = seconds(imu.stamp_ns, zero), seconds(grid, zero)
+    half_s = 0.5e-9 * _STANDING_NS
+    bias = interval_means(stamp_s, imu.angular_velocity_radps, centre_s - half_s, centre_s + half_s)
+    samples = max(1.0, _STANDING_NS / median_period_ns(imu.stamp_ns))
+    variance = imu.gyro_std_radps**2 / samples + 5e-4**2
+    return grid, kernel.STANDING_RATE, bias, np.full((grid.size, 3), variance)
+
+
+def _fillers(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Stamps that split every step longer than the longest allowed."""
+    stamp = np.unique(stamp_ns)
+    step = np.diff(stamp)
+    pieces = -(-step // _MAX_STEP_NS)
+    wide = np.flatnonzero(pieces > 1)
+    count = pieces[wide] - 1
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + 1
+    filled: NDArray[np.int64] = np.repeat(stamp[wide], count) + within * np.repeat(step[wide] // pieces[wide], count)
+    return filled
+
+
+def _inputs(
+    measurements: Measurements, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64], zero_ns: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int8]]:
+    """Mean angular velocity and specific force over each interval, and the process mode they allow: the best source that covers it."""
+    rate, mode = _odometric_turn_rate(measurements, before_ns, after_ns, zero_ns)
+    force = np.zeros((before_ns.size, 3))
+    imu = measurements.imu
+    if imu is None or imu.stamp_ns.size == 0:
+        return rate, force, mode
+    covered = _covered(imu.stamp_ns, before_ns, after_ns)
+    stamp_s = seconds(imu.stamp_ns, zero_ns)
+    start_s, end_s = seconds(before_ns[covered], zero_ns), seconds(after_ns[covered], zero_ns)
+    rate[covered] = interval_means(stamp_s, imu.angular_velocity_radps, start_s, end_s)
+    if imu.accelerometer_usable:
+        force[covered] = interval_means(stamp_s, imu.specific_force_mps2, start_s, end_s)
+    mode[covered] = kernel.INERTIAL if imu.accelerometer_usable else kernel.GYRO_TURN
+    return rate, force, mode
+
+
+def _covered(
+    stamp_ns: NDArray[np.int64], before_ns: NDArray[np.int64], after_ns: NDArray[np.int64]
+) -> NDArray[np.bool_]:
+    """Whether each interval lies among samples without a gap."""
+    longest = max(_MIN_INPUT_GAP_NS, 3 * median_period_ns(stamp_ns))
+    return ~in_gap(stamp_ns, before_ns, after_ns, longest_ns=longest)
+
+
+def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
+    """Return the odometries with a yaw rate, for where there is no gyroscope: the wheels, which skid, then visual odometry."""
+    sources = (measurements.wheels, measurements.visual)
+    return [source for source in sources if source is not None and np.isfinite(source.yaw_rate_radps).any()]
+
+
+def _odometric_turn_rate(
+    measurements: Measurements, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64], zero_ns: int
+) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    """Mean angular velocity by the odometries, shape (M, 3), and the process mode; by the course over ground where there are none."""
+    rate = np.zeros((before_ns.size, 3))
+    mode = np.full(before_ns.size, kernel.FLAT_TURN, np.int8)
+    start_s, end_s = seconds(before_ns, zero_ns), seconds(after_ns, zero_ns)
+    sources = turn_sources(measurements)
+    if not sources and measurements.gnss is not None:
+        stamp_s, values = _course_rate(measurements.gnss, zero_ns)
+        rate[:, 2] = interval_means(stamp_s, values[:, None], start_s, end_s)[:, 0]
+    for rank, source in enumerate(sources):
+        known = np.isfinite(source.yaw_rate_radps)
+        turns = source.turn_rate_radps
+        values = np.stack((0 * source.yaw_rate_radps,) * 2 + (source.yaw_rate_radps,), -1) if turns is None else turns
+        inside = _covered(source.stamp_ns[known], before_ns, after_ns) | (rank == 0)
+        stamp_s = seconds(source.stamp_ns[known], zero_ns)
+        rate[inside] = interval_means(stamp_s, values[known], start_s[inside], end_s[inside])
+        mode[inside] = kernel.VISUAL_TURN if source is measurements.visual else kernel.FLAT_TURN
+    return rate, mode
+
+
+def _course_rate(gnss: Positions, zero_ns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Turn of the course over ground [rad/s] twice a second: where no sensor tells yaw, the robot is taken to drive forward.
+
+    The course is that of the way over one second, where it is longer than the fixes are noisy; in between it turns evenly.
+    """
+    stamp_s = seconds(gnss.stamp_ns, zero_ns)
+    grid_s = np.arange(stamp_s[0], stamp_s[-1], 0.5)
+    if grid_s.size < 3:
+        return stamp_s[:1], np.zeros(1)
+    east, north = (
+        interval_means(stamp_s, gnss.position_enu_m[:, k : k + 1], grid_s - 0.5, grid_s + 0.5)[:, 0] for k in (0, 1)
+    )
+    way = (east[2:] - east[:-2]) + 1j * (north[2:] - north[:-2])
+    noise = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
+    moving = np.abs(way) > max(0.3, 3 * noise)
+    if moving.sum() < 2:
+        return stamp_s[:1], np.zeros(1)
+    course = np.unwrap(np.angle(way[moving]))
+    at_s = grid_s[1:-1][moving]
+    return 0.5 * (at_s[1:] + at_s[:-1]), np.diff(course) / np.diff(at_s)

@@ -1,0 +1,406 @@
+"""The paper's forward filter (section IV-A: GNSS, wheel odometry, IMU and visual odometry through one unscented Kalman filter).
+
+Fifteen states as in robot_localization, moved by `tcpipe.fusion.ukf15_kernel` or, for comparison, by
+`tcpipe.fusion.filterpy_engine`. What each sensor shows:
+
+* GNSS: the position of its antenna, whose lever arm turns with the attitude.
+* IMU: roll and pitch of its own attitude filter where it has one (its yaw may be magnetic or offset and is not used), angular
+  velocity less the bias found at rest, and specific force, which is acceleration, the turning of the velocity, and gravity.
+* Wheels: forward velocity; their yaw rate, which skids on turning, only where there is no gyroscope.
+* Visual odometry: velocity of the camera, and yaw rate.
+* The ground: sideways and vertical body velocity are about zero.
+
+What no sensor shows is held near zero by a weak prior, since a random walk that nothing observes would grow until the sigma points
+go round the circle. Estimates use the past only; the smoother is `tcpipe.fusion.error_state`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from tcpipe.fusion import filterpy_engine, ukf15_kernel
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, InitialState, Measurements
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
+from tcpipe.fusion.ukf15_kernel import (
+    ACCEPTED,
+    ANTENNA,
+    MAX_OPENED_RAD,
+    NOT_RUN,
+    PITCH,
+    RECOVERED,
+    REJECTED,
+    ROLL,
+    ROW,
+    SELECT,
+    SENSOR_VELOCITY,
+    SPECIFIC_FORCE,
+    STATES,
+    YAW,
+    Belief,
+    Events,
+    Outputs,
+    Sources,
+)
+from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
+
+POSITION, VELOCITY, TURN, ACCELERATION = (0, 1, 2), (6, 7, 8), (9, 10, 11), (12, 13, 14)
+"""Where the other states stand."""
+
+PROCESS_VARIANCE = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-2] * 3 + [1.0] * 3 + [2.0] * 3)
+"""Variance that each state gains in a second, shape (15,): angular velocity changes by 1 rad/s, acceleration by 1.4 m/s², in a second
+of rough ground; the small rest stands for gyroscope bias and for what constant acceleration leaves out."""
+
+TILT_STD_RAD = 0.05
+"""Roll and pitch of an IMU's own attitude filter: their error lasts for seconds, so that each one of many says little [rad]."""
+
+SCALE_STD = 0.03
+"""Wheels slip and a camera's scale is off by some per cent, for seconds on end: what odometry says in one second shares this error, so
+that its many messages are worth a few. Without it the filter trusts slipping wheels against the GNSS and is wrong in outages."""
+
+SKID_STD = 0.2
+"""Likewise of the yaw rate of wheels that skid when they turn."""
+
+_BLOCK = 4096  # outputs filtered at a time: bounds the memory of a long run
+_GROUND = "ground"
+_PRIOR = "prior"
+_GROUND_PERIOD_NS = 50_000_000
+_LEVEL_PERIOD_NS = 1_000_000_000
+_CALM_STD_RADPS, _CALM_STD_MPS2, _LEVEL_STD_RAD = (0.05, 0.05, 1.0), 1.0, 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A sensor, or a constraint, as the filter takes it.
+
+    Attributes
+    ----------
+    role : whose measurements these are; constraints have roles of their own and are in no table.
+    kind : `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY` of `tcpipe.fusion.ukf15_kernel`.
+    entries : which states (`SELECT`), or which of the sensor's three entries, are measured; at most six.
+    stamp_ns : [ns], shape (N,), increasing.
+    z, variance : shape (N, m), finite.
+    lever_arm_m : [m], position of the sensor in base_link.
+    """
+
+    role: str
+    kind: int
+    entries: tuple[int, ...]
+    stamp_ns: NDArray[np.int64]
+    z: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    lever_arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Forward:
+    """What the filter made of its sources.
+
+    Attributes
+    ----------
+    x, variance : states and their variances at the wanted stamps, shape (K, 15).
+    final : state, shape (15,), and covariance, shape (15, 15), at the last of them.
+    nis, outcome : per source, normalised innovation squared and what became of each measurement.
+    repairs : how often the covariance lost its positive definiteness.
+    """
+
+    x: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    final: tuple[NDArray[np.float64], NDArray[np.float64]]
+    nis: list[NDArray[np.float64]]
+    outcome: list[NDArray[np.int8]]
+    repairs: int
+
+
+def run_ukf15(
+    measurements: Measurements,
+    initial: InitialState,
+    *,
+    output_ns: NDArray[np.int64],
+    gate_probability: float,
+    engine: Literal["compiled", "filterpy"],
+) -> Trajectory:
+    """Estimate base_link's trajectory with the paper's forward filter.
+
+    Parameters
+    ----------
+    measurements
+        One stretch of a run.
+    initial
+        Where it starts, at its first measurement.
+    output_ns
+        Wanted stamps [ns], shape (K,), increasing.
+    gate_probability
+        A measurement less likely than this is refused (chi-square on its normalised innovation squared).
+    engine
+        ``compiled`` or ``filterpy``.
+
+    Returns
+    -------
+    Trajectory
+        At ``output_ns``; each state uses the measurements up to its stamp.
+    """
+    sources = sources_of(measurements, initial, end_ns=int(output_ns[-1]))
+    gates = [_gate(source, gate_probability) for source in sources]
+    x, P = _initial_belief(initial)
+    start_ns = min(int(source.stamp_ns[0]) for source in sources if source.stamp_ns.size)
+    found = filter_forward(
+        sources, gates, x=x, P=P, q=PROCESS_VARIANCE, start_ns=start_ns, output_ns=output_ns, engine=engine
+    )
+    quat = quat_from_rpy(*found.x[:, ROLL : YAW + 1].T)
+    std = np.sqrt(found.variance)
+    return Trajectory(
+        stamp_ns=output_ns,
+        position_enu_m=found.x[:, POSITION],
+        quat_xyzw=quat,
+        velocity_enu_mps=rotate(quat, found.x[:, VELOCITY]),
+        angular_velocity_radps=found.x[:, TURN],
+        position_std_m=std[:, POSITION],
+        yaw_std_rad=std[:, YAW],
+        forward_velocity_std_mps=std[:, VELOCITY[0]],
+        rejections=_rejections(sources, gates, found),
+        displacement_std_m=np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan),
+        facts=_facts(sources, found),
+    )
+
+
+def filter_forward(
+    sources: Sequence[Source],
+    gates: Sequence[float],
+    *,
+    x: NDArray[np.float64],
+    P: NDArray[np.float64],
+    q: NDArray[np.float64],
+    start_ns: int,
+    output_ns: NDArray[np.int64],
+    engine: Literal["compiled", "filterpy"] = "compiled",
+) -> Forward:
+    """Run the 15-state filter over any sources.
+
+    Parameters
+    ----------
+    sources
+        What is measured. Of measurements with one stamp, the earlier source comes first.
+    gates
+        Per source, the largest normalised innovation squared that is fused.
+    x, P
+        State, shape (15,), and covariance, shape (15, 15), at ``start_ns``.
+    q
+        Variance that each state gains in a second, shape (15,).
+    start_ns
+        Stamp of the belief [ns]; nothing may be older.
+    output_ns
+        Wanted stamps [ns], shape (K,), increasing.
+    engine
+        ``compiled`` or ``filterpy``.
+
+    Returns
+    -------
+    Forward
+    """
+    belief = Belief(np.zeros(ROW), np.zeros((STATES, ROW)), np.zeros(1), np.zeros((len(sources), 2)))
+    belief.x[:STATES], belief.P[:, :STATES] = x, P
+    states, variances = np.empty((output_ns.size, STATES)), np.empty((output_ns.size, STATES))
+    nis = [np.full(source.stamp_ns.size, np.nan) for source in sources]
+    outcome = [np.full(source.stamp_ns.size, NOT_RUN, np.int8) for source in sources]
+    packed = _packed(sources, gates)
+    run = filterpy_engine.run if engine == "filterpy" else ukf15_kernel.run
+    reached, repairs = [0] * len(sources), 0
+    for first in range(0, output_ns.size, _BLOCK):
+        block = slice(first, first + _BLOCK)
+        until = [int(np.searchsorted(s.stamp_ns, output_ns[block][-1], side="right")) for s in sources]
+        rows = [slice(begin, end) for begin, end in zip(reached, until, strict=True)]
+        events, order = _events(sources, rows, start_ns)
+        times_s = np.asarray((output_ns[block] - start_ns) * 1e-9, np.float64)
+        outputs = Outputs(times_s, states[block], variances[block], np.empty(order.size), np.empty(order.size, np.int8))
+        repairs += int(run(belief, np.asarray(q, np.float64), events, packed, outputs))
+        cuts = np.cumsum([s.stop - s.start for s in rows])[:-1]
+        for written, all_of in ((outputs.nis, nis), (outputs.outcome, outcome)):
+            for at, part in enumerate(np.split(_unsorted(written, order), cuts)):
+                all_of[at][rows[at]] = part
+        reached = until
+    return Forward(states, variances, (belief.x[:STATES], belief.P[:, :STATES]), nis, outcome, repairs)
+
+
+def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[Source]:
+    """Return what the filter fuses of a stretch: its sensors, the ground, and priors for what no sensor shows.
+
+    Parameters
+    ----------
+    measurements, initial
+        See `run_ukf15`.
+    end_ns
+        The constraints go on until here [ns].
+
+    Returns
+    -------
+    list of Source
+        In the order in which measurements of one stamp are fused.
+    """
+    sensors = (
+        _imu_sources(measurements, initial)
+        + _velocity_sources(WHEELS, measurements.wheels, with_yaw_rate=measurements.imu is None)
+        + _velocity_sources(VISUAL, measurements.visual, with_yaw_rate=True)
+        + _gnss_sources(measurements)
+    )
+    start_ns = min(int(source.stamp_ns[0]) for source in sensors if source.stamp_ns.size)
+    std = measurements.nonholonomic_std_mps
+    ground = _held(_GROUND, {VELOCITY[1]: std, VELOCITY[2]: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
+    return [*sensors, ground, *_priors(sensors, start_ns, end_ns)]
+
+
+def _imu_sources(measurements: Measurements, initial: InitialState) -> list[Source]:
+    imu = measurements.imu
+    if imu is None:
+        return []
+    shape = imu.angular_velocity_radps.shape
+    turn = imu.angular_velocity_radps - initial.gyro_bias_radps
+    sources = [Source(IMU, SELECT, TURN, imu.stamp_ns, turn, np.broadcast_to(imu.gyro_std_radps**2, shape))]
+    if imu.accelerometer_usable:
+        variance = np.broadcast_to(imu.accelerometer_std_mps2**2, shape)
+        force = imu.specific_force_mps2
+        sources.append(Source(IMU, SPECIFIC_FORCE, (0, 1, 2), imu.stamp_ns, force, variance, imu.lever_arm_m))
+    known = np.isfinite(imu.quat_xyzw).all(axis=1)
+    if known.any():
+        tilt = rpy_from_quat(imu.quat_xyzw[known])[:, :2]
+        variance = np.broadcast_to(TILT_STD_RAD**2, tilt.shape)
+        sources.append(Source(IMU, SELECT, (ROLL, PITCH), imu.stamp_ns[known], tilt, variance))
+    return sources
+
+
+def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_rate: bool) -> list[Source]:
+    """One source for each combination of entries that the odometry gives."""
+    if odometry is None:
+        return []
+    lever = odometry.lever_arm_m
+    kind = SENSOR_VELOCITY if any(lever) else SELECT
+    first = 0 if any(lever) else VELOCITY[0]
+    known = np.isfinite(odometry.velocity_mps)
+    per_second = 1e9 / float(np.median(np.diff(odometry.stamp_ns))) if odometry.stamp_ns.size > 1 else 1.0
+    every_variance = odometry.variance_m2ps2 + per_second * np.square(SCALE_STD * odometry.velocity_mps)
+    sources = []
+    for pattern in np.unique(known, axis=0):
+        rows, columns = (known == pattern).all(axis=1), np.flatnonzero(pattern)
+        if columns.size:
+            z, variance = odometry.velocity_mps[rows][:, columns], every_variance[rows][:, columns]
+            entries = tuple(int(first + column) for column in columns)
+            sources.append(Source(role, kind, entries, odometry.stamp_ns[rows], z, variance, lever))
+    rows = np.isfinite(odometry.yaw_rate_radps)
+    if with_yaw_rate and rows.any():
+        z = odometry.yaw_rate_radps[rows, None]
+        scale_std = SKID_STD if role == WHEELS else SCALE_STD
+        variance = odometry.yaw_rate_var[rows, None] + per_second * np.square(scale_std * z)
+        sources.append(Source(role, SELECT, (TURN[2],), odometry.stamp_ns[rows], z, variance))
+    return sources
+
+
+def _gnss_sources(measurements: Measurements) -> list[Source]:
+    gnss = measurements.gnss
+    if gnss is None:
+        return []
+    kind = ANTENNA if any(gnss.lever_arm_m) else SELECT
+    return [Source(GNSS, kind, POSITION, gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
+
+
+def _held(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> Source:
+    """Return states that are zero to within their standard deviations, said again and again."""
+    stamps = np.arange(start_ns + period_ns, end_ns + 1, period_ns, dtype=np.int64)
+    z = np.zeros((stamps.size, len(stds)))
+    return Source(role, SELECT, tuple(stds), stamps, z, z + np.square(list(stds.values())))
+
+
+def _priors(sensors: Sequence[Source], start_ns: int, end_ns: int) -> list[Source]:
+    selected = {entry for source in sensors if source.kind == SELECT for entry in source.entries}
+    force = any(source.kind == SPECIFIC_FORCE for source in sensors)
+    calm = {state: std for state, std in zip(TURN, _CALM_STD_RADPS, strict=True) if state not in selected}
+    calm |= {} if force else dict.fromkeys(ACCELERATION, _CALM_STD_MPS2)
+    level = {} if force or ROLL in selected else dict.fromkeys((ROLL, PITCH), _LEVEL_STD_RAD)
+    return [
+        _held(_PRIOR, stds, start_ns, end_ns, period_ns)
+        for stds, period_ns in ((calm, _GROUND_PERIOD_NS), (level, _LEVEL_PERIOD_NS))
+        if stds
+    ]
+
+
+def _gate(source: Source, probability: float) -> float:
+    if source.role in {_GROUND, _PRIOR}:
+        return math.inf
+    return float(chdtri(len(source.entries), 1.0 - probability))
+
+
+def _initial_belief(initial: InitialState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    x, std = np.zeros(STATES), np.empty(STATES)
+    x[list(POSITION)], std[list(POSITION)] = initial.position_enu_m, initial.position_std_m
+    x[ROLL : YAW + 1] = rpy_from_quat(initial.quat_xyzw)
+    attitude_std = (initial.tilt_std_rad, initial.tilt_std_rad, initial.yaw_std_rad)
+    std[ROLL : YAW + 1] = np.minimum(attitude_std, MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
+    x[list(VELOCITY)] = rotate(inverse(initial.quat_xyzw), initial.velocity_enu_mps)
+    std[list(VELOCITY)], std[list(TURN)], std[list(ACCELERATION)] = initial.velocity_std_mps, 0.1, 0.5
+    return x, np.diag(std**2)
+
+
+def _events(sources: Sequence[Source], rows: Sequence[slice], start_ns: int) -> tuple[Events, NDArray[np.int64]]:
+    """Return these rows in order of time, and for each which one it was of those of the sources end to end."""
+    stamp_ns = np.concatenate([source.stamp_ns[of] for source, of in zip(sources, rows, strict=True)])
+    which = np.repeat(np.arange(len(sources), dtype=np.int8), [of.stop - of.start for of in rows])
+    width = np.array([len(source.entries) for source in sources])[which]
+    order = np.argsort(stamp_ns, kind="stable")
+    return Events(
+        time_s=np.asarray((stamp_ns[order] - start_ns) * 1e-9, np.float64),
+        source=which[order],
+        at=(np.cumsum(width) - width)[order],
+        z=np.concatenate([source.z[of].ravel() for source, of in zip(sources, rows, strict=True)]),
+        variance=np.concatenate([source.variance[of].ravel() for source, of in zip(sources, rows, strict=True)]),
+    ), order
+
+
+def _unsorted(values: NDArray[Any], order: NDArray[np.int64]) -> NDArray[Any]:
+    found = np.empty_like(values)
+    found[order] = values
+    return found
+
+
+def _packed(sources: Sequence[Source], gates: Sequence[float]) -> Sources:
+    entries = np.zeros((len(sources), 6), np.int64)
+    for row, source in zip(entries, sources, strict=True):
+        row[: len(source.entries)] = source.entries
+    return Sources(
+        kind=np.array([source.kind for source in sources], np.int64),
+        width=np.array([len(source.entries) for source in sources], np.int64),
+        entries=entries,
+        lever_m=np.array([source.lever_arm_m for source in sources], np.float64),
+        gate=np.array(gates, np.float64),
+    )
+
+
+def _rejections(sources: Sequence[Source], gates: Sequence[float], found: Forward) -> Rejections:
+    refused = [outcome == REJECTED for outcome in found.outcome]
+    count = [int(rows.sum()) for rows in refused]
+    stamp_ns = np.concatenate([source.stamp_ns[rows] for source, rows in zip(sources, refused, strict=True)])
+    order = np.argsort(stamp_ns, kind="stable")
+    role = np.repeat([source.role for source in sources], count)[order]
+    nis = np.concatenate([nis[rows] for nis, rows in zip(found.nis, refused, strict=True)])[order]
+    return Rejections(stamp_ns[order], role, np.full(role.size, "gate"), nis, np.repeat(gates, count)[order])
+
+
+def _facts(sources: Sequence[Source], found: Forward) -> dict[str, Any]:
+    facts: dict[str, Any] = {"nis_mean": {}, "measurements": {}, "rejected": {}, "recovered": {}}
+    for role in (GNSS, IMU, WHEELS, VISUAL):
+        mine = [at for at, source in enumerate(sources) if source.role == role]
+        if not mine:
+            continue
+        outcome = np.concatenate([found.outcome[at] for at in mine])
+        freedom = np.concatenate([np.full(found.nis[at].size, len(sources[at].entries)) for at in mine])
+        accepted = outcome == ACCEPTED
+        nis = np.concatenate([found.nis[at] for at in mine])
+        facts["measurements"][role] = int((outcome != NOT_RUN).sum())
+        facts["rejected"][role] = int((outcome == REJECTED).sum())
+        facts["recovered"][role] = int((outcome == RECOVERED).sum())
+        facts["nis_mean"][role] = float(nis[accepted].sum() / freedom[accepted].sum()) if accepted.any() else None
+    return facts | {"covariance_repairs": found.repairs}

@@ -1,0 +1,1 @@
+"""Geometry of the plane and the globe in numpy alone: angles, rotations, datums, polylines."""

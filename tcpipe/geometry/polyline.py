@@ -1,0 +1,221 @@
+"""A driven path between its samples: cubic Hermite interpolation, horizontal arc length, and where it first leaves a circle.
+
+The estimated track has position and velocity at 20 Hz; between two samples the path is the one cubic that has both at both ends.
+Every length of the pipeline, segments and loss ledger alike, is measured on this one curve, so that they add up.
+Stamps are int64 nanoseconds and strictly increasing.
+Where they have a hole is the caller's business (docs/explanation/rulings.md, Endpoints and Gaps).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.compiled import kernel
+
+_GAUSS_NODES, _GAUSS_WEIGHTS = np.polynomial.legendre.leggauss(8)
+_NS = 1e-9
+
+
+def row_before(stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
+    """Return for each time the row that begins its interval: the last row at or before it, at most the last but one.
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,), strictly increasing, N >= 2.
+    at_ns : [ns], shape (M,), inside the span of ``stamp_ns``.
+    """
+    rows: NDArray[np.intp] = np.searchsorted(stamp_ns, at_ns, side="right") - 1
+    return np.clip(rows, 0, len(stamp_ns) - 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Polyline:
+    """An uninterrupted piece of path: samples, and the horizontal length from the first sample to each.
+
+    Attributes
+    ----------
+    stamp_ns : [ns], shape (N,), int64, strictly increasing, N >= 2.
+    position_m, velocity_mps : [m], [m/s], shape (N, 3): east, north, up.
+    length_m : [m], shape (N,): horizontal length of the Hermite path from the first sample.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    position_m: NDArray[np.float64]
+    velocity_mps: NDArray[np.float64]
+    length_m: NDArray[np.float64]
+
+    def position_at(self, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return positions at times inside the span: [m], shape (M, 3); at a sample's own stamp its position, exactly."""
+        row, u, step_s = _locate(self.stamp_ns, at_ns)
+        v0, v1 = self.velocity_mps[row] * step_s, self.velocity_mps[row + 1] * step_s
+        blend = u * u * (3.0 - 2.0 * u)
+        swing = u * (1.0 - u) * ((1.0 - u) * v0 - u * v1)
+        between: NDArray[np.float64] = self.position_m[row] * (1.0 - blend) + self.position_m[row + 1] * blend + swing
+        return between
+
+    def length_at(self, at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the horizontal length from the first sample to each time: [m], shape (M,).
+
+        Differences telescope, so the pieces of a path add up to the whole.
+        """
+        row, u, step_s = _locate(self.stamp_ns, at_ns)
+        between: NDArray[np.float64] = self.length_m[row] + _partial_length_m(
+            self.position_m[:, :2], self.velocity_mps[:, :2], row, u, step_s
+        )
+        return between
+
+    def first_crossing_ns(self, start_ns: int, *, radius_m: float) -> int | None:
+        """Return the first time at which the path is ``radius_m`` [m] from where it is at ``start_ns``, horizontally; or None.
+
+        On each interval |p(t) - p0|² is a polynomial of degree six. In Bernstein form its coefficients bound it, so an interval
+        without a crossing is passed over by proof, not by sampling, and the earliest root is found by halving until it stands alone.
+        The time is rounded to a nanosecond: the residual is about speed x 0.5 ns. ``radius_m`` is the chord d of the paper's III-A.
+        """
+        at = np.array([start_ns], dtype=np.int64)
+        row, u, _ = _locate(self.stamp_ns, at)
+        x0, y0, _z0 = self.position_at(at)[0]
+        start = (row[0], u[0, 0])
+        found = int(_first_crossing(self.stamp_ns, self.position_m, self.velocity_mps, start, (x0, y0, radius_m)))
+        return None if found < 0 else found
+
+
+def polyline(
+    stamp_ns: NDArray[np.int64], position_m: NDArray[np.float64], velocity_mps: NDArray[np.float64]
+) -> Polyline:
+    """Return the path through samples: cubic Hermite between them, its length by 8-node Gauss-Legendre quadrature of its speed.
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,), int64, strictly increasing.
+    position_m, velocity_mps : [m], [m/s], shape (N, 3): east, north, up in one frame.
+    """
+    position_m, velocity_mps = np.ascontiguousarray(position_m), np.ascontiguousarray(velocity_mps)
+    row = np.arange(len(stamp_ns) - 1)
+    step_s = np.diff(stamp_ns)[:, None] * _NS
+    steps = _partial_length_m(position_m[:, :2], velocity_mps[:, :2], row, np.ones((len(row), 1)), step_s)
+    return Polyline(stamp_ns, position_m, velocity_mps, np.concatenate(([0.0], np.cumsum(steps))))
+
+
+def _locate(
+    stamp_ns: NDArray[np.int64], at_ns: NDArray[np.int64]
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
+    """Return each time's interval, its share of it (0 to 1) and the interval's length [s]; the latter two of shape (M, 1)."""
+    row = row_before(stamp_ns, at_ns)
+    step_s = (stamp_ns[row + 1] - stamp_ns[row])[:, None].astype(np.float64) * _NS
+    return row, ((at_ns - stamp_ns[row]) * _NS)[:, None] / step_s, step_s
+
+
+def _partial_length_m(
+    xy_m: NDArray[np.float64],
+    velocity_mps: NDArray[np.float64],
+    row: NDArray[np.intp],
+    until: NDArray[np.float64],
+    step_s: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the length from each row's sample to the share ``until`` (M, 1) of its interval."""
+    u = (until * (0.5 * (_GAUSS_NODES + 1.0)))[:, :, None]
+    step_m = (xy_m[row + 1] - xy_m[row])[:, None, :]
+    v0, v1 = (velocity_mps[row] * step_s)[:, None, :], (velocity_mps[row + 1] * step_s)[:, None, :]
+    tangent = 6.0 * u * (1.0 - u) * step_m + (1.0 - u) * (1.0 - 3.0 * u) * v0 + u * (3.0 * u - 2.0) * v1
+    length: NDArray[np.float64] = until[:, 0] * (np.hypot(tangent[..., 0], tangent[..., 1]) @ (0.5 * _GAUSS_WEIGHTS))
+    return length
+
+
+@kernel
+def _first_crossing(stamp_ns, xy_m, velocity_mps, start, circle):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    row, share = start
+    distance = np.empty(7)
+    for k in range(row, len(stamp_ns) - 1):
+        step_ns = stamp_ns[k + 1] - stamp_ns[k]
+        _squared_distance(distance, xy_m[k : k + 2], velocity_mps[k : k + 2] * (step_ns * 1e-9), circle)
+        if distance.max() < 0.0:
+            continue
+        u = _first_root(distance, share if k == row else 0.0)
+        if u >= 0.0:
+            return stamp_ns[k] + np.int64(np.round(u * step_ns))
+    return np.int64(-1)
+
+
+@kernel
+def _squared_distance(out, ends_m, slopes_m, circle):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Bernstein coefficients of |p(u) - p0|² - d² on one interval: products of the cubic's control points."""
+    x0, y0, radius_m = circle
+    control = np.empty((2, 4))
+    for axis in range(2):
+        origin = x0 if axis == 0 else y0
+        control[axis, 0] = ends_m[0, axis] - origin
+        control[axis, 1] = control[axis, 0] + slopes_m[0, axis] / 3.0
+        control[axis, 3] = ends_m[1, axis] - origin
+        control[axis, 2] = control[axis, 3] - slopes_m[1, axis] / 3.0
+    choose3 = (1.0, 3.0, 3.0, 1.0)
+    choose6 = (1.0, 6.0, 15.0, 20.0, 15.0, 6.0, 1.0)
+    out[:] = 0.0
+    for i in range(4):
+        for j in range(4):
+            product = control[0, i] * control[0, j] + control[1, i] * control[1, j]
+            out[i + j] += choose3[i] * choose3[j] / choose6[i + j] * product
+    out -= radius_m * radius_m
+
+
+@kernel
+def _first_root(coefficients, begin):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """First u in [begin, 1] at which the Bernstein polynomial rises through zero, or -1; leftmost piece first, from a stack."""
+    stack = np.empty((64, 7))
+    low, high = np.empty(64), np.empty(64)
+    stack[0] = coefficients
+    low[0], high[0] = 0.0, 1.0
+    top = 0
+    if begin > 0.0:
+        left, right = _split(coefficients, begin)
+        stack[0] = right
+        low[0] = begin
+    while top >= 0:
+        piece, a, b = stack[top].copy(), low[top], high[top]
+        top -= 1
+        if piece.max() < 0.0:
+            continue
+        if piece[0] >= 0.0:
+            return a
+        changes = 0
+        for i in range(6):
+            if (piece[i] < 0.0) != (piece[i + 1] < 0.0):
+                changes += 1
+        if changes == 1:
+            return a + (b - a) * _bisect(piece)
+        if b - a < 1e-12:
+            continue  # touches the circle without leaving it
+        left, right = _split(piece, 0.5)
+        middle = 0.5 * (a + b)
+        stack[top + 1], low[top + 1], high[top + 1] = right, middle, b
+        stack[top + 2], low[top + 2], high[top + 2] = left, a, middle
+        top += 2
+    return -1.0
+
+
+@kernel
+def _bisect(coefficients):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    a, b = 0.0, 1.0
+    for _ in range(60):
+        middle = 0.5 * (a + b)
+        left, _right = _split(coefficients, middle)
+        if left[6] < 0.0:
+            a = middle
+        else:
+            b = middle
+    return b
+
+
+@kernel
+def _split(coefficients, u):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    """Coefficients of both parts of a Bernstein polynomial split at u (de Casteljau); the value at u stands between them."""
+    work = coefficients.copy()
+    left, right = np.empty(7), np.empty(7)
+    for level in range(7):
+        left[level] = work[0]
+        right[6 - level] = work[6 - level]
+        for i in range(6 - level):
+            work[i] = (1.0 - u) * work[i] + u * work[i + 1]
+    return left, right

@@ -1,0 +1,1 @@
+"""Roles, topics, message meanings, clocks and placements: what a log says, as arrays."""

@@ -1,0 +1,330 @@
+"""Clocks: which stamp of a message rules, where the clock steps, and what order the messages were measured in.
+
+Every message has a log time (when the recorder received it); most have a header stamp (when it was measured). The header's rules where it
+is set and follows the log time, within 10 s, up to a constant offset; otherwise log time; topic by topic. A *lasting* step (> 0.5 s) of
+header minus log time opens a new clock epoch, common to all topics. Lasting means 10 s, or to the log's end: delays, bursts and single
+wrong stamps are no steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+SECOND_NS = 1_000_000_000
+FOLLOWS_NS = 10 * SECOND_NS
+"""A header stamp within this of the log time, up to a constant offset, follows it."""
+STEP_NS = SECOND_NS // 2
+"""A lasting change of header minus log time larger than this is a step of a clock."""
+LATE_NS = SECOND_NS
+"""A message stamped this much before another that came earlier cannot be sorted in: it is dropped."""
+APART_NS = SECOND_NS
+"""Offsets closer than this are delays; topics further apart run on different clocks."""
+
+_LASTING_NS = 10 * SECOND_NS
+_MOST_BACK = 0.2
+_TOGETHER_NS = 5 * SECOND_NS
+_BIN_NS = SECOND_NS // 20
+_FEWEST = 3
+_MOST_UNSET = 0.5
+_MOST_STRAY = 0.01
+_MOST_REPEATED = 0.2
+_NEIGHBOURS = 11
+
+
+@dataclass(frozen=True, slots=True)
+class TopicTimes:
+    """A topic's times in log-time order: log time and header stamp [ns], shape (N,), the header's 0 where unset.
+
+    ``content`` (N, k) tells an exact duplicate from a repeated stamp; ``prefer`` and ``offset_ns`` are the recipe's.
+    """
+
+    log_time_ns: Ints
+    header_ns: Ints | None
+    content: NDArray[np.float64]
+    prefer: Literal["auto", "header", "log"] = "auto"
+    offset_ns: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """A topic's rows in the order they were measured.
+
+    ``row`` points into the topic's rows; (``epoch``, ``stamp_ns``) increases strictly. ``offset_s`` is the median of header minus log time
+    (None without headers), ``moved_s`` what was added to bring the topic to the clock of the others, by epoch.
+    """
+
+    row: Ints
+    stamp_ns: Ints
+    epoch: NDArray[np.int16]
+    source: Literal["header", "log"]
+    why: str
+    offset_s: float | None
+    dropped: dict[str, int] = field(default_factory=dict)
+    notes: dict[str, int] = field(default_factory=dict)
+    moved_s: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """A clock step: at which log time [ns], how far [s], and on which topics."""
+
+    log_time_ns: int
+    step_s: float
+    topics: tuple[str, ...]
+
+
+def settle_clocks(topics: Mapping[str, TopicTimes]) -> tuple[dict[str, Timeline], list[Step]]:
+    """Return each topic's timeline, and the clock steps that divide them into epochs.
+
+    Parameters
+    ----------
+    topics : times of every topic that plays a role, by topic.
+    """
+    steps_of = {name: _steps(times) for name, times in topics.items()}
+    reasons = {name: _why_not_header(times, steps_of[name]) for name, times in topics.items()}
+    # A header that does not rule has no say about the others' clock either.
+    trusted = {name: steps for name, steps in steps_of.items() if reasons[name] is None}
+    steps = _common_steps({name: topics[name].log_time_ns for name in topics}, trusted)
+    drafts = {
+        name: _draft(times, reasons[name], _epochs(name, times, steps, trusted.get(name, [])))
+        for name, times in topics.items()
+    }
+    reference = [_reference_offset(drafts, epoch) for epoch in range(len(steps) + 1)]
+    return {name: _timeline(topics[name], draft, reference) for name, draft in drafts.items()}, steps
+
+
+def _is_set(times: TopicTimes) -> Mask:
+    return np.zeros(len(times.log_time_ns), bool) if times.header_ns is None else times.header_ns > 0
+
+
+def _steps(times: TopicTimes) -> list[tuple[int, int]]:
+    """Return the lasting steps of header minus log time: (row that begins the new level, step [ns])."""
+    rows = np.flatnonzero(_is_set(times))
+    if times.header_ns is None or len(rows) < 2 * _FEWEST:
+        return []
+    log = times.log_time_ns[rows]
+    behind = times.header_ns[rows] - log
+    # One row per 50 ms of log time, the last: messages that a stalled recorder writes in a burst then count once.
+    bins = log // _BIN_NS
+    last = np.flatnonzero(np.append(bins[1:] != bins[:-1], True))
+    level, at = behind[last], log[last]
+    found: list[tuple[int, int]] = []
+    begin = 0
+    for j in (np.flatnonzero(np.abs(np.diff(level)) > STEP_NS // 2) + 1).tolist():
+        if j < begin + _FEWEST or len(level) - j < _FEWEST:
+            continue
+        before = level[max(begin, min(int(np.searchsorted(at, at[j] - _LASTING_NS)), j - _FEWEST)) : j]
+        after = level[j : max(int(np.searchsorted(at, at[j] + _LASTING_NS)), j + _FEWEST)]
+        low, high = np.median(before), np.median(after)
+        step = int(high - low)
+        # The very row must take the step (not one near it), and both levels must last: a delay comes back.
+        takes_it = abs(int(level[j] - level[j - 1]) - step) < abs(step) // 2
+        middle = (low + high) / 2
+        lasts = all(
+            np.mean((side > middle) != (own > middle)) <= _MOST_BACK for side, own in ((before, low), (after, high))
+        )
+        if abs(step) > STEP_NS and takes_it and lasts:
+            between = slice(last[j - 1], last[j] + 1)
+            first = int(last[j - 1]) + 1 + int(np.argmax(np.abs(np.diff(behind[between]))))
+            found.append((int(rows[first]), step))
+            begin = j
+    return found
+
+
+def _common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, list[tuple[int, int]]]) -> list[Step]:
+    """Return steps common to all topics: those of several topics within 5 s of log time are one."""
+    every = sorted((int(log_times[name][row]), name, step) for name, steps in steps_of.items() for row, step in steps)
+    groups: list[list[tuple[int, str, int]]] = []
+    for item in every:
+        if groups and item[0] - groups[-1][0][0] <= _TOGETHER_NS and item[1] not in {name for _, name, _ in groups[-1]}:
+            groups[-1].append(item)
+        else:
+            groups.append([item])
+    return [
+        Step(group[0][0], max((step for _, _, step in group), key=abs) / SECOND_NS, tuple(name for _, name, _ in group))
+        for group in groups
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class _Draft:
+    """A topic whose source of time is chosen, but not yet on the others' clock."""
+
+    source: Literal["header", "log"]
+    why: str
+    stamp_ns: Ints
+    usable: Mask
+    epoch: Ints
+    offset_ns: dict[int, int]
+    median_offset_ns: int | None
+    replaced: int
+
+
+def _draft(times: TopicTimes, reason: str | None, epoch: Ints) -> _Draft:
+    known = _is_set(times)
+    median = _median_offset(times, known)
+    usable = np.ones(len(known), bool)
+    if reason is not None or times.header_ns is None:
+        return _Draft("log", str(reason), times.log_time_ns, usable, epoch, {}, median, 0)
+    offset = _offsets(times, known, epoch)
+    if times.prefer == "header":
+        return _Draft("header", "the recipe says so", times.header_ns, known, epoch, offset, median, 0)
+    expected = _expected(times, offset, epoch)
+    stray = known & (np.abs(times.header_ns - expected) > FOLLOWS_NS)
+    replaced = ~known | stray | _leaps(times, known & ~stray)
+    stamps = np.where(replaced, expected, times.header_ns)
+    why = "its header follows the log time"
+    return _Draft("header", why, stamps, usable, epoch, offset, median, int(np.count_nonzero(replaced)))
+
+
+def _expected(times: TopicTimes, offset_ns: Mapping[int, int], epoch: Ints) -> Ints:
+    """Return where the log time and the epoch's offset put each stamp [ns]."""
+    return times.log_time_ns + np.array([offset_ns[int(e)] for e in epoch], np.int64)
+
+
+def _epochs(name: str, times: TopicTimes, steps: Sequence[Step], own: Sequence[tuple[int, int]]) -> Ints:
+    """Return each row's epoch: by its own topic's step where it has one, else by the step's log time."""
+    own_rows = {int(times.log_time_ns[row]): row for row, _ in own}
+    epoch = np.zeros(len(times.log_time_ns), np.int64)
+    for step in steps:
+        mine = [row for at, row in own_rows.items() if 0 <= at - step.log_time_ns <= _TOGETHER_NS]
+        first = mine[0] if mine and name in step.topics else int(np.searchsorted(times.log_time_ns, step.log_time_ns))
+        epoch[first:] += 1
+    return epoch
+
+
+def _median_offset(times: TopicTimes, known: Mask) -> int | None:
+    if times.header_ns is None or not known.any():
+        return None
+    return int(np.median(times.header_ns[known] - times.log_time_ns[known]))
+
+
+def _offsets(times: TopicTimes, known: Mask, epoch: Ints) -> dict[int, int]:
+    """Return the median of header minus log time [ns] by epoch; an epoch without set stamps takes the whole log's."""
+    header = times.log_time_ns if times.header_ns is None else times.header_ns
+    behind = header - times.log_time_ns
+    whole = int(np.median(behind[known]))
+    return {
+        int(e): int(np.median(behind[known & (epoch == e)])) if np.any(known & (epoch == e)) else whole
+        for e in np.unique(epoch)
+    }
+
+
+def _why_not_header(times: TopicTimes, own_steps: Sequence[tuple[int, int]]) -> str | None:
+    """Return why a topic's log time rules, or None where its header does."""
+    known = _is_set(times)
+    if times.prefer == "log":
+        return "the recipe says so"
+    if times.header_ns is None or not known.any():
+        return "its messages have no header stamp" if times.header_ns is None else "none of its header stamps is set"
+    if times.prefer == "header":
+        return None
+    shares = (
+        (1 - np.mean(known), _MOST_UNSET, "header stamps are unset"),
+        (_stray_share(times, known, own_steps), _MOST_STRAY, "header stamps do not follow the log time within 10 s"),
+        (_repeated_share(times), _MOST_REPEATED, "messages repeat the header stamp before with other content"),
+    )
+    return next((f"{100 * share:.0f} % of its {what}" for share, most, what in shares if share > most), None)
+
+
+def _stray_share(times: TopicTimes, known: Mask, own_steps: Sequence[tuple[int, int]]) -> float:
+    epoch = np.zeros(len(known), np.int64)
+    for row, _ in own_steps:
+        epoch[row:] += 1
+    header = times.log_time_ns if times.header_ns is None else times.header_ns
+    stray = np.abs(header - _expected(times, _offsets(times, known, epoch), epoch)) > FOLLOWS_NS
+    return float(np.mean(known & stray))
+
+
+def _repeated_share(times: TopicTimes) -> float:
+    if times.header_ns is None or len(times.header_ns) < 2 * _FEWEST:
+        return 0.0
+    other = np.any(np.diff(times.content, axis=0) != 0, axis=-1)
+    return float(np.mean((np.diff(times.header_ns) == 0) & other))
+
+
+def _leaps(times: TopicTimes, known: Mask) -> Mask:
+    """Whether single stamps lie more than 1 s ahead of their neighbours': nothing is received before it is measured."""
+    leaps = np.zeros(len(known), bool)
+    rows = np.flatnonzero(known)
+    if times.header_ns is None or len(rows) < _NEIGHBOURS:
+        return leaps
+    behind = times.header_ns[rows] - times.log_time_ns[rows]
+    if np.ptp(behind) <= LATE_NS:
+        return leaps
+    padded = np.pad(behind, _NEIGHBOURS // 2, mode="edge")
+    neighbours = np.median(np.lib.stride_tricks.sliding_window_view(padded, _NEIGHBOURS), axis=-1)
+    leaps[rows] = behind - neighbours > LATE_NS
+    return leaps
+
+
+def _reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
+    """Return the offset [ns] that most topics with header time share in an epoch; 0 where there is none.
+
+    Among equally large groups the one nearest to the log's clock is taken.
+    """
+    offsets = sorted(draft.offset_ns[epoch] for draft in drafts.values() if epoch in draft.offset_ns)
+    if not offsets:
+        return 0
+    groups = [[other for other in offsets if abs(other - offset) <= APART_NS] for offset in offsets]
+    best = min(groups, key=lambda group: (-len(group), abs(group[len(group) // 2])))
+    return best[len(best) // 2]
+
+
+def _timeline(times: TopicTimes, draft: _Draft, reference: Sequence[int]) -> Timeline:
+    apart = [target - draft.offset_ns.get(epoch, 0) for epoch, target in enumerate(reference)]
+    moves = [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in apart]
+    stamps = draft.stamp_ns + np.array(moves, np.int64)[draft.epoch] + times.offset_ns
+    late = _lateness(stamps, draft.epoch, draft.usable)
+    keep = draft.usable & (late < LATE_NS)
+    rows = np.flatnonzero(keep)
+    order = rows[np.lexsort((rows, stamps[rows], draft.epoch[rows]))]
+    again = _repeats(stamps[order], draft.epoch[order])
+    same = np.zeros(len(order), bool)
+    content = times.content[order]
+    same[1:] = again[1:] & np.all(
+        (content[1:] == content[:-1]) | (np.isnan(content[1:]) & np.isnan(content[:-1])), axis=-1
+    )
+    dropped = {
+        "unset_stamps": int(np.count_nonzero(~draft.usable)),
+        "late": int(np.count_nonzero(draft.usable & (late >= LATE_NS))),
+        "duplicates": int(np.count_nonzero(same)),
+        "repeated_stamps": int(np.count_nonzero(again & ~same)),
+    }
+    notes = {"sorted": int(np.count_nonzero(keep & (late > 0))), "stamps_replaced": draft.replaced}
+    chosen = order[~again]
+    return Timeline(
+        chosen,
+        stamps[chosen],
+        draft.epoch[chosen].astype(np.int16),
+        draft.source,
+        draft.why,
+        None if draft.median_offset_ns is None else draft.median_offset_ns / SECOND_NS,
+        {name: count for name, count in dropped.items() if count},
+        {name: count for name, count in notes.items() if count},
+        tuple(move / SECOND_NS for move in moves),
+    )
+
+
+def _lateness(stamp_ns: Ints, epoch: Ints, usable: Mask) -> Ints:
+    """Return how far each row lies before the latest stamp that came earlier in its epoch [ns], 0 where it does not."""
+    late = np.zeros(len(stamp_ns), np.int64)
+    for e in np.unique(epoch):
+        rows = np.flatnonzero((epoch == e) & usable)
+        if len(rows):
+            late[rows] = np.maximum.accumulate(stamp_ns[rows]) - stamp_ns[rows]
+    return late
+
+
+def _repeats(stamp_ns: Ints, epoch: Ints) -> Mask:
+    again = np.zeros(len(stamp_ns), bool)
+    again[1:] = (np.diff(stamp_ns) == 0) & (np.diff(epoch) == 0)
+    return again

@@ -1,0 +1,359 @@
+"""What messages mean: from a topic's fields to the SI columns of its role, row by row, with everything that is left out counted.
+
+Columns in, columns out, named as in the levels' tables. Sources: the definitions of sensor_msgs, nav_msgs and geometry_msgs (their
+comments fix units, frames and what -1 and 0 mean), REP-103, REP-105, REP-145.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.geometry.rotation import normalized
+from tcpipe.logs import roles
+from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, read_gga, with_date
+
+Columns = Mapping[str, NDArray[Any]]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+LOG_TIME = "log_time_ns"
+_STAMP = ("header.stamp.sec", "header.stamp.nanosec")
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """A topic's usable rows.
+
+    ``row`` is each one's place in the table, ``header_ns`` its own stamp (0 where unset, None where the type has none), ``dropped`` counts
+    the rows that are not used by reason, ``notes`` counts values that were set aside inside used rows.
+    """
+
+    row: Ints
+    log_time_ns: Ints
+    header_ns: Ints | None
+    columns: dict[str, NDArray[Any]]
+    dropped: dict[str, int] = field(default_factory=dict)
+    notes: dict[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    own_time_ns: Ints | None = None
+    """Time that the measurement itself carries (NMEA), as `header_ns`."""
+
+
+def needed_fields(type_name: str) -> tuple[str, ...]:
+    """Return the fields that a type of message must have to be read here."""
+    return _FIELDS[type_name]
+
+
+def read_messages(columns: Columns, role: str, type_name: str) -> Readings:
+    """Return the readings of a topic that plays ``role``.
+
+    Parameters
+    ----------
+    columns : ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances as shape (N, k); frames and sentences as
+        arrays of str.
+    role : gnss, imu, wheel_odometry, visual_odometry or command (power is read by `power_sources`).
+    type_name : ``package/msg/Name``.
+    """
+    return _READERS[role, type_name]({name: _possible(name, values) for name, values in columns.items()})
+
+
+_IMPOSSIBLE = 1e9
+"""No position, velocity or acceleration in SI units is larger; squares of what is overflow."""
+
+
+def _possible(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """Return the values of a field with NaN for those that no sensor can mean; covariances are judged where they are used."""
+    if not np.issubdtype(values.dtype, np.floating) or name.endswith("covariance"):
+        return values
+    possible = np.abs(values) <= _IMPOSSIBLE
+    return values if possible.all() else np.where(possible, values, np.nan)
+
+
+def frames(columns: Columns, type_name: str) -> dict[str, int]:
+    """Return the frames that a topic's measurements are given in, with their counts, most frequent first; leading slashes stripped."""
+    name = "child_frame_id" if type_name == roles.ODOMETRY else "header.frame_id"
+    if name not in columns:
+        return {}
+    texts, counts = np.unique(columns[name].astype(str), return_counts=True)
+    found: dict[str, int] = {}
+    for text, count in zip(texts, counts, strict=True):
+        found[text.lstrip("/")] = found.get(text.lstrip("/"), 0) + int(count)
+    return dict(sorted(found.items(), key=lambda item: (-item[1], item[0])))
+
+
+def header_ns(columns: Columns) -> Ints | None:
+    """Return header stamps [ns], 0 where unset; None where the message has no header."""
+    if _STAMP[0] not in columns:
+        return None
+    return columns[_STAMP[0]].astype(np.int64) * 1_000_000_000 + columns[_STAMP[1]].astype(np.int64)
+
+
+def _kept(columns: Columns, values: dict[str, NDArray[Any]], drops: Mapping[str, Mask], **extra: Any) -> Readings:
+    """Return the readings of the rows that no reason drops; a row counts under its first reason."""
+    keep = np.ones(len(columns[LOG_TIME]), bool)
+    dropped: dict[str, int] = {}
+    for reason, mask in drops.items():
+        if count := int(np.count_nonzero(mask & keep)):
+            dropped[reason] = count
+        keep &= ~mask
+    row = np.flatnonzero(keep)
+    stamps = header_ns(columns)
+    return Readings(
+        row,
+        columns[LOG_TIME][row].astype(np.int64),
+        None if stamps is None else stamps[row],
+        {name: value[row] for name, value in values.items()},
+        dropped,
+        **extra,
+    )
+
+
+def _vector(columns: Columns, prefix: str) -> Floats:
+    """Return fields x, y, z as shape (N, 3)."""
+    return np.stack([columns[f"{prefix}.{axis}"].astype(np.float64) for axis in "xyz"], -1)
+
+
+def _axes(name: str, suffix: str, values: Floats) -> dict[str, NDArray[Any]]:
+    return {f"{name}_{axis}_{suffix}": values[:, i] for i, axis in enumerate("xyz")}
+
+
+def _variances(columns: Columns, name: str, *diagonal: int) -> Floats:
+    """Return diagonal entries of a covariance, shape (N, k); NaN where they cannot be trusted: zero, negative or not finite."""
+    if name not in columns:
+        return np.full((len(columns[LOG_TIME]), len(diagonal)), np.nan)
+    chosen = columns[name].astype(np.float64)[:, list(diagonal)]
+    return np.where(np.isfinite(chosen) & (chosen > 0), chosen, np.nan)
+
+
+def _is_absent(columns: Columns, name: str) -> Mask:
+    """Whether a covariance says that its quantity is not measured: -1 in its first element (sensor_msgs/Imu)."""
+    if name not in columns:
+        return np.zeros(len(columns[LOG_TIME]), bool)
+    absent: Mask = columns[name][:, 0] == -1
+    return absent
+
+
+def _orientation(columns: Columns, prefix: str) -> tuple[Floats, Mask]:
+    """Return unit quaternions (N, 4), NaN where they are none, and which rows those are."""
+    given = np.stack([columns[f"{prefix}.{c}"].astype(np.float64) for c in "xyzw"], -1)
+    length = np.linalg.norm(given, axis=-1)
+    bad = ~(np.abs(length - 1.0) < _QUAT_TOLERANCE)
+    return normalized(np.where(bad[:, None], np.nan, given)), bad
+
+
+_QUAT_TOLERANCE = 0.01
+
+
+def _is_outside(lat_deg: Floats, lon_deg: Floats) -> Mask:
+    return (np.abs(lat_deg) > 90) | (np.abs(lon_deg) > 180)
+
+
+def _gnss(lon: Floats, lat: Floats, alt: Floats, variances: Floats, status: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    return {
+        "lon_deg": lon,
+        "lat_deg": lat,
+        "alt_m": alt,
+        **{f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))},
+        "fix_status": status.astype(np.int8),
+    }
+
+
+def _read_nav_sat_fix(columns: Columns) -> Readings:
+    lat, lon, alt = (columns[name].astype(np.float64) for name in ("latitude", "longitude", "altitude"))
+    variances = _variances(columns, "position_covariance", 0, 4, 8)
+    unknown = columns["position_covariance_type"] == 0
+    variances[unknown] = np.nan
+    status = columns["status.status"].astype(np.int64)
+    drops = {
+        "no_fix": status < 0,
+        "not_finite": ~np.isfinite(lat + lon + alt),
+        "null_island": (lat == 0) & (lon == 0),
+        "outside_the_globe": _is_outside(lat, lon),
+    }
+    notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0])))}
+    return _kept(columns, _gnss(lon, lat, alt, variances, status), drops, notes=notes)
+
+
+def _read_nmea(columns: Columns) -> Readings:
+    sentences = columns["sentence"]
+    gga = read_gga([str(sentence) for sentence in sentences])
+    of_gga = {name: values[gga.row] for name, values in columns.items()}
+    known = np.isfinite(gga.separation_m)
+    separation = np.where(known, gga.separation_m, np.median(gga.separation_m[known]) if known.any() else 0.0)
+    std_1 = np.array([STATUS_AND_STD_OF_QUALITY.get(int(q), (-1, np.nan))[1] for q in gga.quality])
+    status = np.array([STATUS_AND_STD_OF_QUALITY.get(int(q), (-1, np.nan))[0] for q in gga.quality], np.int64)
+    horizontal = (np.where(gga.hdop > 0, gga.hdop, np.nan) * std_1) ** 2
+    variances = np.stack((horizontal, horizontal, 4 * horizontal), -1).reshape(-1, 3)
+    alt = gga.alt_m + separation
+    drops = {
+        "broken": gga.broken,
+        "no_fix": status < 0,
+        "not_finite": ~np.isfinite(gga.lat_deg + gga.lon_deg + alt),
+        "null_island": (gga.lat_deg == 0) & (gga.lon_deg == 0),
+        "outside_the_globe": _is_outside(gga.lat_deg, gga.lon_deg),
+    }
+    warnings: tuple[str, ...] = ()
+    if len(gga.row) and not known.any():
+        warnings = ("its GGA sentences give no geoid separation: heights are above the geoid, not the ellipsoid",)
+    values = _gnss(gga.lon_deg, gga.lat_deg, alt, variances, status)
+    found = _kept(of_gga, values, drops, warnings=warnings)
+    others = len(sentences) - len(gga.row)
+    own_time_ns = with_date(gga.time_of_day_ns[found.row], found.log_time_ns)
+    return Readings(
+        gga.row[found.row],
+        found.log_time_ns,
+        found.header_ns,
+        found.columns,
+        {**({"not_gga": others} if others else {}), **found.dropped},
+        {"without_separation": int(np.count_nonzero(~known[found.row]))},
+        (*warnings, *_apart(own_time_ns, found.header_ns)),
+        own_time_ns,
+    )
+
+
+_APART_S = 0.25
+
+
+def _apart(own_time_ns: Ints, stamps_ns: Ints | None) -> tuple[str, ...]:
+    """Return a warning where the sentences' UTC and their header stamps differ by more than reading a serial port takes."""
+    if stamps_ns is None or not (known := (own_time_ns > 0) & (stamps_ns > 0)).any():
+        return ()
+    apart_s = float(np.median(own_time_ns[known] - stamps_ns[known])) / 1e9
+    if abs(apart_s) <= _APART_S:
+        return ()
+    what = f"the UTC in its sentences is {apart_s:+.3f} s from their header stamps; the sentences' rules"
+    return (f'{what}, unless the recipe says [read.time] gnss = "header"',)
+
+
+def _read_imu(columns: Columns) -> Readings:
+    rate = _vector(columns, "angular_velocity")
+    force = _vector(columns, "linear_acceleration")
+    quat, bad = _orientation(columns, "orientation")
+    absent = _is_absent(columns, "orientation_covariance")
+    # A driver without a filter fills in one constant orientation; a sensor's own digits never stand still.
+    constant = len(quat) > 10 and not absent.any() and bool(np.all(quat == quat[0]))
+    quat[absent | constant] = np.nan
+    variances = {
+        f"{name}_var": np.mean(_variances(columns, f"{name}_covariance", 0, 4, 8), axis=-1)
+        for name in ("angular_velocity", "linear_acceleration", "orientation")
+    }
+    variances["orientation_var"][np.isnan(quat[:, 0])] = np.nan
+    values = {
+        **_axes("angular_velocity", "radps", rate),
+        **_axes("linear_acceleration", "mps2", force),
+        **{f"quat_{c}": quat[:, i] for i, c in enumerate("xyzw")},
+        **variances,
+    }
+    drops = {
+        "not_measured": _is_absent(columns, "angular_velocity_covariance")
+        | _is_absent(columns, "linear_acceleration_covariance"),
+        "not_finite": ~np.isfinite(rate.sum(-1) + force.sum(-1)),
+    }
+    notes = {
+        "without_orientation": int(np.count_nonzero(absent)),
+        "bad_quaternions": int(np.count_nonzero(bad & ~absent)),
+    }
+    warnings = ("its orientation never changes: taken as absent",) if constant else ()
+    return _kept(columns, values, drops, notes=notes, warnings=warnings)
+
+
+_POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
+
+
+def _body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, NDArray[Any]], Floats]:
+    linear, angular = _vector(columns, f"{prefix}.linear"), _vector(columns, f"{prefix}.angular")
+    variances = _variances(columns, covariance, 0, 7, 14, 35)
+    values = {
+        **_axes("velocity", "mps", linear),
+        **_axes("angular_velocity", "radps", angular),
+        **_axes("velocity_var", "m2ps2", variances),
+        "yaw_rate_var": variances[:, 3],
+    }
+    return values, np.concatenate((linear, angular), -1)
+
+
+def _read_odometry(columns: Columns) -> Readings:
+    values, twist = _body_twist(columns, "twist.twist", "twist.covariance")
+    position = _vector(columns, "pose.pose.position")
+    quat, bad = _orientation(columns, "pose.pose.orientation")
+    pose = np.concatenate((position, quat), -1)
+    pose[~np.isfinite(pose).all(-1)] = np.nan
+    moved_m = float(np.nansum(np.linalg.norm(np.diff(position, axis=0), axis=-1)))
+    empty = not np.any(twist) and moved_m > _MOVED_M
+    warnings: tuple[str, ...] = ()
+    if empty:
+        warnings = (f"its twist is zero on every row while its pose moves {moved_m:.1f} m: only its pose is used",)
+        values = {name: np.full(len(twist), np.nan) for name in values}
+    values |= {name: pose[:, i] for i, name in enumerate(_POSE)}
+    lost = np.asarray(np.isnan(pose).any(-1) if empty else ~np.isfinite(twist.sum(-1)))
+    notes = {"bad_quaternions": int(np.count_nonzero(bad))}
+    return _kept(columns, values, {"not_finite": lost}, notes=notes, warnings=warnings)
+
+
+_MOVED_M = 0.1
+
+
+def _read_twist_stamped(columns: Columns) -> Readings:
+    with_covariance = "twist.twist.linear.x" in columns
+    values, twist = _body_twist(columns, "twist.twist" if with_covariance else "twist", "twist.covariance")
+    values |= {name: np.full(len(twist), np.nan) for name in _POSE}
+    return _kept(columns, values, {"not_finite": ~np.isfinite(twist.sum(-1))})
+
+
+def _read_command(columns: Columns) -> Readings:
+    prefix = "twist." if "twist.linear.x" in columns else ""
+    forward, yaw_rate = (columns[f"{prefix}{name}"].astype(np.float64) for name in ("linear.x", "angular.z"))
+    values: dict[str, NDArray[Any]] = {"forward_velocity_mps": forward, "yaw_rate_radps": yaw_rate}
+    return _kept(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
+
+
+_READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
+    ("gnss", roles.NAV_SAT_FIX): _read_nav_sat_fix,
+    ("gnss", roles.NMEA_SENTENCE): _read_nmea,
+    ("imu", roles.IMU): _read_imu,
+    ("command", roles.TWIST): _read_command,
+    ("command", roles.TWIST_STAMPED): _read_command,
+    **{
+        (role, type_name): read
+        for role in ("wheel_odometry", "visual_odometry")
+        for type_name, read in (
+            (roles.ODOMETRY, _read_odometry),
+            (roles.TWIST_STAMPED, _read_twist_stamped),
+            (roles.TWIST_WITH_COVARIANCE_STAMPED, _read_twist_stamped),
+        )
+    },
+}
+
+
+def _fields_of(*prefixes: str) -> tuple[str, ...]:
+    """Return field names; a prefix that ends with a dot stands for its x, y, z."""
+    return tuple(
+        name
+        for prefix in prefixes
+        for name in ([prefix + axis for axis in "xyz"] if prefix.endswith(".") else [prefix])
+    )
+
+
+def _quat_of(prefix: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}.{c}" for c in "xyzw")
+
+
+_FIELDS: dict[str, tuple[str, ...]] = {
+    roles.NAV_SAT_FIX: (*_STAMP, "latitude", "longitude", "altitude", "status.status", "position_covariance_type"),
+    roles.NMEA_SENTENCE: ("sentence",),
+    roles.IMU: (*_STAMP, *_fields_of("angular_velocity.", "linear_acceleration."), *_quat_of("orientation")),
+    roles.ODOMETRY: (
+        *_STAMP,
+        *_fields_of("twist.twist.linear.", "twist.twist.angular.", "pose.pose.position."),
+        *_quat_of("pose.pose.orientation"),
+    ),
+    roles.TWIST: _fields_of("linear.", "angular."),
+    roles.TWIST_STAMPED: (*_STAMP, *_fields_of("twist.linear.", "twist.angular.")),
+    roles.TWIST_WITH_COVARIANCE_STAMPED: (*_STAMP, *_fields_of("twist.twist.linear.", "twist.twist.angular.")),
+}

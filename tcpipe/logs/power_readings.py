@@ -1,0 +1,166 @@
+"""From the messages of one or several power topics to rails that can be believed, with every current positive when drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from tcpipe.logs.messages import LOG_TIME, Columns, Floats, Readings, header_ns
+from tcpipe.logs.power_sources import PowerSource, Rail, power_source, read_rails, sign_by_mean, why_refused, with_sign
+from tcpipe.logs.profiles import Robot
+
+CurrentSign = Literal["auto", "drawn_positive", "drawn_negative"]
+
+
+@dataclass(frozen=True, slots=True)
+class PowerReadings:
+    """What the power topics hold.
+
+    ``readings`` has, by topic, one voltage and one current column for each of its ``rails`` (see `columns_of`); it is empty where the power
+    was refused, and ``warnings`` says why.
+    """
+
+    readings: dict[str, Readings] = field(default_factory=dict)
+    rails: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    averaged: bool = False
+    warnings: tuple[str, ...] = ()
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+def columns_of(rail: str) -> tuple[str, str]:
+    """Return the names of a rail's voltage and current columns in its topic's readings."""
+    return f"{rail}: voltage_volt", f"{rail}: current_amp"
+
+
+def read_power(
+    topics: Mapping[str, tuple[str, Columns]],
+    robot: Robot,
+    *,
+    husky_power: Literal["battery", "drivers"] = "battery",
+    current_sign: CurrentSign = "auto",
+) -> PowerReadings:
+    """Return the rails of all power topics.
+
+    Parameters
+    ----------
+    topics : message type and columns by topic.
+    robot : the profile; it names the platform of clearpath_platform_msgs/Power.
+    husky_power, current_sign : recipe keys.
+    """
+    rails: dict[str, list[Rail]] = {}
+    sources: list[PowerSource] = []
+    refused: list[str] = []
+    for topic, (type_name, columns) in topics.items():
+        source = power_source(type_name, topic, robot, husky_power=husky_power)
+        found = source if isinstance(source, str) else read_rails(columns, source, topic)
+        if isinstance(found, str) or isinstance(source, str):
+            refused.append(str(found))
+            continue
+        refused += [why for rail in found if (why := why_refused(rail, columns)) is not None]
+        sources.append(source)
+        rails[topic] = found
+    rails = _paired(rails)
+    refused = refused or _incomplete([rail for found in rails.values() for rail in found])
+    if refused:
+        return PowerReadings(warnings=tuple(f"power refused: {why}; there will be no energy" for why in refused))
+    log_times = {topic: np.asarray(columns[LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
+    sign, warnings, facts = _sign(rails, log_times, sources, current_sign)
+    warnings += [f"power: {source.includes} are part of it" for source in sources if source.includes]
+    return PowerReadings(
+        {
+            topic: _readings(topics[topic][1], [with_sign(rail, sign) for rail in found])
+            for topic, found in rails.items()
+        },
+        {topic: tuple(rail.name for rail in found) for topic, found in rails.items()},
+        any(source.averaged for source in sources),
+        tuple(dict.fromkeys(warnings)),
+        facts,
+    )
+
+
+def _paired(rails: dict[str, list[Rail]]) -> dict[str, list[Rail]]:
+    """Give the one rail without current and the one without voltage a common name: they are one rail on two topics."""
+    flat = [rail for found in rails.values() for rail in found]
+    without_voltage = [rail.name for rail in flat if not np.isfinite(rail.voltage_volt).any()]
+    without_current = [rail.name for rail in flat if not np.isfinite(rail.current_amp).any()]
+    if len(without_voltage) != 1 or len(without_current) != 1 or without_voltage == without_current:
+        return rails
+    pair = {*without_voltage, *without_current}
+    return {
+        topic: [replace(rail, name="battery") if rail.name in pair else rail for rail in found]
+        for topic, found in rails.items()
+    }
+
+
+def _incomplete(rails: list[Rail]) -> list[str]:
+    missing = []
+    for name in dict.fromkeys(rail.name for rail in rails):
+        parts = [rail for rail in rails if rail.name == name]
+        for what, values in (
+            ("voltage", [rail.voltage_volt for rail in parts]),
+            ("current", [rail.current_amp for rail in parts]),
+        ):
+            if not any(np.isfinite(value).any() for value in values):
+                missing.append(f"{name}: it carries no {what}")
+    return missing
+
+
+def _sign(
+    rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
+) -> tuple[int, list[str], dict[str, Any]]:
+    if given != "auto":
+        return (1 if given == "drawn_positive" else -1), [], {"current_sign": f"{given} (recipe)"}
+    if all(source.sign for source in sources):
+        return 1, [], {"current_sign": "drawn_positive (message type)"}
+    time_s, whole = _whole_current(rails, log_times)
+    sign, one_sided = sign_by_mean(whole, np.gradient(time_s) if len(time_s) > 1 else np.ones_like(time_s))
+    share = f"{100 * abs(one_sided):.0f} % of the charge moved"
+    if sign > 0:
+        why = f"power: the current counts as positive when drawn, against the ROS convention: {share} is positive"
+        return (
+            1,
+            [f'{why}; settle it with read.current_sign = "drawn_positive"'],
+            {"current_sign": "drawn_positive (mean)"},
+        )
+    if sign < 0:
+        return -1, [], {"current_sign": "drawn_negative (mean, as ROS has it)"}
+    why = f"power: the current's sign is unclear (net {share}): taken as negative when drawn, as ROS has it"
+    return (
+        -1,
+        [f'{why}; settle it with read.current_sign = "drawn_positive" or "drawn_negative"'],
+        {"current_sign": "drawn_negative (ROS)"},
+    )
+
+
+def _whole_current(rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+    """Return the sum of all rails' currents [A] at the log times of the first topic that carries one, and these times [s]."""
+    parts = [
+        (log_times[topic][known] / 1e9, rail.current_amp[known])
+        for topic, found in rails.items()
+        for rail in found
+        if (known := np.isfinite(rail.current_amp)).any()
+    ]
+    time_s = parts[0][0]
+    return time_s, np.sum([np.interp(time_s, at, current) for at, current in parts], axis=0)
+
+
+def _readings(columns: Columns, rails: list[Rail]) -> Readings:
+    """Return the rows on which at least one rail carries a voltage or a current."""
+    values = {
+        name: v
+        for rail in rails
+        for name, v in zip(columns_of(rail.name), (rail.voltage_volt, rail.current_amp), strict=True)
+    }
+    row = np.flatnonzero(np.any([np.isfinite(value) for value in values.values()], axis=0))
+    stamps = header_ns(columns)
+    lost = len(columns[LOG_TIME]) - len(row)
+    return Readings(
+        row,
+        columns[LOG_TIME][row].astype(np.int64),
+        None if stamps is None else stamps[row],
+        {name: value[row] for name, value in values.items()},
+        {"not_finite": lost} if lost else {},
+    )

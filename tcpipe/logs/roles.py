@@ -1,0 +1,466 @@
+"""Which topic plays which role, decided from the topic list alone, and why; what cannot be decided is asked for with the recipe line.
+
+Rules, in this order: the recipe; topics that are other estimators' outputs play no role (fusing them again would count a sensor twice);
+the message type; how the topic is called. Where two topics are left that no rule tells apart, nobody guesses.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+from tcpipe.logs.power_sources import (
+    BATTERY_STATE,
+    FLOAT_TYPES,
+    POWER_TYPES,
+    PROPULSION_TYPES,
+    is_corrected,
+    quantity,
+    rail_of,
+)
+from tcpipe.logs.profiles import Robot, find_robot
+from tcpipe.logs.several_robots import namespaces_of_robots
+from tcpipe.logs.topics import Topic
+
+NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
+NMEA_SENTENCE = "nmea_msgs/msg/Sentence"
+IMU = "sensor_msgs/msg/Imu"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST = "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+TWIST_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/TwistWithCovarianceStamped"
+TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+
+_MEASURED_TWISTS = (ODOMETRY, TWIST_WITH_COVARIANCE_STAMPED, TWIST_STAMPED)
+
+ROLE_TYPES: dict[str, tuple[str, ...]] = {
+    "gnss": (NAV_SAT_FIX, NMEA_SENTENCE),
+    "imu": (IMU,),
+    "wheel_odometry": _MEASURED_TWISTS,
+    "visual_odometry": _MEASURED_TWISTS,
+    "power": (*POWER_TYPES, *FLOAT_TYPES),
+    "command": (TWIST_STAMPED, TWIST),
+}
+"""Message types that can play each role, best first."""
+
+MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss")
+"""Roles of which a log needs one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Role:
+    """A role, the topics that play it (several only for power: they are summed), their type, and why."""
+
+    name: str
+    topics: tuple[str, ...]
+    type_name: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Assignment:
+    """Who plays what.
+
+    ``left_out`` says why a topic plays no role though its type could; ``problems`` are the plain lines of what the user has to decide;
+    ``warnings`` what the run will lack; ``transforms`` are the topics that may place sensors, static ones first.
+    """
+
+    robot: Robot
+    robot_why: str
+    roles: Mapping[str, Role]
+    left_out: Mapping[str, str]
+    transforms: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def static_transforms(self) -> tuple[str, ...]:
+        """The topics of static transforms (those called so)."""
+        return tuple(topic for topic in self.transforms if topic.endswith("tf_static"))
+
+
+@dataclass(slots=True)
+class _Casting:
+    """The decisions while they are made."""
+
+    roles: dict[str, Role] = field(default_factory=dict)
+    left_out: dict[str, str] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+    ambiguous: list[str] = field(default_factory=list)
+    recipe_lines: list[str] = field(default_factory=list)
+    undecided: set[str] = field(default_factory=set)
+
+
+RoleName = TypeVar("RoleName", bound=str)
+
+
+def assign_roles(
+    topics: Iterable[Topic],
+    chosen: Mapping[RoleName, Sequence[str]],
+    ignored: Sequence[str] = (),
+    robot: str | None = None,
+    *,
+    namespace: str | None = None,
+) -> Assignment:
+    """Return which topic plays which role, and why.
+
+    Parameters
+    ----------
+    topics : the log's topics.
+    chosen : recipe key ``read.topics``: topics by role. For power all are summed; elsewhere the first that the log holds is taken; an
+        empty list means that nothing plays the role.
+    ignored : recipe key ``read.ignore_topics``.
+    robot : profile name, where the user gave one.
+    namespace : recipe key ``read.namespace``; topics elsewhere play no role unless they are chosen by name.
+
+    Raises
+    ------
+    RecipeError : no profile has the robot's name.
+    """
+    every = {topic.name: topic for topic in sorted(topics, key=lambda topic: topic.name)}
+    named = {name for names in chosen.values() for name in names}
+    listed = {name: topic for name, topic in every.items() if _is_in(namespace, topic) or name in named}
+    wanted = {str(role): names for role, names in chosen.items()}
+    profile, robot_why = find_robot(listed.values(), robot)
+    casting = _Casting()
+    if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
+        casting.problems.append(
+            f"recipe read.namespace: no topic lies below {namespace}; the log holds {_listing(every.values())}"
+        )
+    _take_chosen(casting, listed, wanted)
+    taken = {name for role in casting.roles.values() for name in role.topics}
+    free = [topic for topic in listed.values() if topic.name not in taken and _is_usable(casting, topic, ignored)]
+    found = {
+        role: candidates
+        for role, candidates in _candidates(casting, free, wanted)
+        if role not in casting.roles and role not in wanted
+    }
+    robots = namespaces_of_robots({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
+    if robots:
+        casting.problems += _which_robot(robots)
+        casting.undecided |= set(found)
+    else:
+        for role, candidates in found.items():
+            _decide(casting, role, candidates)
+    return Assignment(
+        profile,
+        robot_why,
+        {role: casting.roles[role] for role in ROLE_TYPES if role in casting.roles},
+        casting.left_out,
+        _transform_topics(listed.values(), ignored),
+        tuple(casting.problems + (_without_motion(casting, list(listed.values())) or _questions(casting))),
+        tuple(_warnings(casting)),
+    )
+
+
+def _is_in(namespace: str | None, topic: Topic) -> bool:
+    """Whether a topic belongs to the robot that was asked for; transforms of no namespace belong to all."""
+    below = namespace is None or topic.name.startswith(f"/{namespace.strip('/')}/")
+    return below or (topic.type_name in TRANSFORMS and topic.name.count("/") == 1)
+
+
+def _which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the one question that a log of several robots asks, and the recipe line that answers it."""
+    each = "; ".join(f"{name} ({', '.join(roles)})" for name, roles in robots.items())
+    first, *others = robots
+    other = "".join(f' or "{name}"' for name in others)
+    return [
+        f"the log holds {len(robots)} robots, and a run is of one: {each}",
+        "settle it in the recipe (tcpipe.toml), for example:",
+        "[read]",
+        f'namespace = "{first}"  #{other}',
+    ]
+
+
+def _take_chosen(casting: _Casting, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]]) -> None:
+    for role, names in chosen.items():
+        if role not in ROLE_TYPES:
+            casting.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
+            continue
+        present = [name for name in names if name in topics]
+        wanted = present if role == "power" else present[:1]
+        missing = [name for name in names if name not in topics]
+        if missing and (role == "power" or not present):
+            casting.undecided.add(role)
+            casting.problems.append(
+                f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not hold; "
+                f"it holds {_listing(topics.values(), ROLE_TYPES[role])}"
+            )
+        for name in wanted:
+            if topics[name].type_name not in ROLE_TYPES[role]:
+                casting.problems.append(
+                    f"recipe read.topics.{role}: {name} is {topics[name].type_name}; wanted {' or '.join(ROLE_TYPES[role])}"
+                )
+            elif topics[name].problem is not None:
+                casting.problems.append(f"recipe read.topics.{role}: {name} cannot be read: {topics[name].problem}")
+        if wanted:
+            casting.roles[role] = Role(role, tuple(wanted), topics[wanted[0]].type_name, "the recipe says so")
+
+
+def _is_usable(casting: _Casting, topic: Topic, ignored: Sequence[str]) -> bool:
+    if not any(topic.type_name in types for types in ROLE_TYPES.values()):
+        return False
+    if topic.type_name in FLOAT_TYPES and quantity(topic.name) is None:
+        return False
+    why = None
+    if topic.name in ignored:
+        why = "the recipe ignores it"
+    elif topic.problem is not None:
+        why = f"it cannot be read: {topic.problem}"
+    elif topic.message_count == 0:
+        why = "it has no messages"
+    if why is not None:
+        casting.left_out[topic.name] = why
+    return why is None
+
+
+# Words of topic names, matched from the start of a word: zed matches zed, zed2i and zedx.
+_FUSED = re.compile(
+    r"filtered|fused|fusion|ekf|ukf|kalman|icp|truth|groundtruth|gazebo|amcl|locali[sz]|loam|lio|lidar|laser|scan|"
+    r"cartographer|hector|slam$|slam_toolbox|map$|mapping|global|world|gt$"
+)
+_OF_GNSS = re.compile(r"gps|gnss|navsat|fix$|utm|ublox|novatel|septentrio|rtk")
+_VISUAL = re.compile(
+    r"zed|visual|vo$|vio$|svo|rtabmap|orb$|orbslam|stereo|camera|cam$|realsense|t265|rgbd|vins|mono|okvis|vslam"
+)
+_NO_SENSOR = ((_FUSED, "another estimator's output, not a sensor"), (_OF_GNSS, "made from GNSS"))
+_OTHER_IMU = re.compile(r"odom|zed|camera|realsense|t265|d435|d455|oak|ouster|os_?cloud|velodyne|livox|lidar|phone")
+_WHEEL = re.compile(r"wheel|velocity|base|platform|drive|diff|encoder|odom")
+_COMMAND = re.compile(r"cmd|command|commands|cmdvel")
+_HUMAN_OR_PLANNER = re.compile(r"joy|teleop|nav|move|interactive|marker|key|web|rc$|auto|external|smooth|safe|raw")
+_SIDES = frozenset({"left", "right", "front", "rear", "back", "l", "r", "fl", "fr", "rl", "rr"})
+
+
+def _words(name: str) -> list[str]:
+    return [word for word in re.split(r"[/_\-.]+", name.lower()) if word]
+
+
+def _says(pattern: re.Pattern[str], name: str) -> str | None:
+    """Return the first word of a topic's name that the pattern matches from its start."""
+    return next((word for word in _words(name) if pattern.match(word)), None)
+
+
+Ranked = list[tuple[tuple[int, ...], str, Topic]]
+"""Candidates with their rank (smaller is better) and what speaks for them."""
+
+
+def _candidates(
+    casting: _Casting, topics: Sequence[Topic], chosen: Mapping[str, Sequence[str]]
+) -> Iterable[tuple[str, Ranked]]:
+    """Yield each role with its ranked candidates; what can be no candidate is left out with its reason."""
+    found: dict[str, Ranked] = {role: [] for role in ROLE_TYPES}
+    bare = [topic for topic in topics if topic.type_name in FLOAT_TYPES]
+    for topic in topics:
+        if topic in bare:
+            continue
+        role, rank, why = _SORTERS[topic.type_name](topic)
+        if role is None:
+            casting.left_out[topic.name] = why
+        elif role in chosen:
+            casting.left_out[topic.name] = f"the recipe chooses what plays {role}"
+        else:
+            found[role].append((rank, why, topic))
+    if "power" not in chosen:
+        found["power"] += _bare_power(casting, bare)
+    return found.items()
+
+
+Sorted = tuple[str | None, tuple[int, ...], str]
+
+
+def _sort_gnss(topic: Topic) -> Sorted:
+    if word := _says(re.compile(r"filtered|fused|fusion|ekf|ukf|truth"), topic.name):
+        return None, (), f"its name ({word}) says that it is another estimator's output"
+    return "gnss", (ROLE_TYPES["gnss"].index(topic.type_name),), ""
+
+
+def _sort_imu(topic: Topic) -> Sorted:
+    if word := _says(_OTHER_IMU, topic.name):
+        return "imu", (1,), f"its name ({word}) says that it is another device's or made from odometry"
+    raw = bool(re.search(r"(^|[/_])raw$", topic.name))
+    return "imu", (0, int(raw)), ""
+
+
+def _sort_odometry(topic: Topic) -> Sorted:
+    name = topic.name
+    kind = ROLE_TYPES["wheel_odometry"].index(topic.type_name)
+    if topic.type_name == TWIST_STAMPED and _says(_COMMAND, name):
+        return _sort_command(topic)
+    for pattern, what in _NO_SENSOR:
+        if word := _says(pattern, name):
+            return None, (), f"its name ({word}) says that it is {what}"
+    if word := _says(_VISUAL, name):
+        return "visual_odometry", (kind,), f"its name says {word}"
+    explicit = bool(re.search(r"wheel|velocity_controller|platform|encoder|diff_drive|drive_base", name.lower()))
+    if topic.type_name != ODOMETRY and not explicit and not _says(_WHEEL, name):
+        return None, (), "its name does not say what it measures"
+    return "wheel_odometry", (int(not explicit), kind), "its name says wheels" if explicit else ""
+
+
+def _sort_command(topic: Topic) -> Sorted:
+    name = topic.name.lower()
+    if not _says(_COMMAND, name):
+        return None, (), "a Twist that is not called a command"
+    stamped = ROLE_TYPES["command"].index(topic.type_name)
+    if name.endswith("cmd_vel_out"):
+        return "command", (0, stamped), "it leaves the controller"
+    if _says(_HUMAN_OR_PLANNER, name):
+        return "command", (3, stamped), "the only command"
+    if re.search(r"controller|platform|base", name):
+        return "command", (1, stamped), "it reaches the controller"
+    return "command", (2, stamped), ""
+
+
+_DRIVES = re.compile(r"drive|motor|wheel|traction")
+
+
+def _sort_power(topic: Topic) -> Sorted:
+    """Rank: messages that tell propulsion apart, then what hangs on the drives, then whole batteries."""
+    if topic.type_name in PROPULSION_TYPES:
+        return "power", (0, PROPULSION_TYPES.index(topic.type_name)), "its type tells propulsion apart"
+    if topic.type_name == BATTERY_STATE:
+        return "power", (1 if _says(_DRIVES, topic.name) else 4,), ""
+    return "power", (3,), ""
+
+
+def _bare_power(casting: _Casting, topics: Iterable[Topic]) -> Ranked:
+    """Return bare numbers that make whole rails: one voltage and one current that are called alike, on drives or batteries."""
+    rails: dict[str, list[Topic]] = {}
+    for topic in topics:
+        if quantity(topic.name) is not None and re.search(r"drive|motor|traction|batter", topic.name.lower()):
+            rails.setdefault(rail_of(topic.name), []).append(topic)
+    found: Ranked = []
+    for parts in rails.values():
+        corrected = {quantity(topic.name) for topic in parts if is_corrected(topic.name)}
+        used = [topic for topic in parts if is_corrected(topic.name) or quantity(topic.name) not in corrected]
+        if sorted(str(quantity(topic.name)) for topic in used) == ["current", "voltage"]:
+            found += [((2,), "", topic) for topic in used]
+            casting.left_out |= {topic.name: "its corrected form is taken" for topic in parts if topic not in used}
+    return found
+
+
+_SORTERS: dict[str, Callable[[Topic], Sorted]] = {
+    **dict.fromkeys(ROLE_TYPES["gnss"], _sort_gnss),
+    **dict.fromkeys(ROLE_TYPES["command"], _sort_command),
+    **dict.fromkeys(ROLE_TYPES["imu"], _sort_imu),
+    **dict.fromkeys(_MEASURED_TWISTS, _sort_odometry),
+    **dict.fromkeys(POWER_TYPES, _sort_power),
+}
+
+
+def _decide(casting: _Casting, role: str, candidates: Ranked) -> None:
+    if not candidates:
+        return
+    best = min(rank for rank, _, _ in candidates)
+    first = [(why, topic) for rank, why, topic in candidates if rank == best]
+    topics = [topic for _, topic in first]
+    names = tuple(topic.name for topic in topics)
+    if len(first) == 1:
+        others = [topic.name for rank, _, topic in candidates if rank != best]
+        better = f"it fits better than {', '.join(others)}" if others else f"the only {topics[0].type_name}"
+        why = first[0][0] or better
+    elif role == "power" and _are_sides(rails := _rails(topics)):
+        why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
+    else:
+        casting.ambiguous.append(f"role {role} is ambiguous, {len(first)} topics could play it: {_listing(topics)}")
+        casting.recipe_lines.append(_recipe_line(role, names))
+        casting.undecided.add(role)
+        return
+    casting.roles[role] = Role(role, names, topics[0].type_name, why)
+    for rank, _, topic in candidates:
+        if rank != best:
+            casting.left_out[topic.name] = f"{' + '.join(names)} fits {role} better"
+
+
+def _rails(topics: Iterable[Topic]) -> tuple[str, ...]:
+    """Return the rails' names: bare numbers share one, other topics are one each."""
+    return tuple(dict.fromkeys(rail_of(t.name) if t.type_name in FLOAT_TYPES else t.name for t in topics))
+
+
+def _are_sides(names: Sequence[str]) -> bool:
+    """Whether there is one name, or the names are equal but for words that name a side, each side once."""
+    if len(names) == 1:
+        return True
+    split = [re.split(r"([/_\-.]+)", name.lower()) for name in names]
+    bare = {tuple("" if word in _SIDES else word for word in words) for words in split}
+    sides = {tuple(word for word in words if word in _SIDES) for words in split}
+    return len(bare) == 1 and len(sides) == len(names) and () not in sides
+
+
+def _recipe_line(role: str, names: Sequence[str]) -> str:
+    others = "".join(f' or ["{name}"]' for name in names[1:])
+    summed = f", or several to be summed: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
+    return f'{role} = ["{names[0]}"]  #{others}{summed if role == "power" else ""}'
+
+
+def _questions(casting: _Casting) -> list[str]:
+    """Return what is ambiguous, and the recipe lines that would settle it."""
+    if not casting.ambiguous:
+        return []
+    how = ["settle it in the recipe (tcpipe.toml), for example:", "[read.topics]"]
+    return [*casting.ambiguous, *how, *casting.recipe_lines]
+
+
+def _without_motion(casting: _Casting, topics: Sequence[Topic]) -> list[str]:
+    if any(role in casting.roles or role in casting.undecided for role in MOTION_ROLES):
+        return []
+    lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
+    could = {name: why for name, why in casting.left_out.items() if _is_motion(topics, name)}
+    if could:
+        name = next(iter(could))
+        role = "gnss" if _type_of(topics, name) in ROLE_TYPES["gnss"] else "wheel_odometry"
+        reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:_LISTED])
+        lines.append(f'left out: {reasons}; to use one all the same: [read.topics] {role} = ["{name}"]')
+    return [*lines, f"the log holds {_listing(topics)}"]
+
+
+def _is_motion(topics: Sequence[Topic], name: str) -> bool:
+    return any(_type_of(topics, name) in ROLE_TYPES[role] for role in MOTION_ROLES)
+
+
+def _type_of(topics: Sequence[Topic], name: str) -> str:
+    return next(topic.type_name for topic in topics if topic.name == name)
+
+
+def _warnings(casting: _Casting) -> Iterable[str]:
+    there = casting.roles.keys() | casting.undecided
+    if "gnss" not in there:
+        yield "no topic plays gnss: the track lies in a local frame and cannot be placed on a map"
+    if "power" not in there:
+        yield "no topic plays power: there will be a track but no energy"
+
+
+def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[str, ...]:
+    names = [
+        topic.name
+        for topic in topics
+        if topic.type_name in TRANSFORMS
+        and topic.name not in ignored
+        and topic.problem is None
+        and topic.message_count != 0
+    ]
+    return tuple(sorted(names, key=lambda name: (not name.endswith("tf_static"), name)))
+
+
+_LISTED = 8
+
+
+def _listing(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
+    """Return topics as ``/name (type, n messages, rate)``, the longest lists cut; those of ``types`` only, where there are any."""
+    every = list(topics)
+    of_type = [topic for topic in every if types is not None and topic.type_name in types]
+    chosen = of_type or every
+    shown = ", ".join(_described(topic) for topic in chosen[:_LISTED])
+    more = f", and {len(chosen) - _LISTED} more" if len(chosen) > _LISTED else ""
+    return shown + more if chosen else "no topic at all"
+
+
+def _described(topic: Topic) -> str:
+    parts = [topic.type_name]
+    if topic.message_count is not None:
+        parts.append(f"{topic.message_count} messages")
+        if topic.start_ns is not None and topic.end_ns is not None and topic.end_ns > topic.start_ns:
+            parts.append(f"{(topic.message_count - 1) / (topic.end_ns - topic.start_ns) * 1e9:.3g} Hz")
+    return f"{topic.name} ({', '.join(parts)})"

@@ -1,0 +1,64 @@
+"""Where every metre of a track went: the stretches that are kept, and the reason of each interval that is not.
+
+The odometer is the horizontal length of the estimated track: Hermite arcs inside its pieces, straight lines across its holes. Each interval
+between two rows belongs to one entry, so the ledger's sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.geometry.polyline import polyline
+from tcpipe.motion.pieces import piece_spans, runs
+from tcpipe.tables.bits import DropReason
+
+
+def stretches(dropped_by: NDArray[np.uint32], piece: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return first and last row of every maximal run of kept rows inside one piece, shape (S, 2), two rows at least."""
+    kept = runs(dropped_by == 0, piece)
+    return kept[kept[:, 1] > kept[:, 0]]
+
+
+def interval_reason(dropped_by: NDArray[np.uint32], piece: NDArray[np.int64]) -> NDArray[np.uint32]:
+    """Return one reason for each interval between rows, shape (N - 1,); 0 inside a stretch.
+
+    A hole is a gap. Otherwise the reasons of both ends apply, and of several the first in the order of `DropReason`.
+    """
+    both = (dropped_by[:-1] | dropped_by[1:]).astype(np.int64)
+    lowest = both & -both
+    return np.where(piece[:-1] == piece[1:], lowest, int(DropReason.GAP)).astype(np.uint32)
+
+
+def interval_length_m(
+    stamp_ns: NDArray[np.int64],
+    position_m: NDArray[np.float64],
+    velocity_mps: NDArray[np.float64],
+    piece: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return the odometer's share of every interval between rows, [m], shape (N - 1,).
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,).
+    position_m, velocity_mps : [m], [m/s], shape (N, 3): east, north, up.
+    piece : shape (N,), numbers of the uninterrupted pieces.
+    """
+    step = np.diff(position_m, axis=0)
+    length: NDArray[np.float64] = np.hypot(step[:, 0], step[:, 1])
+    for first, last in piece_spans(piece):
+        rows = slice(first, last + 1)
+        length[first:last] = np.diff(polyline(stamp_ns[rows], position_m[rows], velocity_mps[rows]).length_m)
+    return length
+
+
+def interval_duration_s(stamp_ns: NDArray[np.int64], epoch: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+    """Return the duration of every interval between rows, [s], shape (N - 1,); 0 across a clock epoch, whose step is no time."""
+    return np.where(np.diff(epoch) == 0, np.diff(stamp_ns) * 1e-9, 0.0)
+
+
+def by_reason(reason: NDArray[np.uint32], amount: NDArray[np.float64]) -> dict[str, float]:
+    """Return the sum of an amount an interval (metres, seconds, joules) by reason's name, every `DropReason` present."""
+    return {str(bit.name).lower(): float(amount[reason == int(bit)].sum()) for bit in DropReason}

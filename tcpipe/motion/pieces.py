@@ -1,0 +1,143 @@
+"""Rows of a regular track in uninterrupted pieces: runs, durations, windows and slopes that never reach across a hole.
+
+A piece ends where the stamps make a step other than the track's period, or where a clock epoch begins (docs/explanation/rulings.md, Gaps).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class MotionRows:
+    """What tells how a robot moves: one value for each row of a regular track.
+
+    Attributes
+    ----------
+    velocity_mps : [m/s], shape (N,), fused forward velocity.
+    yaw_rate_radps : [rad/s], shape (N,).
+    wheel_velocity_mps : [m/s], shape (N,), forward velocity by the wheels; NaN where unknown.
+    commanded_mps : [m/s], shape (N,), commanded forward velocity; NaN where unknown.
+    piece : shape (N,), number of the row's uninterrupted piece (`piece_of_rows`).
+    period_s : [s], the track's period.
+    """
+
+    velocity_mps: Floats
+    yaw_rate_radps: Floats
+    wheel_velocity_mps: Floats
+    commanded_mps: Floats
+    piece: NDArray[np.int64]
+    period_s: float
+
+    def count(self, duration_s: float) -> int:
+        """Return a duration in rows, to the nearest."""
+        return round(duration_s / self.period_s)
+
+
+def piece_of_rows(
+    stamp_ns: NDArray[np.int64], epoch: NDArray[np.integer[Any]], *, period_ns: float
+) -> NDArray[np.int64]:
+    """Return for each row the number of its uninterrupted piece, 0 upward, shape (N,).
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,).
+    epoch : shape (N,), clock epoch.
+    period_ns : [ns], the track's period; a step that differs from it by half or more is a hole.
+    """
+    broken = (np.abs(np.diff(stamp_ns) - period_ns) >= 0.5 * period_ns) | (np.diff(epoch) != 0)
+    return np.concatenate((np.zeros(min(len(stamp_ns), 1), dtype=np.int64), np.cumsum(broken)))
+
+
+def runs(mask: Mask, piece: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return first and last row of every maximal run of true rows inside one piece, shape (R, 2)."""
+    joined = mask[:-1] & mask[1:] & (piece[:-1] == piece[1:])
+    edge = np.zeros(min(len(mask), 1), dtype=np.bool_)
+    first = np.flatnonzero(mask & ~np.concatenate((edge, joined)))
+    last = np.flatnonzero(mask & ~np.concatenate((joined, edge)))
+    return np.column_stack((first, last)).astype(np.int64)
+
+
+def mask_of(spans: NDArray[np.int64], size: int) -> Mask:
+    """Return the mask that is true on every span of rows (first, last), shape (size,)."""
+    edges = np.zeros(size + 1, dtype=np.int64)
+    np.add.at(edges, spans[:, 0], 1)
+    np.add.at(edges, spans[:, 1] + 1, -1)
+    covered: Mask = np.cumsum(edges)[:size] > 0
+    return covered
+
+
+def piece_spans(piece: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return first and last row of every piece, shape (P, 2)."""
+    return runs(np.ones(len(piece), dtype=np.bool_), piece)
+
+
+def piece_bounds(piece: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return for each row the first and the last row of its piece, both of shape (N,)."""
+    spans = piece_spans(piece)
+    return spans[piece, 0], spans[piece, 1]
+
+
+def lasting(mask: Mask, piece: NDArray[np.int64], *, min_rows: int) -> Mask:
+    """Return the mask without runs of fewer than ``min_rows`` rows."""
+    spans = runs(mask, piece)
+    return mask_of(spans[spans[:, 1] - spans[:, 0] + 1 >= min_rows], len(mask))
+
+
+def dilated(mask: Mask, piece: NDArray[np.int64], *, before: int, after: int) -> Mask:
+    """Return the mask with every run widened by ``before`` and ``after`` rows, inside its piece."""
+    spans = runs(mask, piece)
+    low, high = piece_bounds(piece)
+    spans[:, 0] = np.maximum(spans[:, 0] - before, low[spans[:, 0]])
+    spans[:, 1] = np.minimum(spans[:, 1] + after, high[spans[:, 1]])
+    return mask_of(spans, len(mask))
+
+
+def window_mean(
+    value: NDArray[np.float64], piece: NDArray[np.int64], *, before: int, after: int
+) -> NDArray[np.float64]:
+    """Return the mean over rows k - before … k + after, clipped to the piece, shape (N,).
+
+    ``before=10, after=-1`` is the ten rows ahead of k. NaN where the window is empty.
+    """
+    first, last = _window(piece, before, after)
+    total = np.concatenate(([0.0], np.cumsum(value)))
+    count = last - first + 1
+    mean = np.full(len(value), np.nan)
+    np.divide(total[last + 1] - total[first], count, out=mean, where=count > 0)
+    return mean
+
+
+def slope(
+    value: NDArray[np.float64], piece: NDArray[np.int64], *, half_window: int, period_s: float
+) -> NDArray[np.float64]:
+    """Return the least-squares slope over 2 half_window + 1 rows around each, one-sided at a piece's ends, per second, shape (N,).
+
+    This is the first derivative of Savitzky and Golay (1964) of order one or two; white noise s in the value gives
+    s / period_s / sqrt(n (n² - 1) / 12) in the slope of n rows. A piece of one row has slope 0.
+    """
+    first, last = _window(piece, half_window, half_window)
+    low, _ = piece_bounds(piece)
+    position = np.arange(len(value)) - low
+    level = value - value[low]
+    total, moment = (np.concatenate(([0.0], np.cumsum(x))) for x in (level, level * position))
+    n = last - first + 1
+    middle = 0.5 * (position[first] + position[last])
+    covariance = (moment[last + 1] - moment[first]) - middle * (total[last + 1] - total[first])
+    spread = n * (n.astype(np.float64) ** 2 - 1.0) / 12.0
+    result = np.zeros(len(value))
+    np.divide(covariance, spread * period_s, out=result, where=spread > 0)
+    return result
+
+
+def _window(piece: NDArray[np.int64], before: int, after: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    low, high = piece_bounds(piece)
+    row = np.arange(len(piece))
+    return np.maximum(row - before, low), np.minimum(row + after, high)

@@ -1,0 +1,78 @@
+"""Whether what is removed of a drive depends on the ground: metres in use by class or slope, and where the share stands out.
+
+A dataset whose mud metres are mostly dropped shows the easy mud. So the share in use of every group of metres is held against that of all
+of them. Neighbouring metres share their fate, so that a share is known no better than as many independent draws as there are stretches.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+_STRETCH_M = 5.0
+_FEWEST_M = 20.0
+_APART = 0.15
+_SURE = 2.5
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Metres of one class or range of slopes: driven, in use, and removed by reason (those of zero left out) [m]."""
+
+    name: str
+    driven_m: float
+    used_m: float
+    removed_m: Mapping[str, float]
+
+    @property
+    def used_share(self) -> float:
+        """Share in use, 0 of nothing."""
+        return self.used_m / self.driven_m if self.driven_m > 0 else 0.0
+
+
+def tally_m(
+    group: NDArray[np.int64], reason: NDArray[np.int64], length_m: NDArray[np.float64], *, shape: tuple[int, int]
+) -> NDArray[np.float64]:
+    """Return the metres of every group and reason, ``shape``; group, reason and length [m] of every piece of a drive, shape (N,)."""
+    cells = np.bincount(group * shape[1] + reason, weights=length_m, minlength=shape[0] * shape[1])
+    return cells.astype(np.float64).reshape(shape)
+
+
+def named_groups(tally: NDArray[np.float64], names: Sequence[str], reasons: Sequence[str]) -> tuple[Group, ...]:
+    """Return the groups that were driven at all, in order; ``tally`` is of `tally_m`, reason 0 is being in use."""
+    return tuple(
+        Group(
+            name,
+            float(row.sum()),
+            float(row[0]),
+            {reasons[i]: float(row[i]) for i in range(1, len(reasons)) if row[i] > 0},
+        )
+        for name, row in zip(names, tally, strict=True)
+        if row.sum() > 0
+    )
+
+
+def uneven(groups: Sequence[Group]) -> list[Group]:
+    """Return the groups whose share in use differs from that of all together by more than 0.15 and than chance would have it.
+
+    Groups below 20 m are too short to speak of. Chance: 2.5 standard deviations of a share over stretches of 5 m.
+    """
+    driven_m, used_m = sum(g.driven_m for g in groups), sum(g.used_m for g in groups)
+    found = []
+    for group in groups:
+        rest_m = driven_m - group.driven_m
+        if group.driven_m < _FEWEST_M or rest_m < _FEWEST_M:
+            continue
+        others = (used_m - group.used_m) / rest_m
+        variance = used_m / driven_m * (1 - used_m / driven_m) * _STRETCH_M * (1 / group.driven_m + 1 / rest_m)
+        if abs(group.used_share - others) > max(_APART, _SURE * float(np.sqrt(variance))):
+            found.append(group)
+    return found
+
+
+def main_reason(group: Group) -> str:
+    """Return the reason that removed most of a group, ``""`` where nothing was removed."""
+    return max(group.removed_m, key=lambda name: group.removed_m[name], default="")

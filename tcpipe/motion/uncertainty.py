@@ -1,0 +1,104 @@
+"""How far two estimated positions may be wrong *against each other*: what a cost per metre suffers from.
+
+The absolute error of an RTK or dead-reckoned position is nearly the same at both ends of a metre and cancels. How nearly a smoother
+knows exactly, and tells for some durations (`between_durations_m`). Elsewhere, as at the end of a track and in a forward filter, it follows
+from what a track states of every row.
+Over a short time the error of the displacement is that of the velocity, sigma_v T; over a long time it is that of two independent
+positions, hypot(sigma_1, sigma_2). A position error that is correlated in time like 1 / (1 + t² / (2 tau²)), with
+tau = sigma_position / sigma_velocity as both variances demand, gives in between::
+
+    1 / variance = 1 / (sigma_v T)² + 1 / (sigma_1² + sigma_2²)
+
+It is no less than the change of the position error itself, |sigma_2 - sigma_1| (triangle inequality); and in a forward filter a fix that
+shrinks the error moves the estimate, by sqrt(sigma_1² - sigma_2²).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tcpipe.motion.pieces import Floats, MotionRows, piece_bounds
+
+
+def displacement_std_m(
+    *, velocity_std_mps: Floats, duration_s: Floats, start_std_m: Floats, end_std_m: Floats, smoothed: bool
+) -> Floats:
+    """Return the standard deviation of the displacement between two estimated positions, [m], shape (M,).
+
+    Parameters
+    ----------
+    velocity_std_mps : [m/s], shape (M,), of the velocity along the displacement.
+    duration_s : [s], shape (M,).
+    start_std_m, end_std_m : [m], shape (M,), of either position along the displacement.
+    smoothed : whether the positions come from a fixed-interval smoother rather than a forward filter.
+    """
+    change = np.abs(end_std_m - start_std_m)
+    if not smoothed:
+        change = np.maximum(change, np.sqrt(np.maximum(start_std_m**2 - end_std_m**2, 0.0)))
+    short, long = velocity_std_mps * duration_s, np.hypot(start_std_m, end_std_m)
+    drift = np.divide(short * long, np.hypot(short, long), out=np.zeros_like(short), where=long > 0.0)
+    result: Floats = np.maximum(drift, change)
+    return result
+
+
+def between_durations_m(duration_s: Floats, *, told_s: Sequence[float], told_std_m: Floats) -> Floats:
+    """Return the displacement error over each duration from what is told for some, [m], shape (M,); NaN where that is not told.
+
+    Between two durations it is taken as a power of time, below the shortest as that of a constant velocity error.
+
+    Parameters
+    ----------
+    duration_s : [s], shape (M,), > 0.
+    told_s : [s], L durations, increasing.
+    told_std_m : [m], shape (M, L), > 0 or NaN.
+    """
+    known = np.array(told_s)
+    after = np.clip(np.searchsorted(known, duration_s), 1, len(known) - 1)
+    row = np.arange(len(duration_s))
+    low, high = told_std_m[row, after - 1], told_std_m[row, after]
+    share = np.log(duration_s / known[after - 1]) / np.log(known[after] / known[after - 1])
+    std_m: Floats = np.where(
+        duration_s < known[0], told_std_m[:, 0] * duration_s / known[0], low ** (1.0 - share) * high**share
+    )
+    return np.where(duration_s <= known[-1], std_m, np.nan)
+
+
+def along_std_m(east_std_m: Floats, north_std_m: Floats, course_rad: Floats) -> Floats:
+    """Return the position standard deviation along a course from those along east and north, [m], shape (M,).
+
+    The correlation of east and north is not in a track; it is taken as zero.
+    """
+    return np.hypot(east_std_m * np.cos(course_rad), north_std_m * np.sin(course_rad))
+
+
+def chord_ahead_std_m(
+    rows: MotionRows,
+    *,
+    velocity_std_mps: Floats,
+    position_std_m: Floats,
+    chord_m: float,
+    slowest_mps: float,
+    smoothed: bool,
+) -> Floats:
+    """Return for each row the displacement error over the next chord at the row's speed, [m], shape (N,).
+
+    Parameters
+    ----------
+    velocity_std_mps : [m/s], shape (N,), standard deviation of the forward velocity.
+    position_std_m : [m], shape (N,), of the position along the direction of travel.
+    chord_m : [m].
+    slowest_mps : [m/s], rows slower than this are taken as this fast.
+    """
+    _, high = piece_bounds(rows.piece)
+    duration_s = chord_m / np.maximum(np.abs(rows.velocity_mps), slowest_mps)
+    row = np.arange(len(duration_s))
+    end = np.minimum(row + np.ceil(duration_s / rows.period_s).astype(np.int64), high)
+    return displacement_std_m(
+        velocity_std_mps=velocity_std_mps,
+        duration_s=duration_s,
+        start_std_m=position_std_m,
+        end_std_m=position_std_m[end],
+        smoothed=smoothed,
+    )

@@ -1,0 +1,1 @@
+"""Cutting a driven path into segments of one chord each."""

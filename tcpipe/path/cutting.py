@@ -1,0 +1,79 @@
+"""Cutting a steady stretch of path into segments by chord (paper, section IV: straight-line distance d, path nearly as long).
+
+A segment ends where the path first is d away from the segment's start, and the next one starts at exactly that state. Where the path
+in between is too curved, the start moves on to the next sample of the track, until a segment from there is straight enough; the
+metres passed over are *curved*. Moving on by one sample rather than to the end of the rejected piece recovers the straight metres
+behind a bend. What remains at the end of a stretch, shorter than a chord, is *leftover*.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.geometry.polyline import Polyline
+
+
+@dataclass(frozen=True, slots=True)
+class Cut:
+    """The segments of one stretch, and what of it is in none.
+
+    Attributes
+    ----------
+    start_ns, end_ns : [ns], shape (M,), int64; in order, never overlapping.
+    curved_ns, leftover_ns : [ns], shape (C, 2) and (L, 2), int64: begin and end of every other piece; the three kinds tile the stretch.
+    """
+
+    start_ns: NDArray[np.int64]
+    end_ns: NDArray[np.int64]
+    curved_ns: NDArray[np.int64]
+    leftover_ns: NDArray[np.int64]
+
+    def ledger(self, path: Polyline) -> dict[str, tuple[float, float]]:
+        """Return horizontal metres and seconds of the three kinds by name; together they are the stretch's."""
+        spans = {
+            "kept": np.column_stack((self.start_ns, self.end_ns)),
+            "curved": self.curved_ns,
+            "leftover": self.leftover_ns,
+        }
+        return {
+            name: (float((path.length_at(ns[:, 1]) - path.length_at(ns[:, 0])).sum()), float(np.diff(ns).sum()) * 1e-9)
+            for name, ns in spans.items()
+        }
+
+
+def cut_by_chord(path: Polyline, *, chord_m: float, max_arc_to_chord: float) -> Cut:
+    """Return the segments of a stretch, from its first sample on.
+
+    Parameters
+    ----------
+    path : the stretch.
+    chord_m : [m], d.
+    max_arc_to_chord : [1], a piece whose horizontal arc is longer than this times ``chord_m`` is too curved.
+    """
+    kept: list[tuple[int, int]] = []
+    curved: list[tuple[int, int]] = []
+    start, last = int(path.stamp_ns[0]), int(path.stamp_ns[-1])
+    while start < last:
+        end = path.first_crossing_ns(start, radius_m=chord_m)
+        if end is None:
+            break
+        begin_m, end_m = path.length_at(np.array([start, end]))
+        if end_m - begin_m <= max_arc_to_chord * chord_m:
+            kept.append((start, end))
+            start = end
+            continue
+        following = int(path.stamp_ns[np.searchsorted(path.stamp_ns, start, side="right")])
+        if curved and curved[-1][1] == start:
+            curved[-1] = (curved[-1][0], following)
+        else:
+            curved.append((start, following))
+        start = following
+    spans = _spans(kept)
+    return Cut(spans[:, 0], spans[:, 1], _spans(curved), _spans([(start, last)] if start < last else []))
+
+
+def _spans(pairs: list[tuple[int, int]]) -> NDArray[np.int64]:
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)

@@ -1,0 +1,1 @@
+"""Plain calls that run the stages over files: ingest logs, add maps, build datasets."""

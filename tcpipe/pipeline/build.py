@@ -1,0 +1,275 @@
+"""From labelled segments and a map to a dataset: sample, split, audit, write; whole or not at all."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from tcpipe.errors import DatasetError, RecipeError
+from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.croissant import croissant
+from tcpipe.formats.dataset_files import (
+    CARD,
+    CROISSANT,
+    OVERVIEW,
+    REPORT,
+    SAMPLES,
+    FileFormat,
+    Pixels,
+    file_checksum,
+    file_checksums,
+    read_card,
+    read_samples,
+    write_patches_parquet,
+    write_patches_zarr,
+)
+from tcpipe.formats.geojson import read_regions
+from tcpipe.formats.json_files import plain, write_json
+from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
+from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+from tcpipe.formats.zarr_arrays import Compression
+from tcpipe.pipeline.dataset_card import CARD_COLUMNS, CardFacts, dataset_card, is_whole, map_to_json
+from tcpipe.pipeline.dataset_content import Content, gather_content
+from tcpipe.pipeline.dataset_inputs import Inputs, choose_inputs, earlier_splits
+from tcpipe.pipeline.dataset_segments import KEPT
+from tcpipe.pipeline.dataset_splitting import regions_to_json
+from tcpipe.recipe import Recipe
+from tcpipe.report.dataset_report import dataset_report
+from tcpipe.report.overview import map_overview, write_overview
+from tcpipe.splits.assignment import SPLITS
+from tcpipe.splits.audit import HeldOut, audit_lines
+from tcpipe.splits.holdouts import Holdout
+from tcpipe.splits.regions import Regions
+from tcpipe.store import open_store
+from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
+
+logger = logging.getLogger("tcpipe")
+
+
+@dataclass(frozen=True, slots=True)
+class BuildResult:
+    """What became of a dataset; ``str`` of it is what the command prints."""
+
+    path: Path
+    status: str
+    """``done`` or ``unchanged``."""
+    samples: int
+    splits: Mapping[str, int]
+    ledger_m: Mapping[str, float]
+    audit: tuple[HeldOut, ...]
+    warnings: tuple[str, ...]
+
+    def __str__(self) -> str:
+        """Return counts, the audit and where the metres went, as plain lines."""
+        counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
+        head = f"{self.path}: {self.samples} samples ({counts})"
+        if self.status == "unchanged":
+            head += "; nothing to do: it is made from the same runs, map, region and recipe"
+        lost = [(name, metres) for name, metres in self.ledger_m.items() if metres >= 0.5 and name != KEPT]
+        lost.sort(key=lambda entry: (-entry[1], entry[0]))
+        ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
+        ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
+        return "\n".join((head, *audit_lines(self.audit), ledger, *(f"warning: {text}" for text in self.warnings)))
+
+
+def build_dataset(
+    out: str | Path = "dataset",
+    *,
+    store: str | Path = "tcpipe-store",
+    split: str | Path | None = None,
+    map_name: str | Sequence[str] | None = None,
+    robot: str | None = None,
+    recipe: Recipe | str | Path | None = None,
+    jobs: int = 1,
+    file_format: FileFormat = "zarr",
+    holdout: Holdout | None = None,
+    seed: int | None = None,
+    keep_split: str | Path | None = None,
+) -> BuildResult:
+    """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
+
+    Parameters
+    ----------
+    out
+        Directory of the dataset: new, empty, or a dataset, which is replaced unless it is made from the same inputs.
+    store
+        Where runs and maps are kept.
+    split
+        GeoJSON region (WGS84): inside is train and test, outside is unseen. None: everything is train and test.
+    map_name
+        Map to sample, or several, the first ruling where they overlap; None takes the only one in the store.
+    robot
+        Only runs of this robot; needed where the store holds several.
+    recipe
+        A `Recipe`, a path to one, or None for the one that rules here.
+    jobs
+        Processes that sample side by side; the bytes do not depend on it.
+    file_format
+        ``zarr`` or ``parquet``.
+    holdout, seed
+        Instead of the recipe's.
+    keep_split
+        An earlier dataset, which may be ``out`` itself: its samples keep their split and fold, only new ones are drawn.
+
+    Raises
+    ------
+    DatasetError, RegionError, MapError, StoreError, RecipeError
+        Nothing is written then.
+
+    """
+    ruling = _ruling(recipe, holdout=holdout, seed=seed)
+    place, house = Path(out), open_store(store)
+    known = _card_in_place(place)
+    regions = None if split is None else read_regions(Path(split))
+    region = None if split is None else Path(split).read_bytes()
+    robot = robot or ruling.robot
+    earlier = None if keep_split is None else earlier_splits(Path(keep_split))
+    inputs = choose_inputs(
+        house,
+        ruling,
+        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
+        robot=robot,
+        region=region,
+        file_format=file_format,
+        earlier=earlier,
+    )
+    if known is not None and known.get("inputs") == inputs.digest and is_whole(place, known):
+        return _result(place, "unchanged", known)
+    try:
+        with atomic_directory(place.absolute()) as directory:
+            card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
+    except OSError as error:
+        raise DatasetError(f"{place}: the dataset cannot be written ({error.strerror or error})") from None
+    return _result(place, "done", card)
+
+
+def _result(place: Path, status: str, card: Mapping[str, Any]) -> BuildResult:
+    return BuildResult(
+        path=place,
+        status=status,
+        samples=card["samples"],
+        splits={name: card["splits"][name] for name in SPLITS},
+        ledger_m=card["ledger_m"],
+        audit=tuple(HeldOut(**part) for part in card["split"]["audit"]),
+        warnings=tuple(card["warnings"]),
+    )
+
+
+def _ruling(recipe: Recipe | str | Path | None, *, holdout: Holdout | None, seed: int | None) -> Recipe:
+    """Return the recipe with the command's own choices in it."""
+    if not isinstance(recipe, Recipe):
+        recipe = load_recipe(find_recipe(None if recipe is None else Path(recipe), Path.cwd()))
+    rules = replace(
+        recipe.split,
+        holdout=recipe.split.holdout if holdout is None else holdout,
+        seed=recipe.split.seed if seed is None else seed,
+    )
+    problems = []
+    if not 0.0 <= rules.test_fraction < 1.0:
+        problems.append(f"split.test_fraction is {rules.test_fraction:g}; wanted from 0 to below 1")
+    if not rules.block_m > 0.0:
+        problems.append(f"split.block_m is {rules.block_m:g}; wanted above 0 m")
+    if rules.buffer_m is not None and not rules.buffer_m >= 0.0:
+        problems.append(f"split.buffer_m is {rules.buffer_m:g}; wanted 0 m or more")
+    if problems:
+        raise RecipeError(*problems)
+    return replace(recipe, split=rules)
+
+
+def _card_in_place(place: Path) -> Mapping[str, Any] | None:
+    """Return the card of the dataset that is there, None if nothing is; `DatasetError` if it is something else."""
+    if not place.exists() or (place.is_dir() and not any(place.iterdir())):
+        return None
+    if not place.is_dir():
+        raise DatasetError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
+    if not (place / CARD).is_file():
+        raise DatasetError(f"{place}: exists and is no dataset (it has no {CARD}); it is left alone; give another OUT")
+    card = read_card(place)
+    ours = {*card.get("checksums", {}), CARD, CROISSANT, REPORT}
+    others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise DatasetError(f"{place}: holds {others[0]}{more} beside the dataset; move it away or give another OUT")
+    return card
+
+
+def _build(
+    directory: Path,
+    inputs: Inputs,
+    recipe: Recipe,
+    regions: Regions | None,
+    earlier: pa.Table | None,
+    *,
+    file_format: FileFormat,
+    jobs: int,
+) -> dict[str, Any]:
+    """Write the dataset into ``directory`` and return its card."""
+    spool = directory / "spool"
+    spool.mkdir()
+    content = gather_content(spool, inputs, recipe, regions, earlier, jobs=jobs)
+    logger.info("writing %d samples", len(content.samples))
+    with parquet_rows(directory / SAMPLES, SAMPLES_SCHEMA.arrow()) as write:
+        for piece in content.samples.pieces(ROWS_PER_GROUP):
+            write(piece)
+    shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
+    shutil.rmtree(spool)
+    write_overview(directory / OVERVIEW, map_overview(content.sources[0]))
+    files = file_checksums(directory)
+    write_json(directory / CROISSANT, _croissant(files, recipe))
+    facts = CardFacts(
+        inputs=inputs.digest,
+        file_format=file_format,
+        layers=content.layers,
+        classes=content.sources[0].classes,
+        region=None if regions is None else regions_to_json(regions),
+        buffer_m=content.drawn.buffer_m,
+        audit=content.drawn.audit,
+        kept=content.drawn.kept,
+        runs=inputs.sources,
+        maps=[
+            {**map_to_json(source), "sha256": sha256, "registration": registration}
+            for source, sha256, registration in zip(
+                content.sources, inputs.map_sha256, content.registrations, strict=True
+            )
+        ],
+        ledger_m=content.ledger_m,
+        removal=content.removal.to_json(),
+        warnings=content.warnings,
+        shards=shards,
+        checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},
+    )
+    card = plain(dataset_card(read_samples(directory, CARD_COLUMNS), recipe, facts))
+    write_json(directory / CARD, card)
+    write_text(directory / REPORT, dataset_report(directory))
+    return dict(card)
+
+
+def _write_patches(
+    directory: Path, content: Content, file_format: FileFormat, *, compression: Compression, threads: int
+) -> list[dict[str, Any]]:
+    """Write the layers; return the shards, where the format has any."""
+    samples, spool = content.samples, content.spool
+    pixels = Pixels(content.layers, spool.patch_px, samples.slots(), spool.read)
+    if file_format == "parquet":
+        return write_patches_parquet(directory, pixels, samples.take, samples.splits())
+    write_patches_zarr(directory, pixels, samples.ids, compression=compression, threads=threads)
+    return []
+
+
+def _croissant(files: Mapping[str, tuple[int, str]], recipe: Recipe) -> dict[str, Any]:
+    about = recipe.dataset
+    return croissant(
+        name=about.name,
+        description=about.description,
+        licence=about.licence,
+        creator=about.creator,
+        files=files,
+        samples_file=SAMPLES,
+        samples=SAMPLES_SCHEMA.arrow(),
+    )

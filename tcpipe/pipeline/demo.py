@@ -1,0 +1,83 @@
+"""The demo: a simulated site through the whole pipeline, as a user would run it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcpipe.errors import DatasetError, UsageError
+from tcpipe.pipeline.build import BuildResult, build_dataset
+from tcpipe.pipeline.ingest import IngestSummary, ingest
+from tcpipe.pipeline.maps import add_map
+from tcpipe.pipeline.report import report
+from tcpipe.recipe import Recipe
+from tcpipe.simulation import simulate
+
+
+@dataclass(frozen=True, slots=True)
+class DemoResult:
+    """Where everything is; ``str`` of it is what the command prints."""
+
+    directory: Path
+    ingested: IngestSummary
+    built: BuildResult
+    pages: tuple[Path, ...]
+    unchanged: bool
+
+    def __str__(self) -> str:
+        """Return where everything is and what to open."""
+        here = self.directory
+        return "\n".join(
+            (
+                "",
+                f"simulated site   {here}/site          real logs, GeoTIFFs, region.geojson, and the truth behind them",
+                f"store            {here}/store         {len(self.ingested.results)} runs, 1 map",
+                f"dataset          {here}/dataset       {self.built.samples} samples: "
+                + ", ".join(f"{count} {split}" for split, count in self.built.splits.items()),
+                "",
+                f"open             {self.pages[0]}",
+                *(f"                 {page}" for page in self.pages[1:]),
+                "",
+                "train on it      import tcpipe",
+                f'                 train = tcpipe.open_dataset("{here}/dataset")["train"]',
+                "                 train.patches  # float32 (N, 40, 40, 3): ortho, terrain, height",
+                "                 train.labels   # (N, 2): power [W], velocity [m/s]",
+                *(("", "nothing to do: all of it was there already") if self.unchanged else ()),
+            )
+        )
+
+
+def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoResult:
+    """Simulate, ingest, add the map, build the dataset and write the reports under ``directory``.
+
+    Raises
+    ------
+    UsageError
+        When the directory holds something else.
+    DatasetError
+        When a step fails (which would be a bug).
+
+    """
+    site_path, store_path, dataset_path = directory / "site", directory / "store", directory / "dataset"
+    if directory.exists() and not directory.is_dir():
+        raise UsageError(f"{directory}: is a file, wanted a directory for the demo")
+    if directory.exists() and any(directory.iterdir()) and not site_path.exists():
+        raise UsageError(f"{directory}: exists and is no demo; give another directory")
+    say("simulating a site and two drives")
+    site = simulate(site_path, scenario="demo", seed=seed)
+    for path in site.logs:
+        say(f"$ tcpipe ingest {path}")
+    ingested = ingest(site.logs, store=store_path, recipe=Recipe())
+    if ingested.exit_code:
+        raise DatasetError(*(problem for result in ingested.results for problem in result.problems))
+    height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
+    say(f"$ tcpipe add-map site --height {height} --ortho {ortho} --terrain {terrain} --classes {classes}")
+    added = add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store_path)
+    say(f"$ tcpipe build-dataset {dataset_path} --split {site.region}")
+    built = build_dataset(dataset_path, store=store_path, split=site.region, recipe=Recipe())
+    say(f"$ tcpipe report {dataset_path}")
+    pages = (*report(dataset_path), *report(store_path))
+    statuses = {added.status, built.status, *(result.status for result in ingested.results)}
+    unchanged = statuses == {"unchanged"} and not any(page.changed for page in pages)
+    return DemoResult(directory, ingested, built, tuple(page.path for page in pages), unchanged)

@@ -1,0 +1,219 @@
+"""What changed between two datasets, and by which cause: code, recipe keys, logs, maps, region; with the shift of the labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
+from tcpipe.formats.json_files import plain
+from tcpipe.pipeline.explain import flat_recipe
+from tcpipe.splits.assignment import SPLITS
+
+_LABELS = ("power_watt", "velocity_mps", "duration_s", "energy_joule")
+_VERSIONS = ("tcpipe_version", "data_model_version")
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """Two datasets held against each other; ``str`` of it is what the command prints."""
+
+    a: Path
+    b: Path
+    causes: tuple[str, ...]
+    """What the two are made from differently."""
+    samples: Mapping[str, int]
+    """Samples only in one, in both, and of these how many have other labels or patches."""
+    moved: Mapping[str, int]
+    """Samples of both by the splits that they moved between, ``train to test`` …."""
+    labels: Mapping[str, Mapping[str, float]]
+    """For every label: means, deviations and the largest gap between the two distribution functions, over all samples."""
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing differs."""
+        return not (self.causes or self.moved or any(self.samples[name] for name in _CHANGES))
+
+    def __str__(self) -> str:
+        """Return causes and effects as plain lines."""
+        return "\n".join(_lines(self))
+
+
+_CHANGES = ("only in a", "only in b", "other labels", "other patches")
+
+
+def diff(a: str | Path, b: str | Path) -> Difference:
+    """Compare two datasets; `DatasetError` if either is none.
+
+    Parameters
+    ----------
+    a, b
+        Their directories, the older one first.
+
+    """
+    first, second = Path(a), Path(b)
+    cards = read_card(first), read_card(second)
+    tables = _columns(first), _columns(second)
+    at = pc.index_in(tables[0].column("sample_id"), value_set=tables[1].column("sample_id").combine_chunks())
+    row = at.to_numpy(zero_copy_only=False)  # of b for each of a, NaN where it is not there
+    in_a = np.flatnonzero(np.isfinite(row))
+    in_b = row[in_a].astype(np.int64)
+    counts = {
+        "only in a": tables[0].num_rows - len(in_a),
+        "only in b": tables[1].num_rows - len(in_a),
+        "in both": len(in_a),
+        "other labels": int(_other_labels(*tables, in_a, in_b).sum()),
+        "other patches": _other_patches((first, second), cards, tables, in_a, in_b),
+    }
+    moved = _moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
+    shifts = {name: _shift(*(_values(table, name) for table in tables)) for name in _LABELS}
+    return Difference(first, second, tuple(_causes(*cards)), counts, moved, plain(shifts))
+
+
+def _columns(directory: Path) -> pa.Table:
+    there = sample_columns(directory)
+    return read_samples(directory, [name for name in ("sample_id", "split", *_LABELS) if name in there])
+
+
+def _values(table: pa.Table, name: str) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = table.column(name).to_numpy().astype(np.float64)
+    return values
+
+
+def _other_labels(a: pa.Table, b: pa.Table, in_a: Ints, in_b: Ints) -> NDArray[np.bool_]:
+    pairs = [(_values(a, name)[in_a], _values(b, name)[in_b]) for name in _LABELS]
+    other: NDArray[np.bool_] = np.any([ours != theirs for ours, theirs in pairs], axis=0)
+    return other
+
+
+def _other_patches(
+    directories: tuple[Path, Path],
+    cards: tuple[Mapping[str, Any], Mapping[str, Any]],
+    tables: tuple[pa.Table, pa.Table],
+    in_a: Ints,
+    in_b: Ints,
+) -> int:
+    """Return how many samples of both have other pixels; all of them where layers or size differ."""
+    if set(cards[0]["layers"]) != set(cards[1]["layers"]) or cards[0]["patch_px"] != cards[1]["patch_px"]:
+        return len(in_a)
+    ours, theirs = (
+        _hashes(directory, card, table) for directory, card, table in zip(directories, cards, tables, strict=True)
+    )
+    return int((ours[in_a] != theirs[in_b]).sum())
+
+
+def _hashes(directory: Path, card: Mapping[str, Any], table: pa.Table) -> NDArray[np.int64]:
+    """Return a hash of every patch, in the order of the samples: equal pixels, equal hashes."""
+    files = open_patches(directory, card)
+    split = table.column("split").to_numpy()
+    found = np.empty(table.num_rows, np.int64)
+    for piece in range(len(files.starts) - 1):
+        pixels = files.read(piece, files.layers)
+        count = len(next(iter(pixels.values())))
+        flat = [np.ascontiguousarray(layer).reshape(count, -1).view(np.uint8) for layer in pixels.values()]
+        found[files.starts[piece] : files.starts[piece + 1]] = [
+            hash(b"".join(part.tobytes() for part in parts)) for parts in zip(*flat, strict=True)
+        ]
+    out = np.empty_like(found)
+    for name, rows in rows_in_files(card, split).items():
+        out[split == name] = found[rows]
+    return out
+
+
+def _moved(ours: NDArray[Any], theirs: NDArray[Any]) -> dict[str, int]:
+    moves = {f"{a} to {b}": int(((ours == a) & (theirs == b)).sum()) for a in SPLITS for b in SPLITS if a != b}
+    return {name: count for name, count in moves.items() if count}
+
+
+def _shift(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> dict[str, float]:
+    """Return mean and deviation of both, and the Kolmogorov-Smirnov distance between them."""
+    if not len(ours) or not len(theirs):
+        return {}
+    every = np.sort(np.concatenate([ours, theirs]))
+    below = [np.searchsorted(np.sort(values), every, side="right") / len(values) for values in (ours, theirs)]
+    return {
+        "mean_a": float(ours.mean()),
+        "mean_b": float(theirs.mean()),
+        "std_a": float(ours.std()),
+        "std_b": float(theirs.std()),
+        "largest_gap": float(np.abs(below[0] - below[1]).max()),
+    }
+
+
+def _causes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for everything that the two are made from differently."""
+    for name in _VERSIONS:
+        if a[name] != b[name]:
+            yield f"code: {name} {a[name]} → {b[name]}"
+    ours, theirs = flat_recipe(a["recipe"]), flat_recipe(b["recipe"])
+    for key in sorted({*ours, *theirs}):
+        if ours.get(key) != theirs.get(key):
+            yield f"recipe: {key} {_shown(ours.get(key))} → {_shown(theirs.get(key))}"
+    yield from _run_causes({run["run_id"]: run for run in a["runs"]}, {run["run_id"]: run for run in b["runs"]})
+    yield from _map_causes({m["name"]: m for m in a["maps"]}, {m["name"]: m for m in b["maps"]})
+    if a["split"]["region"] != b["split"]["region"]:
+        was, now = (card["split"]["region"] for card in (a, b))
+        yield "region: " + ("added" if was is None else "removed" if now is None else "another one")
+    if a["split"].get("kept") != b["split"].get("kept"):
+        yield f"kept split: {_shown(a['split'].get('kept'))} → {_shown(b['split'].get('kept'))}"
+    if a["format"] != b["format"]:
+        yield f"format: {a['format']} → {b['format']}"
+
+
+def _run_causes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+    for run_id in sorted({*a, *b}):
+        if run_id not in a or run_id not in b:
+            which, run = ("added", b[run_id]) if run_id not in a else ("removed", a[run_id])
+            yield f"log: {which} {', '.join(run['logs'])} (run {run_id}, {run['samples']} samples)"
+        elif a[run_id].get("segments_sha256") != b[run_id].get("segments_sha256"):
+            was, now = a[run_id]["recipe_id"], b[run_id]["recipe_id"]
+            why = f"ingested with recipe {was} → {now}" if was != now else "the same log and recipe, ingested anew"
+            yield f"log: run {run_id} has other segments: {why}"
+
+
+def _map_causes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+    for name in sorted({*a, *b}):
+        if name not in a or name not in b:
+            yield f"map: {'added' if name not in a else 'removed'} {name}"
+        elif a[name].get("sha256") != b[name].get("sha256"):
+            yield f"map: {name} is another one: {', '.join(_map_changes(a[name], b[name])) or 'its files were made anew'}"
+
+
+def _map_changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+    for key in ("crs", "pitch_m", "rows", "cols", "sources"):
+        if a.get(key) != b.get(key):
+            yield f"{key} {_shown(a.get(key))} → {_shown(b.get(key))}"
+    files = [(entry.get("inputs") or {}).get("files") or {} for entry in (a, b)]
+    yield from (
+        f"another {role} file" for role in sorted({*files[0], *files[1]}) if files[0].get(role) != files[1].get(role)
+    )
+
+
+def _shown(value: Any) -> str:
+    return "none" if value is None else str(value)
+
+
+def _lines(found: Difference) -> Iterator[str]:
+    if found.same:
+        yield f"{found.a} and {found.b}: the same {found.samples['in both']} samples, made from the same"
+        return
+    yield f"{found.a} → {found.b}"
+    yield from found.causes or ("no cause on record: same code, recipe, logs, maps and region",)
+    yield "samples: " + ", ".join(f"{count} {name}" for name, count in found.samples.items())
+    if found.moved:
+        yield "splits: " + ", ".join(f"{count} from {name}" for name, count in found.moved.items())
+    for name, shift in found.labels.items():
+        if shift and shift["largest_gap"] > 0.0:
+            yield (
+                f"{name}: mean {shift['mean_a']:.4g} → {shift['mean_b']:.4g}, deviation {shift['std_a']:.4g} → "
+                f"{shift['std_b']:.4g}, distributions up to {shift['largest_gap']:.1%} apart"
+            )

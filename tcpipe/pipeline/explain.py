@@ -1,0 +1,336 @@
+"""Where a sample came from, down to log, stamps and message ranges; and whether it comes out the same when it is made again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tcpipe import __version__
+from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files
+from tcpipe.formats.json_files import plain
+from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.recipe_toml import parse_recipe, read_key
+from tcpipe.pipeline.ingest import run_stages
+from tcpipe.recipe import Recipe
+from tcpipe.stages.sample import sample_segments
+from tcpipe.store import RunDirectory, Store, open_store
+from tcpipe.tables.bits import DropReason, Quality
+from tcpipe.tables.columns import integers
+from tcpipe.tables.levels import LABELLED_SEGMENTS, Streams
+
+_NEARBY_NS = 5_000_000_000
+"""Gates and refusals this long before and after a segment are told [ns]."""
+
+_PATCH_COLUMNS = (
+    "terrain_class",
+    "terrain_purity",
+    "slope_rad",
+    "cross_slope_rad",
+    "valid_fraction",
+    "height_min_m",
+    "height_clipped_fraction",
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """A sample's whole history as JSON values, and what differs when it is made again; ``str`` of it is what the command prints."""
+
+    sample_id: str
+    facts: Mapping[str, Any]
+    differences: tuple[str, ...]
+    """Empty: the sample was made again bit for bit."""
+
+    def __str__(self) -> str:
+        """Return the history as plain lines."""
+        return "\n".join(_lines(self.sample_id, self.facts, self.differences))
+
+
+def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
+    """Tell where a sample of a dataset came from, and make it again from the store.
+
+    Parameters
+    ----------
+    sample_id
+        Its id.
+    dataset
+        The dataset's directory.
+    store
+        The store it was built from.
+
+    Raises
+    ------
+    DatasetError, StoreError
+        There is no such dataset, sample or store, or the store no longer holds the sample's run.
+
+    """
+    directory, house = Path(dataset), open_store(store)
+    card, sample = read_card(directory), _sample(directory, sample_id)
+    recipe = parse_recipe(card["recipe"], where=str(directory / "dataset.json"))
+    run = _run(house, directory, card, sample)
+    read_with = read_key(recipe, run.manifest["robot_requested"])
+    streams = house.read_streams(run.run_id, key=f"{read_with}-{run.manifest['tcpipe_version']}")
+    source = open_map(house.map_path(sample["map"]))
+    window = sample["start_ns"], sample["end_ns"]
+    made = _made_again(sample, run, streams, source, recipe)
+    differences = tuple(_differences(directory, card, sample, made))
+    facts = {
+        "sample": sample,
+        "labels": {name: sample[name] for name in _LABELS},
+        "quality": [str(bit.name).lower() for bit in Quality if sample["quality"] & bit],
+        "log": _log(house, run),
+        "messages": {} if streams is None else dict(_messages(streams, *window)),
+        "gates": list(_gates(run, *window)),
+        "refused": list(_refused(run, *window)),
+        "map": _map(source, sample, recipe),
+        "recipe_id": run.recipe_id,
+        "recipe_differs_in": _changed_keys(recipe),
+        "versions": {
+            "dataset": card["tcpipe_version"],
+            "run": run.manifest["tcpipe_version"],
+            "here": __version__,
+            "data_model": card["data_model_version"],
+        },
+        "made_from": "segments" if streams is None else "streams",
+    }
+    return Explained(sample_id, plain(facts), differences)
+
+
+_LABELS = tuple(
+    f"{name}{end}"
+    for name, unit in (("power", "_watt"), ("velocity", "_mps"), ("duration", "_s"), ("energy", "_joule"))
+    for end in (unit, f"_std{unit}")
+)
+
+
+def _sample(directory: Path, sample_id: str) -> dict[str, Any]:
+    """Return a sample's row, and under ``row`` where it stands."""
+    ids = read_samples(directory, ["sample_id"]).column("sample_id")
+    row = pc.index(ids, sample_id).as_py()
+    if row < 0:
+        near = [name for name in ids.to_pylist() if sample_id and sample_id in name][:3]
+        hint = (
+            f"; did you mean {', '.join(near)}?" if near else f"; an id of it is {ids[0].as_py()}" if len(ids) else ""
+        )
+        raise DatasetError(f"{directory}: no sample {sample_id!r}{hint}")
+    found: dict[str, Any] = read_samples(directory).slice(row, 1).to_pylist()[0]
+    return {**found, "row": row}
+
+
+def _run(store: Store, directory: Path, card: Mapping[str, Any], sample: Mapping[str, Any]) -> RunDirectory:
+    recipe_id = next(run["recipe_id"] for run in card["runs"] if run["run_id"] == sample["run_id"])
+    for run in store.recipes_of(sample["run_id"]):
+        if run.recipe_id == recipe_id:
+            return run
+    raise DatasetError(
+        f"{store.root}: run {sample['run_id']} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
+        "name the store it was built from with --store"
+    )
+
+
+def _log(store: Store, run: RunDirectory) -> dict[str, Any]:
+    known = store.run_json(run.run_id) or {}
+    return {
+        "run_id": run.run_id,
+        "robot": run.robot,
+        "paths": known.get("source", {}).get("paths", []),
+        "sha256": known.get("source", {}).get("sha256"),
+        "damage": known.get("damage", []),
+        "tags": dict(run.manifest.get("tags", {})),
+    }
+
+
+def _messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield, for every role, its topic and which of its messages lie in the segment."""
+    for role, table in streams.tables.items():
+        stamps = integers(table, "stamp_ns")
+        first, last = np.searchsorted(stamps, [start_ns, end_ns], side="left")
+        inside = stamps[first:last]
+        sensor = streams.sensors[role]
+        yield (
+            role,
+            {
+                "topic": sensor.topic,
+                "type": sensor.type_name,
+                "time": sensor.time_source,
+                "placed_by": sensor.placed_by,
+                "first": int(first),
+                "last": int(last) - 1,
+                "of": len(stamps),
+                "first_ns": int(inside[0]) if len(inside) else None,
+                "last_ns": int(inside[-1]) if len(inside) else None,
+            },
+        )
+
+
+def _gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[dict[str, Any]]:
+    """Yield each stretch of dropped track near the segment: why, and when, from its start and end [s]."""
+    table = run.track().table
+    stamps, bits = integers(table, "stamp_ns"), integers(table, "dropped_by")
+    near = slice(*np.searchsorted(stamps, [start_ns - _NEARBY_NS, end_ns + _NEARBY_NS]))
+    stamps, bits = stamps[near], bits[near]
+    for part in np.split(np.arange(len(bits)), np.flatnonzero(np.diff(bits)) + 1):
+        if len(part) and bits[part[0]]:
+            names = [str(reason.name).lower() for reason in DropReason if int(bits[part[0]]) & reason]
+            before = stamps[part[0]] < start_ns
+            offset_ns = start_ns - stamps[part[-1]] if before else stamps[part[0]] - end_ns
+            yield {
+                "why": names,
+                "where": "before" if before else "after",
+                "apart_s": float(offset_ns) / 1e9,
+                "rows": len(part),
+            }
+
+
+def _refused(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[dict[str, Any]]:
+    """Yield how many measurements near the segment the filter refused, by role and reason."""
+    table = run.rejections()
+    stamps = integers(table, "stamp_ns")
+    near = (stamps >= start_ns - _NEARBY_NS) & (stamps <= end_ns + _NEARBY_NS)
+    pairs: dict[tuple[str, str], int] = {}
+    for row in table.filter(pa.array(near)).select(["role", "reason"]).to_pylist():
+        key = row["role"], row["reason"]
+        pairs[key] = pairs.get(key, 0) + 1
+    yield from ({"role": role, "reason": reason, "count": count} for (role, reason), count in sorted(pairs.items()))
+
+
+def _map(source: MapFile, sample: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
+    """Return which map, made from what, and the tiles of it that the patch touches."""
+    corners = _sampled(sample, source, recipe).footprint_xy_m.reshape(-1, 2)
+    px = source.grid.px_from_xy(corners)
+    low, high = (np.floor(end / source.tile_px).astype(int) for end in (px.min(axis=0), px.max(axis=0)))
+    return {
+        "name": source.name,
+        "crs": source.grid.crs,
+        "sources": source.facts["sources"],
+        "inputs": source.facts.get("inputs", {}),
+        "corners_xy_m": corners.tolist(),
+        "tiles_col_row": [[col, row] for row in range(low[1], high[1] + 1) for col in range(low[0], high[0] + 1)],
+        "tile_px": source.tile_px,
+    }
+
+
+def _sampled(segment: Mapping[str, Any], source: MapFile, recipe: Recipe) -> Any:
+    """Sample one segment, given as a row of values."""
+    row = {column.name: pa.array([segment[column.name]], column.dtype) for column in LABELLED_SEGMENTS.columns}
+    table = pa.Table.from_arrays(list(row.values()), schema=LABELLED_SEGMENTS.arrow())
+    return sample_segments(table, source, recipe.sample, gnss_crs=recipe.read.gnss_crs)
+
+
+def _made_again(
+    sample: Mapping[str, Any], run: RunDirectory, streams: Streams | None, source: MapFile, recipe: Recipe
+) -> Mapping[str, Any] | str:
+    """Return the segment and its patch as they come out now, or why they do not.
+
+    From the streams where the store has them: fused, gated, cut and labelled anew; else from the stored segments.
+    """
+    if streams is None:
+        segments = run.segments()
+    else:
+        try:
+            segments = run_stages(streams, recipe, run_id=run.run_id, name=run.run_id)[2].table
+        except TcpipeError as error:
+            return "; ".join(error.problems)
+    row = pc.index(segments.column("segment_id"), sample["sample_id"]).as_py()
+    if row < 0:
+        return f"no segment of run {run.run_id} begins at this stamp any more"
+    segment = segments.slice(row, 1).to_pylist()[0]
+    sampled = _sampled(segment, source, recipe)
+    if len(sampled.kept) == 0:
+        return f"map {source.name} gives no patch for it any more"
+    return {"segment": segment, "patches": sampled.patches}
+
+
+def _differences(
+    directory: Path, card: Mapping[str, Any], sample: Mapping[str, Any], made: Mapping[str, Any] | str
+) -> Iterator[str]:
+    """Yield a line for each value and each layer that is not, bit for bit, what the dataset holds."""
+    if isinstance(made, str):
+        yield made
+        return
+    for name, value in made["segment"].items():
+        if name in sample and sample[name] != value:
+            yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
+    patches = made["patches"]
+    for name in _PATCH_COLUMNS:
+        values = getattr(patches, name)
+        if sample[name] is not None and values[0] != sample[name]:
+            yield f"{name}: {values[0]!r} now, {sample[name]!r} in the dataset"
+    for layer, stored in _stored(directory, card, sample["row"]).items():
+        new = getattr(patches, layer)[0]
+        if not np.array_equal(new, stored):
+            yield f"{layer}: {int((new != stored).sum())} of {stored.size} pixels differ"
+
+
+def _stored(directory: Path, card: Mapping[str, Any], row: int) -> dict[str, NDArray[Any]]:
+    """Return the stored layers of the sample in a row of samples.parquet, each of shape (px, px)."""
+    files = open_patches(directory, card)
+    split = read_samples(directory, ["split"]).column("split").to_numpy()
+    place = rows_in_files(card, split)[split[row]][int((split[:row] == split[row]).sum())]
+    piece = int(np.searchsorted(files.starts, place, side="right")) - 1
+    return {name: pixels[place - files.starts[piece]] for name, pixels in files.read(piece, files.layers).items()}
+
+
+def _changed_keys(recipe: Recipe) -> dict[str, Any]:
+    """Return the recipe's keys that are not at their default."""
+    return {key: value for key, value in flat_recipe(asdict(recipe)).items() if value != _DEFAULTS[key]}
+
+
+def flat_recipe(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return a recipe's values by dotted key; a table whose keys are the user's own is one value."""
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and not prefix:
+            flat.update(flat_recipe(value, f"{key}."))
+        else:
+            flat[prefix + key] = json.loads(json.dumps(plain(value)))
+    return flat
+
+
+_DEFAULTS = flat_recipe(asdict(Recipe()))
+
+
+def _lines(sample_id: str, facts: Mapping[str, Any], differences: Sequence[str]) -> Iterator[str]:
+    sample, labels, log, ground = facts["sample"], facts["labels"], facts["log"], facts["map"]
+    fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
+    yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"
+    yield (
+        f"labels   power {labels['power_watt']:.1f} ± {labels['power_std_watt']:.1f} W, "
+        f"velocity {labels['velocity_mps']:.3f} ± {labels['velocity_std_mps']:.3f} m/s, "
+        f"duration {labels['duration_s']:.3f} s, energy {labels['energy_joule']:.1f} J; "
+        f"quality {', '.join(facts['quality']) or 'clean'}"
+    )
+    yield f"log      {', '.join(log['paths']) or 'unknown'} (sha256 {str(log['sha256'])[:12]}…), run {log['run_id']}, robot {log['robot']}"
+    yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
+    for role, found in facts["messages"].items():
+        count = found["last"] - found["first"] + 1
+        which = f"{found['first']} to {found['last']} ({count})" if count else "none"
+        yield f"messages {role}: {found['topic']}, {which} of {found['of']} as read, by {found['time']} time"
+    for gate in facts["gates"]:
+        yield f"gate     {gate['apart_s']:.2f} s {gate['where']}: {', '.join(gate['why'])}, {gate['rows']} rows"
+    for refused in facts["refused"]:
+        yield f"refused  {refused['count']} of {refused['role']} ({refused['reason']}) within {_NEARBY_NS / 1e9:g} s"
+    tiles = ", ".join(f"({col}, {row})" for col, row in ground["tiles_col_row"])
+    made_of = ", ".join(f"{layer} {name}" for layer, name in sorted(ground["sources"].items()))
+    yield f"map      {ground['name']} in {ground['crs']} from {made_of}; tiles (column, row) {tiles}"
+    changed = (
+        ", ".join(f"{key} = {value}" for key, value in facts["recipe_differs_in"].items())
+        or "all keys at their defaults"
+    )
+    yield f"recipe   {facts['recipe_id']}: {changed}"
+    versions = facts["versions"]
+    yield f"versions dataset {versions['dataset']}, run {versions['run']}, here {versions['here']}; data model {versions['data_model']}"
+    if differences:
+        yield f"made again from the {facts['made_from']}: it differs"
+        yield from (f"  {line}" for line in differences)
+    else:
+        yield f"made again from the {facts['made_from']}: equal, bit for bit"

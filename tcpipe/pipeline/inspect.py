@@ -1,0 +1,133 @@
+"""What a path holds: a log, a map, a dataset, a run or a store, told without changing anything."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from tcpipe.errors import LogError, TcpipeError
+from tcpipe.formats.json_files import plain, read_json
+from tcpipe.formats.log_file import find_logs, open_log
+from tcpipe.formats.object_storage import is_url, staged
+from tcpipe.pipeline.log_inspection import inspect_log
+from tcpipe.recipe import Recipe
+from tcpipe.store import RunDirectory, Store, is_store, run_at
+
+
+def inspect(
+    path: Path | str,
+    *,
+    recipe: Recipe,
+    robot: str | None = None,
+    full: bool = False,
+    message_definitions: Path | None = None,
+) -> dict[str, Any]:
+    """Return what the path holds as JSON values; ``kind`` is log, logs, map, dataset, run or store.
+
+    Parameters
+    ----------
+    full
+        Read every message of a log: damage, gaps, stamps and clocks, instead of its index alone.
+    message_definitions
+        A directory of .msg or .idl files for types that a log does not define.
+
+    Raises
+    ------
+    LogError, MapError, DatasetError, StoreError
+        When it is none of these, or cannot be read.
+
+    """
+    how = {"robot": robot or recipe.robot, "full": full, "message_definitions": message_definitions}
+    if is_url(path):
+        with tempfile.TemporaryDirectory(prefix="tcpipe-") as staging:
+            return {**_logs_at(staged(str(path), Path(staging)), recipe, **how), "path": str(path)}
+    path = Path(path)
+    if (path / "dataset.json").is_file():
+        return {**read_json(path / "dataset.json"), "kind": "dataset", "path": str(path)}
+    if is_store(path):
+        return _store(Store(path))
+    found = run_at(path)
+    if found:
+        return _run(path, *found)
+    if path.suffix == ".zarr":
+        from tcpipe.formats.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
+
+        return {"kind": "map", "path": str(path), **plain(open_map(path).summary())}
+    return _logs_at(path, recipe, **how)
+
+
+def _logs_at(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
+    logs = _logs(path)
+    if len(logs) == 1:
+        return _one(logs[0], recipe, **how)
+    return {"kind": "logs", "path": str(path), "logs": [_one_of(entry, recipe, **how) for entry in logs]}
+
+
+def _logs(path: Path) -> list[Path]:
+    try:
+        return find_logs(path)
+    except LogError:
+        if not path.is_dir():
+            raise
+        raise LogError(f"{path}: is no map, dataset, run or store, and holds no log") from None
+
+
+def _one(
+    path: Path, recipe: Recipe, *, robot: str | None, full: bool, message_definitions: Path | None
+) -> dict[str, Any]:
+    with open_log(path, message_definitions=message_definitions) as log:
+        return inspect_log(log, recipe, robot, full=full)
+
+
+def _one_of(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
+    try:
+        return _one(path, recipe, **how)
+    except TcpipeError as error:
+        return {"kind": "log", "path": str(path), "problems": list(error.problems)}
+
+
+def _run(path: Path, store: Store, runs: list[RunDirectory]) -> dict[str, Any]:
+    run_id = runs[0].run_id
+    known = store.run_json(run_id) or {}
+    return {
+        "kind": "run",
+        "path": str(path),
+        "run_id": run_id,
+        "source": known.get("source", {}),
+        "tags": known.get("tags", {}),
+        "recipes": [
+            {
+                **_line(run),
+                "counts": run.manifest["counts"],
+                "ledger_m": run.manifest["ledger_m"],
+                "warnings": run.manifest["warnings"],
+                "damage": run.manifest["damage"],
+            }
+            for run in runs
+        ],
+    }
+
+
+def _store(store: Store) -> dict[str, Any]:
+    runs = store.runs()
+    return {
+        "kind": "store",
+        "path": str(store.root),
+        "maps": store.maps(),
+        "runs": [
+            {**_line(run), "warnings": len(run.manifest["warnings"]), "damage": len(run.manifest["damage"])}
+            for run in runs
+        ],
+        "unfinished": sorted(set(store.run_ids()) - {run.run_id for run in runs}),
+    }
+
+
+def _line(run: RunDirectory) -> dict[str, Any]:
+    return {
+        "run_id": run.run_id,
+        "recipe_id": run.recipe_id,
+        "robot": run.robot,
+        "segments": run.manifest["counts"]["segments"],
+        "distance_m": sum(run.manifest["ledger_m"].values()),
+    }

@@ -1,0 +1,49 @@
+"""Write the HTML page of whatever a path is: a run, a dataset, or a store."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import write_text
+from tcpipe.report.dataset_report import dataset_report
+from tcpipe.report.run_report import run_report
+from tcpipe.store import Store, is_store, run_at
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """A page, and whether it had to be written."""
+
+    path: Path
+    changed: bool
+
+
+def report(path: Path) -> list[Page]:
+    """Write ``report.html`` into a run's recipe directory or a dataset, or into every run of a store; return the pages.
+
+    One that would be the same is left alone.
+
+    Raises
+    ------
+    StoreError
+        When the path is none of these.
+
+    """
+    if (path / "dataset.json").is_file():
+        return [_write(path, dataset_report(path))]
+    store = Store(path)
+    found = (store, store.runs()) if is_store(path) else run_at(path)
+    if found is None or not found[1]:
+        what = "is no dataset, run or store with runs" if path.exists() else "there is no such directory"
+        raise StoreError(f"{path}: {what}; give a dataset, a run of a store, or a store")
+    return [_write(run.path, run_report(found[0], run)) for run in found[1]]
+
+
+def _write(directory: Path, html: str) -> Page:
+    path = directory / "report.html"
+    changed = not path.is_file() or path.read_bytes() != html.encode()
+    if changed:
+        write_text(path, html)
+    return Page(path, changed)

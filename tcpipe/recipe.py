@@ -1,0 +1,239 @@
+"""The recipe: every key that rules the pipeline, one frozen dataclass a stage, with its default and its reason.
+
+``formats.recipe_toml`` reads and checks it from TOML; docs/reference/recipe.md and ``tcpipe init`` are written from the docstrings here.
+Units stand in the names. Rulings and their sources: docs/explanation/rulings.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from annotated_types import Ge, Gt, Le, Lt
+
+_STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
+
+Role = Literal["gnss", "imu", "wheel_odometry", "visual_odometry", "power", "command"]
+Positive = Annotated[float, Gt(0)]
+NotNegative = Annotated[float, Ge(0)]
+Fraction = Annotated[float, Ge(0), Le(1)]
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """Where a sensor sits: base_link_from_sensor."""
+
+    __pydantic_config__ = _STRICT
+
+    xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Position of the sensor in base_link (x forward, y left, z up) [m]."""
+    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation sensor to base_link as roll, pitch, yaw about fixed axes [rad]."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadConfig:
+    """Which topics play which role, and how their numbers and stamps are to be understood."""
+
+    __pydantic_config__ = _STRICT
+
+    topics: dict[Role, list[str]] = field(default_factory=dict)
+    """Topics by role (gnss, imu, wheel_odometry, visual_odometry, power, command), where they cannot be found by type and profile."""
+    ignore_topics: list[str] = field(default_factory=list)
+    """Topics that play no role whatever their type."""
+    namespace: str | None = None
+    """Of several robots in one log, the one whose topics lie below this name (for example "/husky_1"); none takes all topics."""
+    placement: dict[Role, Placement] = field(default_factory=dict)
+    """Sensor placement by role; overrides /tf_static."""
+    gnss_crs: str = "EPSG:4326"
+    """Geographic CRS of the GNSS positions; RTK often comes in a national datum."""
+    time: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
+    """Which stamp rules, by role; auto takes header.stamp when it is set and follows the log time."""
+    time_offset_s: dict[Role, float] = field(default_factory=dict)
+    """Added to the stamps of a role [s]."""
+    imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
+    """Units of the IMU: si is rad/s and m/s² as REP-103 asks; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
+    current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"
+    """Sign of the currents: auto takes the message type's; BatteryState, on which robots disagree, is told by its mean over the run."""
+    power_averaged: Literal["auto", "yes", "no"] = "auto"
+    """Whether the power source averages over its message period: auto takes the message type's."""
+    husky_power: Literal["battery", "drivers"] = "battery"
+    """A Husky's power: battery takes battery voltage times both driver currents (the paper's), drivers each driver's own voltage."""
+
+
+@dataclass(frozen=True, slots=True)
+class FuseConfig:
+    """The estimator and the noise it assumes where the log does not say."""
+
+    __pydantic_config__ = _STRICT
+
+    estimator: Literal["smoother", "ukf"] = "smoother"
+    """smoother: error-state unscented filter and fixed-interval smoother; ukf: the paper's forward filter, 15 states."""
+    engine: Literal["compiled", "filterpy"] = "compiled"
+    """What runs the 15-state filter; filterpy is the slow reference."""
+    rate_hz: Positive = 20.0
+    """Rate of the track (the paper: 20 Hz)."""
+    gate_probability: Annotated[float, Gt(0), Lt(1)] = 0.999
+    """Chi-square gate: a measurement less likely than this is refused and listed."""
+    gnss_std_floor_m: Positive = 0.01
+    """No GNSS standard deviation is taken below this, whatever the receiver says [m]."""
+    gnss_default_std_m: Positive = 0.05
+    """Horizontal standard deviation where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
+    wheel_std_mps: Positive = 0.05
+    """Standard deviation of wheel velocity where the source gives none [m/s]."""
+    visual_std_mps: Positive = 0.05
+    """Standard deviation of visual velocity where the source gives none [m/s]."""
+    nonholonomic_std_mps: Positive = 0.15
+    """Sideways and vertical body velocity are zero to within this; much smaller values lock GNSS out [m/s]."""
+    gyro_noise_radps: Positive = 0.003
+    """White noise of the gyroscope at its rate [rad/s]."""
+    accelerometer_noise_mps2: Positive = 0.10
+    """White noise of the accelerometer at its rate, vibration included [m/s²]."""
+    max_gap_s: Positive = 1.0
+    """Without any motion measurement for this long the track has a gap [s]."""
+    max_power_gap_s: Positive = 0.3
+    """A power gap longer than this, and than three periods, leaves the track without power there and ends a segment [s]."""
+
+
+@dataclass(frozen=True, slots=True)
+class GateConfig:
+    """What steady driving is; everything else is marked, never deleted."""
+
+    __pydantic_config__ = _STRICT
+
+    max_acceleration_mps2: Positive = 0.3
+    """Without a command topic: steadier than this [m/s²]."""
+    acceleration_window_s: Positive = 0.45
+    """Acceleration is the slope of the forward velocity over this long, centred [s]."""
+    ramp_acceleration_mps2: Positive = 0.1
+    """A start or stop ramp, beside standing or turning in place, lasts while the speed changes faster than this [m/s²]."""
+    min_event_s: Positive = 0.2
+    """An acceleration or rotation shorter than this is noise [s]."""
+    dilate_s: NotNegative = 0.25
+    """Acceleration marks are widened by this on both sides [s]."""
+    command_step_mps: Positive = 0.1
+    """A command change larger than this within `command_window_s` is a change (a joystick jitters) [m/s]."""
+    command_window_s: Positive = 0.5
+    """See `command_step_mps` [s]."""
+    command_settle_s: NotNegative = 2.0
+    """Rows this long after a commanded change are dropped [s]."""
+    require_full_speed: bool = True
+    """With commands: drop rows commanded below `full_speed_fraction` of the robot's maximum; their speed is not the terrain's limit."""
+    full_speed_fraction: Fraction = 0.95
+    """See `require_full_speed`."""
+    max_velocity_mps: Positive | None = None
+    """The robot's maximum speed; none takes the profile's [m/s]."""
+    standing_velocity_mps: Positive = 0.05
+    """Slower than this (and not turning) is standing [m/s]."""
+    standing_yaw_rate_radps: Positive = 0.05
+    """See `standing_velocity_mps` [rad/s]."""
+    stuck_wheel_velocity_mps: Positive = 0.2
+    """Wheels faster than this while the ground speed is that of standing are stuck [m/s]."""
+    turning_velocity_mps: Positive = 0.10
+    """Slower than this while turning is turning in place [m/s]."""
+    turning_yaw_rate_radps: Positive = 0.10
+    """See `turning_velocity_mps` [rad/s]."""
+    min_turn_radius_m: Positive = 0.5
+    """Turning tighter than this is turning in place [m]."""
+    keep_reversing: bool = False
+    """Keep stretches driven backwards."""
+    max_relative_position_std_m: Positive = 0.10
+    """A stretch whose position error over one chord would exceed this is a gap [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentConfig:
+    """How the track is cut."""
+
+    __pydantic_config__ = _STRICT
+
+    chord_m: Positive = 1.0
+    """d: straight-line length of a segment in the horizontal plane [m]."""
+    max_arc_to_chord: Annotated[float, Ge(1)] = 1.02
+    """A segment more curved than this is dropped (radius below 1.5 m for 1 m)."""
+    flag_arc_to_chord: Annotated[float, Ge(1)] = 1.01
+    """A segment more curved than this is flagged."""
+
+
+@dataclass(frozen=True, slots=True)
+class LabelConfig:
+    """How power becomes a label."""
+
+    __pydantic_config__ = _STRICT
+
+    velocity: Literal["ground", "fused"] = "ground"
+    """Which velocity trains: ground is chord / duration; fused the mean of the filter's forward velocity (the paper's v*)."""
+    integration: Literal["exact", "right_endpoint"] = "exact"
+    """exact integrates the product of two piecewise-linear signals; right_endpoint is the paper's sum."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleConfig:
+    """How a patch is taken from a map."""
+
+    __pydantic_config__ = _STRICT
+
+    patch_m: Positive = 1.0
+    """Side of the patch on the ground [m]."""
+    patch_px: Annotated[int, Ge(2), Le(1024)] = 40
+    """Side of the patch in pixels; the pitch is patch_m / patch_px whatever the map's resolution."""
+    min_valid_fraction: Fraction = 1.0
+    """A patch with a smaller share of valid pixels is dropped."""
+    max_position_std_m: Positive = 0.10
+    """A sample whose absolute position is less certain than this is dropped [m]."""
+
+
+@dataclass(frozen=True, slots=True)
+class SplitConfig:
+    """Who trains and who tests."""
+
+    __pydantic_config__ = _STRICT
+
+    holdout: Literal["block", "sample", "run"] = "block"
+    """block keeps spatial neighbours together, sample is the paper's random draw, run keeps whole runs together."""
+    test_fraction: Fraction = 0.2
+    """Share of test among the samples inside the region."""
+    block_m: Positive = 10.0
+    """Side of a spatial block [m]."""
+    buffer_m: NotNegative | None = None
+    """A footprint nearer than this to a region's border goes to no split; none takes sqrt(2) times the chord [m]."""
+    folds: Annotated[int, Ge(2), Le(100)] = 5
+    """Folds of spatial cross-validation among train and test: whole blocks, or whole runs with the holdout run."""
+    seed: int = 0
+    """Seed of the split and of the row order."""
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetConfig:
+    """What the dataset says of itself."""
+
+    __pydantic_config__ = _STRICT
+
+    name: str = "terrain-cost"
+    """Name in the card."""
+    description: str = ""
+    """Description in the card."""
+    licence: str = ""
+    """Licence of the data (SPDX identifier)."""
+    creator: str = ""
+    """Who made it."""
+    compression: Literal["zstd", "lz4"] = "zstd"
+    """How patches are stored in Zarr: zstd takes less room, lz4 is read two to three times as fast."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """All keys of tcpipe.toml."""
+
+    __pydantic_config__ = _STRICT
+
+    robot: str | None = None
+    """Robot profile (husky, jackal, warthog, generic); none finds it by message types and topic names."""
+    read: ReadConfig = field(default_factory=ReadConfig)
+    fuse: FuseConfig = field(default_factory=FuseConfig)
+    gate: GateConfig = field(default_factory=GateConfig)
+    segment: SegmentConfig = field(default_factory=SegmentConfig)
+    label: LabelConfig = field(default_factory=LabelConfig)
+    sample: SampleConfig = field(default_factory=SampleConfig)
+    split: SplitConfig = field(default_factory=SplitConfig)
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)

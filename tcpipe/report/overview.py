@@ -1,0 +1,77 @@
+"""A small picture of a whole map: grey for the background of the reports, tinted by class for a quick look."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import matplotlib.image
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.map_files import MapFile
+from tcpipe.report.figures import CLASS_COLOURS
+
+_SIDE_PX = 900
+_TINT = 0.35
+
+
+def map_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return the orthophoto, or a shaded relief without one, as grey bytes of at most `_SIDE_PX` a side; the map is read in strips."""
+    level, step = _level(source)
+    layer = "ortho" if "ortho" in level.layers else "height"
+    picture = _thinned(level, layer, step)
+    return picture.astype(np.uint8) if layer == "ortho" else _shaded(picture, step * level.grid.pitch_m)
+
+
+def quick_look(source: MapFile) -> NDArray[np.uint8]:
+    """Return the overview in colour, shape (R, C, 3): terrain classes tinted over it, white where a layer has no data."""
+    level, step = _level(source)
+    picture = map_overview(source)[..., None].repeat(3, axis=2)
+    missing = np.zeros(picture.shape[:2], np.bool_)
+    for layer in level.layers:
+        pixels = _thinned(level, layer, step)
+        missing |= pixels == 0 if layer != "height" else ~np.isfinite(pixels)
+        if layer == "terrain":
+            index = (pixels.astype(np.int64) - 1) % len(CLASS_COLOURS)
+            tints = np.array([[int(colour[n : n + 2], 16) for n in (1, 3, 5)] for colour in CLASS_COLOURS])
+            picture = ((1.0 - _TINT) * picture + _TINT * tints[index]).astype(np.uint8)
+    return np.where(missing[..., None], np.uint8(255), picture)
+
+
+def _level(source: MapFile) -> tuple[MapFile, int]:
+    """Return the coarsest level that is still large enough, and which of its pixels to take."""
+    longer = max(source.grid.rows, source.grid.cols)
+    factor = max(factor for factor in source.factors if factor == 1 or longer // factor >= _SIDE_PX)
+    return source.at(factor), max(1, -(-(longer // factor) // _SIDE_PX))
+
+
+def _thinned(level: MapFile, layer: str, step: int) -> NDArray[Any]:
+    """Return every ``step``-th pixel of a layer."""
+    strip = max(step, level.tile_px // step * step)
+    rows, cols = level.grid.rows, level.grid.cols
+    parts = [level.read(layer, row, min(row + strip, rows), 0, cols)[::step, ::step] for row in range(0, rows, strip)]
+    return np.concatenate(parts)
+
+
+def _shaded(height_m: NDArray[Any], pitch_m: float) -> NDArray[np.uint8]:
+    """Return Lambert shading of a height field lit from the north-west, 45° above the horizon; no data is white."""
+    down, right = np.gradient(height_m.astype(float), pitch_m)
+    light = (1.0 + right / np.sqrt(2.0) + down / np.sqrt(2.0)) / np.sqrt(2.0 * (1.0 + right**2 + down**2))
+    return np.where(np.isfinite(light), np.clip(light, 0.0, 1.0) * 255, 255).astype(np.uint8)
+
+
+_PLAIN_PNG: dict[str, Any] = {"Software": None}
+
+
+def write_overview(path: Path, picture: NDArray[np.uint8]) -> None:
+    """Write a picture, grey (R, C) or colour (R, C, 3), as PNG; the same picture gives the same bytes."""
+    with atomic_file(path) as temporary:
+        matplotlib.image.imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=_PLAIN_PNG)
+
+
+def read_overview(path: Path) -> NDArray[np.uint8]:
+    """Read what `write_overview` wrote, shape (R, C)."""
+    grey: NDArray[np.uint8] = (matplotlib.image.imread(path)[..., 0] * 255).astype(np.uint8)
+    return grey

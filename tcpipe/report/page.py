@@ -1,0 +1,42 @@
+"""One self-contained HTML page from plain values."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.resources import files
+from typing import Any
+
+from jinja2 import Environment, StrictUndefined
+
+from tcpipe import __version__
+
+
+@dataclass(frozen=True, slots=True)
+class Number:
+    """One headline figure."""
+
+    value: str
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A heading with a sentence, a picture (SVG text) and a table, each optional."""
+
+    title: str
+    text: str = ""
+    svg: str = ""
+    header: Sequence[str] = field(default_factory=tuple)
+    rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
+
+
+def render_page(
+    *, title: str, lead: str, numbers: Sequence[Number], warnings: Sequence[str], sections: Sequence[Section]
+) -> str:
+    """Return the page's HTML; every text is escaped, pictures are inline."""
+    source = files("tcpipe.report").joinpath("page.html.j2").read_text(encoding="utf-8")
+    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True).from_string(source)
+    return template.render(
+        title=title, lead=lead, numbers=numbers, warnings=warnings, sections=sections, version=__version__
+    )

@@ -1,0 +1,191 @@
+"""The page of one ingested run: where it drove, what was used, and what each metre cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.report.error_budget import budget_sections
+from tcpipe.report.figures import DROPPED, KEPT, histograms, ledger_bars, over_distance, path_on_map
+from tcpipe.report.overview import map_overview
+from tcpipe.report.page import Number, Section, render_page
+from tcpipe.store import RunDirectory, Store
+from tcpipe.tables.bits import DropReason, Quality
+
+_MOSTLY = 0.5
+
+_COLOURS = {
+    "kept": KEPT,
+    "gap": "#7a5195",
+    "standing": "#9aa3ab",
+    "stuck": "#000000",
+    "turning in place": "#e0a100",
+    "reversing": "#2a6fb0",
+    "accelerating": DROPPED,
+    "below limit": "#d48fb0",
+}
+
+
+def run_report(store: Store, run: RunDirectory) -> str:
+    """Return the HTML page of a run of the store; a map of the store that lies under the run is its background."""
+    track, segments, manifest = run.track().table, run.segments(), run.manifest
+    source = store.run_json(run.run_id)
+    ledger = manifest["ledger_m"]
+    total = sum(ledger.values())
+    return render_page(
+        title=f"Run {run.run_id}",
+        lead=f"Robot {run.robot}, recipe {run.recipe_id}, {_source_line(source)}",
+        numbers=[
+            Number(f"{total:.0f} m", "driven"),
+            Number(f"{segments.num_rows}", "segments"),
+            Number(f"{100 * ledger.get('kept', 0.0) / max(total, 1e-9):.0f} %", "of the metres used"),
+            Number(_mean(segments, "power_watt", "W"), "mean power w"),
+            Number(_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
+        ],
+        warnings=[*manifest["damage"], *manifest["warnings"]],
+        sections=[
+            *_track_sections(store, run, track),
+            *_segment_sections(
+                segments, ledger, manifest["info"]["findings"]["facts"].get("label", {}).get("physics", {})
+            ),
+            *budget_sections(manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget")),
+            *_detail_sections(run, source),
+        ],
+    )
+
+
+def _source_line(source: Mapping[str, Any] | None) -> str:
+    if source is None:
+        return "source unknown"
+    size = source["source"]["size_bytes"] / 1e6
+    return f"from {', '.join(source['source']['paths'])} ({size:.1f} MB)"
+
+
+def _column(table: pa.Table, name: str) -> NDArray[Any]:
+    values: NDArray[Any] = table.column(name).to_numpy(zero_copy_only=False)
+    return values
+
+
+def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
+    values = segments.column(name).drop_null().to_numpy()
+    return f"{values.mean():.{digits}f} {unit}" if len(values) else "none"
+
+
+def _first_reason(dropped_by: NDArray[Any]) -> NDArray[Any]:
+    """Return each row's reason by precedence, ``kept`` where there is none."""
+    reasons = np.full(len(dropped_by), "kept", dtype=object)
+    for bit in reversed(list(DropReason)):
+        reasons[(dropped_by & int(bit)) != 0] = str(bit.name).lower().replace("_", " ")
+    return reasons
+
+
+def _track_sections(store: Store, run: RunDirectory, track: pa.Table) -> list[Section]:
+    if not track.num_rows:
+        return []
+    x, y = _column(track, "x_m"), _column(track, "y_m")
+    dropped = _column(track, "dropped_by")
+    distance = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
+    series = {"speed [m/s]": (_column(track, "forward_velocity_mps"), "#2a6fb0")}
+    if track.column("power_watt").null_count < track.num_rows:
+        series["power [W]"] = (_column(track, "power_watt"), DROPPED)
+    series["height [m]"] = (_column(track, "z_m"), "#8a5a2b")
+    return [
+        _path_section(store, run, track),
+        Section("Speed, power and height over distance", "", over_distance(distance, series, dropped == 0)),
+    ]
+
+
+def _path_section(store: Store, run: RunDirectory, track: pa.Table) -> Section:
+    reasons = _first_reason(_column(track, "dropped_by"))
+    text = "The fused track; colour says why a row is not used."
+    found = None if run.track().info.datum is None else _map_under(store, run, track)
+    if found is None:
+        x, y = _column(track, "x_m"), _column(track, "y_m")
+        return Section("Path", text, path_on_map(x, y, reasons, _COLOURS))
+    source, x, y = found
+    x_min_m, y_min_m, x_max_m, y_max_m = source.grid.bounds_m
+    svg = path_on_map(
+        x,
+        y,
+        reasons,
+        _COLOURS,
+        backdrop=map_overview(source),
+        extent_m=(x_min_m, x_max_m, y_min_m, y_max_m),
+        labels=("easting [m]", "northing [m]"),
+    )
+    return Section("Path on the map", text, svg)
+
+
+def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[MapFile, NDArray[Any], NDArray[Any]] | None:
+    """Return the first map that holds most of the track, and the track in its CRS; None if there is none."""
+    gnss_crs = run.manifest["recipe"]["read"]["gnss_crs"]
+    lon, lat = _column(track, "lon_deg"), _column(track, "lat_deg")
+    for name in store.maps():
+        source = open_map(store.map_path(name))
+        x, y = Transformer.from_crs(gnss_crs, source.grid.crs, always_xy=True).transform(lon, lat)
+        if source.grid.contains(np.column_stack([x, y])).mean() > _MOSTLY:
+            return source, np.asarray(x), np.asarray(y)
+    return None
+
+
+def _physics_sections(segments: pa.Table, physics: Mapping[str, Any]) -> list[Section]:
+    """Return what rolling resistance and grade leave unexplained; nothing where they could not be fitted."""
+    if not physics.get("fitted"):
+        return []
+    left = _column(segments, "power_watt").astype(float) - _column(segments, "physics_power_watt").astype(float)
+    resistance = physics["rolling_resistance"]
+    grade = "" if resistance is None else f", rolling resistance {resistance:.3f}"
+    text = (
+        f"Power minus what rolling resistance and grade alone, fitted on this run, predict ({physics['segments']} segments{grade}): "
+        f"terrain, turning and errors. {physics['outliers']} segments are further than four standard deviations of "
+        f"{physics['residual_watt']:.0f} W."
+    )
+    return [Section("What physics leaves unexplained", text, histograms({"w - physics [W]": left}))]
+
+
+def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: Mapping[str, Any]) -> list[Section]:
+    sections = [
+        Section("Where every metre went", "Kept and dropped add up to the odometer.", ledger_bars(ledger)),
+    ]
+    if segments.num_rows:
+        labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
+        data = {label: _column(segments, name).astype(float) for label, name in labels.items()}
+        sections.append(Section("Labels", "One value a segment.", histograms(data)))
+        sections += _physics_sections(segments, physics)
+        quality = _column(segments, "quality")
+        counts = [(str(bit.name).lower(), int(((quality & int(bit)) != 0).sum()), bit.__doc__) for bit in Quality]
+        rows = [(name.replace("_", " "), count) for name, count, _ in counts if count]
+        if rows:
+            sections.append(Section("Quality flags", "", header=("flag", "segments"), rows=rows))
+    return sections
+
+
+def _detail_sections(run: RunDirectory, source: Mapping[str, Any] | None) -> list[Section]:
+    rejections = run.rejections()
+    refused: dict[str, int] = {}
+    for role in rejections.column("role").to_pylist():
+        refused[role] = refused.get(role, 0) + 1
+    sections = []
+    if source is not None:
+        rows = [
+            (
+                role.replace("_", " "),
+                sensor["topic"],
+                sensor["type_name"],
+                run.manifest["counts"].get(f"{role}_messages", 0),
+                refused.get(role, 0),
+                sensor["time_source"],
+                sensor["placed_by"],
+                sensor["why"],
+            )
+            for role, sensor in sorted(source["sensors"].items())
+        ]
+        header = ("role", "topic", "type", "messages", "refused", "stamp", "placed by", "why this topic")
+        sections.append(Section("Sensors", "Which topic played which role.", header=header, rows=rows))
+    return sections

@@ -1,0 +1,25 @@
+"""Worlds and drives with known truth, written as real logs and GeoTIFFs.
+
+`simulate` writes a whole site. In pieces: a `scenarios.Scenario` holds a `world.World`, drives (`route` says where to, `faults` what goes
+wrong, `sensors` how strongly) and the rasters' grids; `simulated_drive` gives the truth and the readings of one drive in memory;
+`truth.true_cost` is the cost of the true metre that begins at any time.
+"""
+
+from tcpipe.simulation.faults import Faults
+from tcpipe.simulation.scenarios import Scenario, scenario, tiny
+from tcpipe.simulation.site_files import SimulatedSite, read_truth, simulate, simulated_drive
+from tcpipe.simulation.truth import TrueCost, Truth, true_cost
+
+__all__ = [
+    "Faults",
+    "Scenario",
+    "SimulatedSite",
+    "TrueCost",
+    "Truth",
+    "read_truth",
+    "scenario",
+    "simulate",
+    "simulated_drive",
+    "tiny",
+    "true_cost",
+]

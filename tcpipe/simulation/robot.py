@@ -1,0 +1,184 @@
+"""What the simulated robot can do, and what it costs: speed limits, slip, rolling resistance, grade, battery.
+
+The plant is deliberately plain, but every effect that a label should carry is in it: the terrain slows a robot that is commanded at full
+speed, rolling resistance depends on the class (and on what no map shows), grade costs and gives back, turning scrubs, the battery sags.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.compiled import kernel
+from tcpipe.simulation.site import Float
+from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED
+
+GRAVITY_MPS2 = 9.80665
+_STEEPEST_SIN = float(np.sin(np.radians(22.5)))
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """How one terrain class treats the robot on the flat."""
+
+    speed: float
+    """Wheel speed reached under full command, as a fraction of it."""
+    slip: float
+    """1 - ground speed / wheel speed."""
+    rolling_resistance: float
+    """Traction force over normal force."""
+
+
+_GROUND = {
+    GRASS: Ground(speed=0.90, slip=0.03, rolling_resistance=0.170),
+    MUD: Ground(speed=0.84, slip=0.07, rolling_resistance=0.220),
+    UNPAVED: Ground(speed=0.94, slip=0.02, rolling_resistance=0.135),
+    PAVED: Ground(speed=0.97, slip=0.01, rolling_resistance=0.115),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Robot:
+    """A Husky with some payload."""
+
+    mass_kg: float = 70.0
+    max_velocity_mps: float = 1.0
+    speed_time_constant_s: float = 0.25
+    max_acceleration_mps2: float = 1.0
+    max_yaw_rate_radps: float = 0.7
+    uphill_slowdown: float = 0.25
+    """Wheel speed lost on 22.5° uphill, as a fraction."""
+    slope_slip: float = 0.05
+    """Slip added on 22.5° uphill, taken away downhill."""
+    wheelbase_m: float = 0.5
+    """Ground properties are averaged over it."""
+    scrub_torque_nm: float = 190.0
+    """Turning in place."""
+    drive_efficiency: float = 0.72
+    regeneration_efficiency: float = 0.55
+    idle_watt: float = 14.0
+    """Both motor drivers at rest; part of the propulsion current."""
+    electronics_watt: float = 38.0
+    """Computer and user ports: never part of the propulsion current, but the battery sags with it."""
+    open_circuit_volt: float = 26.4
+    discharge_volt_per_megajoule: float = 0.9
+    internal_resistance_ohm: float = 0.045
+    driver_resistance_ohm: float = 0.006
+    resistance_noise: float = 0.10
+    """Fluctuation of the rolling resistance in time, relative, standard deviation."""
+    resistance_noise_s: float = 0.15
+    """Its correlation time."""
+    ground: dict[int, Ground] = field(default_factory=lambda: dict(_GROUND))
+    """By class id; a class that is not named is grass."""
+
+    def ground_table(self) -> Float:
+        """Return speed, slip and rolling resistance by class id, shape (256, 3)."""
+        table = np.empty((256, 3))
+        table[:] = [self.ground[GRASS].speed, self.ground[GRASS].slip, self.ground[GRASS].rolling_resistance]
+        for class_id, ground in self.ground.items():
+            table[class_id] = [ground.speed, ground.slip, ground.rolling_resistance]
+        return table
+
+    def speed_factor(self, flat_speed: Float, sin_slope: Float) -> Float:
+        """Return wheel speed over commanded speed, from the class's flat value and the sine of the slope along travel."""
+        return flat_speed * (1.0 - self.uphill_slowdown * np.maximum(sin_slope, 0.0) / _STEEPEST_SIN)
+
+    def slip(self, flat_slip: Float, sin_slope: Float) -> Float:
+        """Return 1 - ground speed / wheel speed; gravity pulls the robot back uphill and on downhill."""
+        return flat_slip + self.slope_slip * sin_slope / _STEEPEST_SIN
+
+    def wheel_power_watt(
+        self,
+        *,
+        wheel_velocity_mps: Float,
+        acceleration_mps2: Float,
+        yaw_rate_radps: Float,
+        slope_rad: Float,
+        rolling_resistance: Float,
+    ) -> Float:
+        """Return mechanical power at the wheels [W]; negative where the slope drives them."""
+        direction = np.sign(wheel_velocity_mps)
+        weight = self.mass_kg * GRAVITY_MPS2
+        force = (
+            weight * (rolling_resistance * direction * np.cos(slope_rad) + np.sin(slope_rad))
+            + self.mass_kg * acceleration_mps2
+        )
+        radius_m = np.abs(wheel_velocity_mps) / np.maximum(np.abs(yaw_rate_radps), 1e-6)
+        scrub = self.scrub_torque_nm * np.abs(yaw_rate_radps) / (1.0 + radius_m / 0.4)
+        return force * wheel_velocity_mps + scrub
+
+    def propulsion_watt(self, wheel_power_watt: Float) -> Float:
+        """Return the electrical power of both motor drivers [W], negative when they give back."""
+        driving = wheel_power_watt > 0.0
+        return self.idle_watt + wheel_power_watt * np.where(
+            driving, 1.0 / self.drive_efficiency, self.regeneration_efficiency
+        )
+
+    def battery(self, propulsion_watt: Float, *, dt_s: float) -> tuple[Float, Float]:
+        """Return terminal voltage [V] and propulsion current [A] whose product is ``propulsion_watt``.
+
+        Solves U² - U0·U + R·P = 0 for the total power P; U0 falls with the energy drawn so far.
+        """
+        total = propulsion_watt + self.electronics_watt
+        drawn_joule = np.concatenate([[0.0], np.cumsum(total[:-1]) * dt_s])
+        open_circuit = self.open_circuit_volt - self.discharge_volt_per_megajoule * 1e-6 * drawn_joule
+        voltage = 0.5 * (open_circuit + np.sqrt(open_circuit**2 - 4.0 * self.internal_resistance_ohm * total))
+        return voltage, propulsion_watt / voltage
+
+
+@kernel
+def drive_along(  # noqa: PLR0917 - numba takes positional arguments
+    grid_m: float,
+    speed_factor: NDArray[np.float64],
+    slip: NDArray[np.float64],
+    map_per_surface: NDArray[np.float64],
+    command_mps: float,
+    brake_at_m: float,
+    time_constant_s: float,
+    max_acceleration_mps2: float,
+    dt_s: float,
+    max_steps: int,
+) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
+    """Drive one path from rest to rest; returns path position [m], wheel speed [m/s] at every step, and the number of steps.
+
+    The arrays hold the ground along the path every ``grid_m`` map metres. Wheel speed follows command times ``speed_factor`` with a
+    first-order lag and a limited acceleration; past ``brake_at_m`` the command is zero. Ends when the wheels stand, or, with the
+    position past the path, when the path was too short to stop on (the caller checks).
+    """
+    position = np.empty(max_steps)
+    wheel = np.empty(max_steps)
+    s, w = 0.0, 0.0
+    last = speed_factor.size - 1
+    for step in range(max_steps):
+        position[step] = s
+        wheel[step] = w
+        at = min(s / grid_m, last - 1e-9)
+        i = int(at)
+        part = at - i
+        factor = speed_factor[i] + part * (speed_factor[i + 1] - speed_factor[i])
+        braking = s >= brake_at_m
+        if braking and w < 1e-3:
+            wheel[step] = 0.0
+            return position[: step + 1], wheel[: step + 1], step + 1
+        target = 0.0 if braking else command_mps * factor
+        change = (target - w) / time_constant_s
+        w_next = w + dt_s * min(max(change, -max_acceleration_mps2), max_acceleration_mps2)
+        loss = slip[i] + part * (slip[i + 1] - slip[i])
+        scale = map_per_surface[i] + part * (map_per_surface[i + 1] - map_per_surface[i])
+        s += 0.5 * (w + w_next) * (1.0 - loss) * scale * dt_s
+        w = w_next
+    return position, wheel, max_steps
+
+
+@kernel
+def correlated_noise(white: NDArray[np.float64], correlation: float) -> NDArray[np.float64]:
+    """Return a first-order Gauss-Markov series of unit variance from white noise; ``correlation`` is that of neighbours."""
+    out = np.empty_like(white)
+    gain = np.sqrt(1.0 - correlation * correlation)
+    state = 0.0
+    for i in range(white.size):
+        state = white[0] if i == 0 else correlation * state + gain * white[i]
+        out[i] = state
+    return out

@@ -1,0 +1,231 @@
+"""Where a simulated drive goes: legs, turns, pauses, and the smooth curve a leg follows.
+
+A plan is a list of manoeuvres. A `Leg` starts where the robot stands and looks, so that turns in place are found by the driver
+(`tcpipe.simulation.drive`); its corners become arcs, its curvature is smoothed over half a metre, and a human's weaving is laid over it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from tcpipe.simulation.site import Float
+from tcpipe.simulation.world import GRASS, World
+
+PATH_GRID_M = 0.01
+_SMOOTH_M = 0.5
+_RUN_OUT_M = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Leg:
+    """Drive through waypoints without a stop, from rest to rest."""
+
+    waypoints_m: tuple[tuple[float, float], ...]
+    """From the site's south-west corner; the robot's own place is not among them."""
+    radius_m: float = 2.5
+    """Radius of the curves."""
+    command: float = 1.0
+    """Commanded speed as a fraction of the robot's maximum."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reverse:
+    """Drive straight back, from rest to rest."""
+
+    distance_m: float
+    command: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pause:
+    """Stand still."""
+
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """Turn in place by an angle, counter-clockwise."""
+
+    angle_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Stuck:
+    """The wheels turn, the robot stands."""
+
+    duration_s: float
+
+
+Manoeuvre = Leg | Reverse | Pause | Turn | Stuck
+
+
+@dataclass(frozen=True, slots=True)
+class Path:
+    """A smooth curve in the map plane, by its arc length in map metres; the robot should stop near ``stop_m``."""
+
+    curve: CubicSpline
+    length_m: float
+    stop_m: float
+
+    def at(self, s_m: Float) -> tuple[Float, Float]:
+        """Return positions, shape (N, 2), and tangent directions from the map's x axis [rad]."""
+        tangent = self.curve(s_m, 1)
+        return self.curve(s_m), np.arctan2(tangent[:, 1], tangent[:, 0])
+
+
+def leg_path(start_m: Float, leg: Leg, *, weave: tuple[Float, Float, Float], weave_m: float) -> Path:
+    """Return the curve of ``leg`` from ``start_m``, shape (2,), in the coordinates of its waypoints.
+
+    ``weave`` holds wavelengths [m], phases [rad] and weights of the sideways weaving, of total amplitude ``weave_m``.
+    """
+    corners = np.vstack([start_m, np.asarray(leg.waypoints_m, dtype=np.float64)])
+    curvature, straight_m = _curvature(corners, leg.radius_m)
+    first = corners[1] - corners[0]
+    yaw = np.arctan2(first[1], first[0]) + np.concatenate(
+        [[0.0], np.cumsum(curvature[:-1] + curvature[1:]) * PATH_GRID_M / 2]
+    )
+    s = np.arange(yaw.size) * PATH_GRID_M
+    wavelengths, phases, weights = weave
+    window = np.clip(np.minimum(s, straight_m - s) / 3.0, 0.0, 1.0)
+    sway = np.sin(2.0 * np.pi * s[:, None] / wavelengths + phases) @ weights
+    offset = weave_m * (window * window * (3.0 - 2.0 * window)) * sway
+    middle = np.column_stack([_integral(np.cos(yaw)), _integral(np.sin(yaw))]) + corners[0]
+    points = middle + offset[:, None] * np.column_stack([-np.sin(yaw), np.cos(yaw)])
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    coarse = slice(None, None, 10)
+    stop_m = float(np.interp(straight_m, s, arc))
+    return Path(CubicSpline(arc[coarse], points[coarse]), float(arc[coarse][-1]), stop_m)
+
+
+def straight_path(start_m: Float, direction_rad: float, distance_m: float) -> Path:
+    """Return a straight path that should be stopped on after ``distance_m``."""
+    s = np.linspace(0.0, distance_m + _RUN_OUT_M, 8)
+    points = start_m + s[:, None] * np.array([np.cos(direction_rad), np.sin(direction_rad)])
+    return Path(CubicSpline(s, points), float(s[-1]), distance_m)
+
+
+def _integral(values: Float) -> Float:
+    return np.concatenate([[0.0], np.cumsum(values[:-1] + values[1:]) * PATH_GRID_M / 2])
+
+
+def _curvature(corners: Float, radius_m: float) -> tuple[Float, float]:
+    """Return the smoothed curvature every PATH_GRID_M, run-out included, and the length up to the last corner."""
+    steps = np.diff(corners, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    turns = _wrapped(np.diff(np.arctan2(steps[:, 1], steps[:, 0])))
+    cuts = np.zeros(lengths.size + 1)
+    for i, turn in enumerate(turns):
+        cuts[i + 1] = min(radius_m * np.tan(abs(turn) / 2.0), 0.45 * min(lengths[i], lengths[i + 1]))
+    pieces = []
+    for i, length in enumerate(lengths):
+        pieces.append(np.zeros(max(round((length - cuts[i] - cuts[i + 1]) / PATH_GRID_M), 1)))
+        if i < turns.size and abs(turns[i]) > 1e-6:
+            arc_m = cuts[i + 1] / np.tan(abs(turns[i]) / 2.0) * abs(turns[i])
+            count = max(round(arc_m / PATH_GRID_M), 1)
+            pieces.append(np.full(count, turns[i] / (count * PATH_GRID_M)))
+    straight_m = sum(piece.size for piece in pieces) * PATH_GRID_M
+    pieces.append(np.zeros(round(_RUN_OUT_M / PATH_GRID_M)))
+    return moving_average(moving_average(np.concatenate(pieces), _SMOOTH_M), _SMOOTH_M), straight_m
+
+
+def moving_average(values: Float, window_m: float) -> Float:
+    """Return the centred mean over ``window_m`` of values given every PATH_GRID_M; ends are held."""
+    half = max(round(window_m / PATH_GRID_M / 2), 1)
+    padded = np.concatenate([np.full(half, values[0]), values, np.full(half, values[-1])])
+    sums = np.concatenate([[0.0], np.cumsum(padded)])
+    return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1))
+
+
+def _wrapped(angle_rad: Float) -> Float:
+    return np.asarray((angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+@dataclass(frozen=True, slots=True)
+class Wander:
+    """A random tour that stays on traversable ground and steers towards wanted shares of terrain classes."""
+
+    length_m: float
+    """About how far to drive."""
+    start_m: tuple[float, float]
+    """From the site's south-west corner."""
+    shares: tuple[tuple[int, float], ...] = ((4, 0.51), (5, 0.09), (6, 0.20), (7, 0.20))
+    """Wanted share of the way by class id (the paper's by default)."""
+    margin_m: float = 5.0
+    """Kept from the site's border."""
+    max_slope_deg: float = 22.5
+    """Steeper ground is avoided."""
+    climbing: float = 0.3
+    """How much steep ground draws it, against wanted classes."""
+    odd_manoeuvres: bool = True
+    """Now and then reverse, drive slowly, or get stuck."""
+
+    def plan(self, world: World, rng: np.random.Generator) -> list[Manoeuvre]:
+        """Return the manoeuvres; the same generator state gives the same plan."""
+        here, driven = np.array(self.start_m), 0.0
+        done = np.zeros(256)
+        plan: list[Manoeuvre] = [Pause(3.0)]
+        legs = 0
+        while driven < self.length_m:
+            odd = legs % 6 if self.odd_manoeuvres else -1
+            waypoints: list[tuple[float, float]] = []
+            direction = None
+            for _ in range(1 if odd == 5 else int(rng.integers(2, 6))):
+                step = self._next(world, rng, here, direction, done)
+                if step is None or driven >= self.length_m:
+                    break
+                direction = float(np.arctan2(step[1] - here[1], step[0] - here[0]))
+                driven += float(np.hypot(*(step - here)))
+                waypoints.append((float(step[0]), float(step[1])))
+                here = step
+            if not waypoints:
+                here = here + rng.uniform(-1.0, 1.0, 2)
+                continue
+            legs += 1
+            plan.append(Leg(tuple(waypoints), radius_m=float(rng.uniform(1.2, 4.0)), command=0.5 if odd == 5 else 1.0))
+            plan.append(Pause(float(rng.uniform(0.6, 2.5))))
+            if odd == 1:
+                plan += [Reverse(2.5), Pause(1.0)]
+            if odd == 3:
+                plan += [Stuck(2.0), Pause(0.8)]
+        return plan
+
+    def _next(
+        self, world: World, rng: np.random.Generator, here: Float, direction: float | None, done: Float
+    ) -> Float | None:
+        """Choose the best of many random next waypoints, and count its classes into ``done``; None if none is allowed."""
+        count, points = 192, 40
+        turn = rng.normal(0.0, 0.6, count) if direction is not None else rng.uniform(-np.pi, np.pi, count)
+        turn = np.clip(turn, -1.9, 1.9) if direction is not None else turn
+        heading = turn + (direction or 0.0)
+        length = rng.uniform(6.0, 24.0, count)
+        taste = rng.random(count)
+        along = np.linspace(0.0, 1.0, points)
+        u = here[0] + np.outer(length * np.cos(heading), along)
+        v = here[1] + np.outer(length * np.sin(heading), along)
+        allowed, classes, steepness = self._allowed(world, u, v)
+        if not allowed.any():
+            return None
+        wanted = np.zeros(256)
+        wanted[[class_id for class_id, _ in self.shares]] = [share for _, share in self.shares]
+        deficit = wanted - done / max(done.sum(), 1.0)
+        relative = deficit / np.maximum(wanted, 0.05)
+        score = np.where(allowed, relative[classes].mean(axis=1) + self.climbing * steepness + 0.25 * taste, -np.inf)
+        best = int(np.argmax(score))
+        done += length[best] * np.bincount(classes[best], minlength=256) / points
+        return np.array([u[best, -1], v[best, -1]])
+
+    def _allowed(self, world: World, u: Float, v: Float) -> tuple[NDArray[np.bool_], NDArray[np.uint8], Float]:
+        """Return which lines may be driven, the classes along them, and how steep they are on the whole (1: the steepest allowed)."""
+        site, margin = world.site, self.margin_m
+        inside = (u > margin) & (u < site.width_m - margin) & (v > margin) & (v < site.height_m - margin)
+        x, y = u + site.west_m, v + site.south_m
+        steepness = np.hypot(*world.gradient(x, y)) / np.tan(np.radians(self.max_slope_deg))
+        classes = world.terrain_class(x, y)
+        near = [world.terrain_class(x + dx, y + dy) for dx, dy in ((1.5, 0), (-1.5, 0), (0, 1.5), (0, -1.5))]
+        free = np.minimum.reduce([classes, *near]) >= GRASS
+        return (inside & (steepness <= 1.0) & free).all(axis=1), classes, steepness.mean(axis=1)

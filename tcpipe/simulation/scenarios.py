@@ -1,0 +1,321 @@
+"""What `tcpipe simulate` can make: a world, drives over it, their sensors and faults, and how the rasters are cut."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from tcpipe.errors import UsageError
+from tcpipe.simulation.faults import Faults
+from tcpipe.simulation.messages import Recorder
+from tcpipe.simulation.robot import Robot
+from tcpipe.simulation.route import Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
+from tcpipe.simulation.sensors import Imu, Sensors, Visual
+from tcpipe.simulation.site import Site
+from tcpipe.simulation.world import MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, Wave, World
+
+HUSKY_ROS2 = Recorder("ros2", "clearpath_power")
+HUSKY_ROS1 = Recorder("ros1", "husky_status")
+
+Container = Literal["mcap", "bag", "rosbag2", "rosbag2_mcap"]
+"""ROS 2 or, with the ROS 1 recorder, ROS 1 messages in MCAP; a ROS 1 bag; ROS 2 bag directories with sqlite3 or MCAP."""
+
+_WEST = ((1.0, 1.0), (80.0, 2.0), (74.0, 40.0), (80.0, 79.0), (2.0, 78.0))
+"""Two thirds of the small world, with a bent border."""
+_FIRST_START_NS = 1_700_000_000_000_000_000
+_BETWEEN_DRIVES_NS = 3_600_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSpec:
+    """One drive: where it goes, what records it, what is wrong with that."""
+
+    name: str
+    plan: tuple[Manoeuvre, ...] | Wander
+    start_m: tuple[float, float]
+    """From the site's south-west corner."""
+    container: Container = "mcap"
+    recorder: Recorder = HUSKY_ROS2
+    sensors: Sensors = field(default_factory=Sensors)
+    faults: Faults = field(default_factory=Faults)
+    robot: Robot = field(default_factory=Robot)
+    start_yaw_rad: float = 0.0
+    """From the map's x axis."""
+    weave_m: float = 0.04
+
+
+@dataclass(frozen=True, slots=True)
+class RasterSpec:
+    """How the world is cut into rasters: pitch and shift of each, so that no two share a grid."""
+
+    height_pitch_m: float = 0.05
+    ortho_pitch_m: float = 0.06
+    terrain_pitch_m: float = 0.05
+    ortho_shift_m: tuple[float, float] = (0.013, -0.021)
+    terrain_shift_m: tuple[float, float] = (0.017, 0.008)
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """A site with its drives."""
+
+    name: str
+    world: World
+    drives: tuple[DriveSpec, ...]
+    region_m: tuple[tuple[float, float], ...]
+    """The part to train and test in: a polygon from the site's south-west corner."""
+    rasters: RasterSpec = RasterSpec()
+
+    def start_ns(self, drive: int) -> int:
+        """Return when a drive starts; they are an hour apart."""
+        return _FIRST_START_NS + drive * _BETWEEN_DRIVES_NS
+
+
+def waves(seed: int, *, count: int, total: float, wavelength_m: tuple[float, float]) -> tuple[Wave, ...]:
+    """Return plane waves of random direction and phase, log-uniform wavelength, and amplitudes that sum in square to ``total``²."""
+    rng = np.random.default_rng(seed)
+    amplitude = total * np.sqrt(2.0 / count)
+    return tuple(
+        Wave(
+            amplitude,
+            float(np.exp(rng.uniform(*np.log(wavelength_m)))),
+            float(rng.uniform(0.0, np.pi)),
+            float(rng.uniform(0.0, 2.0 * np.pi)),
+        )
+        for _ in range(count)
+    )
+
+
+def small_world(site: Site | None = None) -> World:
+    """Return 120 m × 80 m with three hills of up to 22.5°, two roads, mud, trees, and a hole in the rasters."""
+    return World(
+        site=Site() if site is None else site,
+        base_m=598.0,
+        hills=(
+            Hill(34.0, 52.0, 6.1, 10.0, 11.5),
+            Hill(86.0, 26.0, 6.4, 12.5, 10.0),
+            Hill(92.0, 66.0, 4.2, 14.0, 9.0),
+            Hill(52.0, 12.0, -2.6, 16.0, 9.0),
+        ),
+        waves=waves(11, count=5, total=0.10, wavelength_m=(9.0, 22.0)),
+        regions=(
+            Band(UNPAVED, 62.0, 40.0, 1.35, 4.0, 3.0, 70.0, 0.4),
+            Band(PAVED, 60.0, 24.0, 0.12, 4.6, 4.0, 85.0, 1.0),
+            Ellipse(MUD, 22.0, 22.0, 8.0, 5.5, 0.5),
+            Ellipse(MUD, 100.0, 48.0, 9.0, 6.0, 2.2),
+            Ellipse(MUD, 50.0, 66.0, 6.0, 5.0, 0.0),
+            Ellipse(VEGETATION, 112.0, 12.0, 6.0, 8.0, 0.2),
+            Ellipse(VEGETATION, 9.0, 70.0, 7.0, 6.0, 0.0),
+            Ellipse(TREE, 74.0, 52.0, 2.2, 2.2),
+            Ellipse(TREE, 40.0, 36.0, 2.0, 2.0),
+            Ellipse(OBSTACLE, 30.0, 8.0, 3.0, 1.5, 0.9),
+        ),
+        holes=(Ellipse(0, 118.0, 78.0, 9.0, 7.0), Ellipse(0, 71.0, 30.4, 2.2, 1.6)),
+        texture=waves(12, count=10, total=0.05, wavelength_m=(0.8, 5.0)),
+        resistance=waves(13, count=8, total=0.03, wavelength_m=(1.5, 12.0)),
+    )
+
+
+_PAPER_ROADS = (
+    Band(UNPAVED, 150.0, 150.0, 1.40, 4.2, 9.0, 170.0, 0.4),
+    Band(UNPAVED, 300.0, 215.0, 0.06, 4.2, 12.0, 230.0, 2.0),
+    Band(UNPAVED, 470.0, 150.0, 1.75, 4.2, 8.0, 150.0, 1.1),
+    Band(PAVED, 300.0, 95.0, -0.04, 5.0, 14.0, 260.0, 0.0),
+    Band(PAVED, 330.0, 150.0, 1.25, 5.0, 10.0, 210.0, 2.6),
+)
+
+
+def paper_world() -> World:
+    """Return a site as large, as high and as steep as the paper's (section IV-A): 596 m × 305 m, 574.8 m to 661.3 m above sea level.
+
+    Its shape is made up: a long slope with knolls, two paved and three unpaved roads, mud in the hollows, trees and hedges.
+    """
+    rng = np.random.default_rng(2024)
+    site = Site(west_m=697300.0, south_m=5208300.0, width_m=596.0, height_m=305.0)
+    slope = (Hill(420.0, 210.0, 60.0, 170.0, 130.0), Hill(120.0, 60.0, -16.0, 120.0, 80.0))
+    knolls = tuple(
+        Hill(x, y, float(rng.uniform(3.0, 7.5)), x_sigma, y_sigma)
+        for x, y, x_sigma, y_sigma, _ in _scattered(rng, 26, size_m=(14.0, 26.0), margin_m=25.0)
+    )
+    mud = tuple(Ellipse(MUD, *place) for place in _scattered(rng, 26, size_m=(5.0, 13.0), margin_m=25.0))
+    hedges = tuple(Ellipse(VEGETATION, *place) for place in _scattered(rng, 16, size_m=(3.0, 14.0)))
+    trees = tuple(Ellipse(TREE, *place) for place in _scattered(rng, 30, size_m=(1.5, 4.5)))
+    world = World(
+        site,
+        base_m=600.0,
+        hills=slope + knolls,
+        waves=waves(21, count=6, total=0.12, wavelength_m=(9.0, 24.0)),
+        regions=(
+            *mud,
+            *_PAPER_ROADS,
+            *hedges,
+            *trees,
+            Ellipse(OBSTACLE, 60.0, 245.0, 9.0, 6.0, 0.3),
+            Ellipse(OBSTACLE, 520.0, 40.0, 7.0, 5.0),
+        ),
+        holes=(
+            Ellipse(0, 0.0, 305.0, 70.0, 40.0),
+            Ellipse(0, 596.0, 0.0, 60.0, 35.0),
+            Ellipse(0, 250.0, 60.0, 3.0, 2.0),
+        ),
+        texture=waves(22, count=12, total=0.05, wavelength_m=(0.8, 6.0)),
+        resistance=waves(23, count=10, total=0.03, wavelength_m=(1.5, 15.0)),
+    )
+    return _stretched(world, 574.8, 661.3)
+
+
+def _scattered(
+    rng: np.random.Generator, count: int, *, size_m: tuple[float, float], margin_m: float = 0.0
+) -> list[tuple[float, float, float, float, float]]:
+    """Return random places on the paper's site: x, y, two radii [m], rotation [rad]."""
+    low, high = (
+        (margin_m, margin_m, *[size_m[0]] * 2, 0.0),
+        (596.0 - margin_m, 305.0 - margin_m, *[size_m[1]] * 2, np.pi),
+    )
+    drawn = rng.uniform(low, high, (count, 5)).tolist()
+    return [(x, y, x_radius, y_radius, rotation) for x, y, x_radius, y_radius, rotation in drawn]
+
+
+def _stretched(world: World, lowest_m: float, highest_m: float) -> World:
+    """Scale and shift the heights so that they span the given range (on a 1 m grid)."""
+    x = world.site.west_m + np.arange(0.5, world.site.width_m)
+    y = world.site.south_m + np.arange(0.5, world.site.height_m)
+    heights = world.height_m(x[None, :], y[:, None]) - world.base_m
+    factor = (highest_m - lowest_m) / float(heights.max() - heights.min())
+    return replace(
+        world,
+        base_m=lowest_m - factor * float(heights.min()),
+        hills=tuple(replace(hill, height_m=factor * hill.height_m) for hill in world.hills),
+        waves=tuple(replace(wave, amplitude=factor * wave.amplitude) for wave in world.waves),
+    )
+
+
+def _paper() -> Scenario:
+    """Eleven drives of 1.2 km, mcap and bag in turn, over the paper's site; 60 % of it to train and test in."""
+    world, sensors = paper_world(), Sensors()
+    starts = (
+        (40, 40),
+        (90, 150),
+        (200, 120),
+        (240, 250),
+        (310, 60),
+        (350, 180),
+        (380, 260),
+        (430, 90),
+        (470, 190),
+        (540, 150),
+        (560, 260),
+    )
+    drives = tuple(
+        DriveSpec(
+            f"paper_{number:02d}", Wander(1200.0, start, climbing=0.1), start, "mcap" if number % 2 else "bag",
+            HUSKY_ROS2 if number % 2 else HUSKY_ROS1, sensors, Faults.every(),
+        )
+        for number, start in enumerate(starts, 1)
+    )  # fmt: skip
+    region = ((1.0, 1.0), (398.0, 1.0), (386.0, 120.0), (412.0, 200.0), (396.0, 304.0), (1.0, 304.0))
+    return Scenario("paper", world, drives, region)
+
+
+def _demo() -> Scenario:
+    faults = Faults.every()
+    pose_only = replace(Sensors(), visual=Visual(says="pose"), imu=Imu(rate_hz=100.0, orientation=False))
+    return Scenario(
+        name="demo",
+        world=small_world(),
+        drives=(
+            DriveSpec(
+                "husky_2023-11-14_a", Wander(170.0, (110.0, 30.0)), (110.0, 30.0), "mcap", HUSKY_ROS2, Sensors(), faults
+            ),
+            DriveSpec(
+                "husky_2023-11-14_b", Wander(170.0, (90.0, 55.0)), (90.0, 55.0), "bag", HUSKY_ROS1, pose_only, faults
+            ),
+        ),
+        region_m=_WEST,
+    )
+
+
+def _hills12() -> Scenario:
+    sensors = replace(Sensors(), imu=Imu(rate_hz=200.0))
+    drive = DriveSpec(
+        "hills12",
+        Wander(500.0, (14.0, 34.0), climbing=0.5),
+        (14.0, 34.0),
+        "mcap",
+        Recorder("ros2", "clearpath_power"),
+        sensors,
+        Faults.every(),
+    )
+    return Scenario("hills12", small_world(), (drive,), region_m=_WEST)
+
+
+def tiny(
+    faults: Faults | None = None,
+    *,
+    container: Container = "mcap",
+    recorder: Recorder = HUSKY_ROS2,
+    sensors: Sensors | None = None,
+    seconds: float = 30.0,
+) -> Scenario:
+    """Return a short drive with chosen faults, over a slope, a curve and a turn in place; its rasters are coarse."""
+    length_m = max(seconds - 14.0, 4.0) * 0.85 / 2.0
+    plan = (
+        Pause(2.0),
+        Leg(((14.0 + length_m * 0.6, 34.0), (14.0 + length_m, 34.0 + length_m * 0.3))),
+        Pause(1.0),
+        Turn(2.0),
+        Leg(((14.0 + length_m * 0.5, 34.0 + length_m * 0.55), (14.0, 34.0 + length_m * 0.4)), radius_m=1.5),
+        Pause(1.0),
+    )
+    drive = DriveSpec(
+        "tiny", plan, (14.0, 34.0), container, recorder, sensors if sensors is not None else Sensors(),
+        faults if faults is not None else Faults(),
+    )  # fmt: skip
+    region = ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0))
+    return Scenario("tiny", small_world(), (drive,), region, RasterSpec(0.1, 0.12, 0.1))
+
+
+def _manoeuvres() -> Scenario:
+    plan = (
+        Pause(3.0),
+        Leg(((30.0, 34.0),)),
+        Pause(1.0),
+        Turn(np.pi / 2),
+        Turn(-np.pi),
+        Pause(0.5),
+        Reverse(3.0),
+        Pause(0.5),
+        Leg(((36.0, 44.0), (30.0, 50.0)), radius_m=1.2),
+        Stuck(3.0),
+        Leg(((20.0, 56.0),), command=0.5),
+        Pause(2.0),
+    )
+    drive = DriveSpec("manoeuvres", plan, (14.0, 34.0), "mcap", HUSKY_ROS2, Sensors(), Faults())
+    return Scenario(
+        "manoeuvres",
+        small_world(),
+        (drive,),
+        ((2.0, 2.0), (60.0, 2.0), (60.0, 78.0), (2.0, 78.0)),
+        RasterSpec(0.1, 0.12, 0.1),
+    )
+
+
+SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
+    "demo": _demo,
+    "hills12": _hills12,
+    "paper": _paper,
+    "tiny": tiny,
+    "manoeuvres": _manoeuvres,
+}
+"""Scenarios by name: demo (two drives of 5 minutes), hills12 (12 minutes, all faults), paper (eleven drives of 1.2 km over a site of
+the paper's size), tiny (half a minute), manoeuvres (one of each, no faults)."""
+
+
+def scenario(name: str) -> Scenario:
+    """Return a scenario by name; `UsageError` lists those there are."""
+    if name not in SCENARIOS:
+        raise UsageError(f"scenario {name!r} is unknown; there are {', '.join(SCENARIOS)}")
+    return SCENARIOS[name]()

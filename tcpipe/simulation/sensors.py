@@ -1,0 +1,486 @@
+"""The simulated sensors: what each would have said of the truth, and when the recorder heard it.
+
+A sensor samples at its own rate and phase. Its reading holds the time of measurement as the header tells it, the time of recording, and
+columns in SI units in the sensor's own frame. Each sensor and each fault draws from a random stream of its own, named by a string.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.geometry.rotation import (
+    inverse,
+    product,
+    quat_from_rotation_vector,
+    quat_from_rpy,
+    rotate,
+    rpy_from_quat,
+)
+from tcpipe.simulation.faults import Faults
+from tcpipe.simulation.robot import GRAVITY_MPS2, correlated_noise
+from tcpipe.simulation.site import Float, Site
+from tcpipe.simulation.truth import Truth
+
+CLOCK_STEP_NS = 2_500_000_000
+"""How far header stamps jump with the fault ``clock_step``."""
+
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """What one sensor said: one row a message."""
+
+    stamp_ns: NDArray[np.int64]
+    log_time_ns: NDArray[np.int64]
+    values: dict[str, Any]
+    """Arrays by name, one row a message."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mounting:
+    """base_link_from_sensor."""
+
+    xyz_m: Triple = (0.0, 0.0, 0.0)
+    rpy_rad: Triple = (0.0, 0.0, 0.0)
+
+    def quat_xyzw(self) -> Float:
+        """Return base_link_from_sensor as a quaternion."""
+        return np.asarray(quat_from_rpy(*self.rpy_rad))
+
+
+AT_BASE_LINK = Mounting()
+
+
+@dataclass(frozen=True, slots=True)
+class Gnss:
+    """RTK receiver."""
+
+    rate_hz: float = 10.0
+    std_m: float = 0.015
+    """East and north."""
+    vertical_std_m: float = 0.025
+    covariance: Literal["known", "unknown"] = "known"
+    """Whether the message tells its own deviation."""
+    mounting: Mounting = Mounting((0.1, 0.0, 0.9))
+    outlier_share: float = 0.01
+    outlier_m: float = 1.5
+    outage_s: float = 10.0
+    stamp_jitter_s: float = 0.002
+    delay_s: float = 0.06
+    clock_offset_s: float = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Wheels:
+    """Wheel odometry; its pose is its own dead reckoning."""
+
+    rate_hz: float = 50.0
+    std_mps: float = 0.03
+    yaw_rate_std_radps: float = 0.02
+    covariance: Literal["known", "unknown"] = "known"
+    """unknown: all zero in the message."""
+    scale: float = 1.015
+    yaw_scale: float = 1.08
+    delay_s: float = 0.006
+    clock_offset_s: float = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Imu:
+    """Inertial unit."""
+
+    rate_hz: float = 100.0
+    gyro_std_radps: float = 0.002
+    accelerometer_std_mps2: float = 0.04
+    gyro_bias_radps: float = 0.004
+    accelerometer_bias_mps2: float = 0.06
+    vibration_mps2: float = 0.25
+    """At full speed."""
+    mounting: Mounting = Mounting((0.05, -0.1, 0.3), (np.pi, 0.0, np.pi / 2))
+    orientation: bool = True
+    yaw_offset_rad: float = 0.14
+    orientation_std_rad: float = 0.01
+    delay_s: float = 0.004
+    clock_offset_s: float = -0.10
+
+
+@dataclass(frozen=True, slots=True)
+class Visual:
+    """Visual odometry, in its own child frame."""
+
+    rate_hz: float = 30.0
+    says: Literal["twist", "pose"] = "twist"
+    """pose leaves the twist empty, as the ZED wrapper for ROS 1 does."""
+    covariance: Literal["known", "unknown"] = "known"
+    """unknown: all zero in the message."""
+    std_mps: float = 0.03
+    yaw_rate_std_radps: float = 0.01
+    scale: float = 0.97
+    outlier_share: float = 0.004
+    outlier_mps: float = 2.0
+    dropout_s: float = 3.0
+    mounting: Mounting = Mounting((0.32, 0.06, 0.42), (0.0, 0.1, 0.0))
+    delay_s: float = 0.045
+    clock_offset_s: float = 0.20
+
+
+@dataclass(frozen=True, slots=True)
+class Power:
+    """Voltage and driver currents."""
+
+    rate_hz: float = 20.0
+    averaged: bool = False
+    """Over the period that ends at the stamp, rather than sampled at it."""
+    voltage_std_volt: float = 0.02
+    current_std_amp: float = 0.08
+    voltage_step_volt: float = 0.01
+    current_step_amp: float = 0.05
+    gap_s: float = 1.5
+    electronics_watt: float = 38.0
+    """What computer and user ports draw; reported apart."""
+    delay_s: float = 0.01
+    clock_offset_s: float = 0.25
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """The operator's joystick."""
+
+    rate_hz: float = 20.0
+    jitter: float = 0.012
+    delay_s: float = 0.004
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """The whole set; None leaves a sensor out."""
+
+    gnss: Gnss | None = field(default_factory=Gnss)
+    wheels: Wheels | None = field(default_factory=Wheels)
+    imu: Imu | None = field(default_factory=Imu)
+    visual: Visual | None = field(default_factory=Visual)
+    power: Power | None = field(default_factory=Power)
+    command: Command | None = field(default_factory=Command)
+
+    def mounted(self, faults: Faults) -> Sensors:
+        """Return the sensors where they really sit: at base_link unless the fault that moves them is on."""
+        moved = self
+        if self.gnss is not None and not faults.gnss_lever_arm:
+            moved = replace(moved, gnss=replace(self.gnss, mounting=AT_BASE_LINK))
+        if self.imu is not None and not faults.imu_mounting:
+            moved = replace(moved, imu=replace(self.imu, mounting=AT_BASE_LINK))
+        return moved
+
+
+def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: Noise) -> dict[str, Reading]:
+    """Return what all sensors said of a drive, by sensor (gnss, imu, wheels, visual, power, command); ``sensors`` as mounted."""
+    readings: dict[str, Reading] = {}
+    if sensors.gnss is not None:
+        readings["gnss"] = read_gnss(truth, site, sensors.gnss, faults, noise)
+    if sensors.imu is not None:
+        readings["imu"] = read_imu(truth, sensors.imu, faults, noise)
+    if sensors.wheels is not None:
+        readings["wheels"] = read_wheels(truth, sensors.wheels, faults, noise)
+    if sensors.visual is not None:
+        readings["visual"] = read_visual(truth, sensors.visual, faults, noise)
+    if sensors.power is not None:
+        readings["power"] = read_power(truth, sensors.power, faults, noise)
+    if sensors.command is not None:
+        readings["command"] = read_command(truth, sensors.command, faults, noise)
+    readings = {name: _offset(name, reading, sensors, faults) for name, reading in readings.items()}
+    if faults.clock_step:
+        middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
+        return {name: _stepped(reading, middle_ns) for name, reading in readings.items()}
+    return readings
+
+
+class Noise:
+    """Random streams by name, all from one seed; the same name gives the same numbers."""
+
+    def __init__(self, seed: int, drive: int) -> None:
+        self._key = (seed, drive)
+
+    def __call__(self, name: str) -> np.random.Generator:
+        """Return the stream called ``name``, from its beginning."""
+        return np.random.default_rng([*self._key, zlib.crc32(name.encode())])
+
+
+def read_gnss(truth: Truth, site: Site, sensor: Gnss, faults: Faults, noise: Noise) -> Reading:
+    """Return fixes: lon_deg, lat_deg, alt_m, covariance (N, 9), known, status (-1: no fix)."""
+    stamp = _sample_times(truth, sensor.rate_hz, noise("gnss.phase"))
+    at = truth.at(stamp)
+    enu = at.enu_m + rotate(at.quat_xyzw, np.array(sensor.mounting.xyz_m))
+    deviation = np.array([sensor.std_m, sensor.std_m, sensor.vertical_std_m])
+    if faults.gnss_noise:
+        enu = enu + deviation * noise("gnss.noise").standard_normal(enu.shape)
+    if faults.gnss_outliers:
+        rng = noise("gnss.outliers")
+        hit = rng.random(stamp.size) < sensor.outlier_share
+        enu = enu + hit[:, None] * sensor.outlier_m * rng.standard_normal(enu.shape)
+    lon, lat, alt = site.lonlatalt(enu)
+    status = np.full(stamp.size, 2, dtype=np.int8)
+    keep = np.ones(stamp.size, dtype=bool)
+    if faults.gnss_outage:
+        begin = _middle_ns(truth, noise("gnss.outage"), sensor.outage_s)
+        half = round(sensor.outage_s * 0.5e9)
+        status[(stamp >= begin) & (stamp < begin + half)] = -1
+        keep = (stamp < begin + half) | (stamp >= begin + 2 * half)
+    blind = status < 0
+    lon, lat, alt = (np.where(blind, np.nan, values) for values in (lon, lat, alt))
+    known = sensor.covariance == "known"
+    covariance = np.zeros((stamp.size, 9))
+    covariance[:, [0, 4, 8]] = deviation**2 if known else 0.0
+    values = {"lon_deg": lon, "lat_deg": lat, "alt_m": alt, "covariance": covariance, "status": status}
+    values["covariance_type"] = np.full(stamp.size, 2 if known else 0, dtype=np.uint8)
+    said = stamp
+    if faults.gnss_stamp_jitter:
+        said = stamp + np.round(1e9 * sensor.stamp_jitter_s * noise("gnss.jitter").standard_normal(stamp.size)).astype(
+            np.int64
+        )
+    log_time = _log_times(stamp, sensor.delay_s, faults, noise("gnss.delay"))
+    return _repeated(_kept(Reading(said, log_time, values), keep), faults, noise("gnss.duplicates"))
+
+
+def read_wheels(truth: Truth, sensor: Wheels, faults: Faults, noise: Noise) -> Reading:
+    """Return velocity_mps and yaw_rate_radps as the wheels tell them, and their dead reckoning x_m, y_m, yaw_rad."""
+    stamp = _sample_times(truth, sensor.rate_hz, noise("wheels.phase"))
+    at = truth.at(stamp)
+    velocity = at.wheel_velocity_mps if faults.wheel_slip else at.forward_velocity_mps
+    yaw_rate = at.angular_velocity_radps[:, 2]
+    if faults.wheel_scale:
+        velocity, yaw_rate = velocity * sensor.scale, yaw_rate * sensor.yaw_scale
+    if faults.wheel_noise:
+        rng = noise("wheels.noise")
+        turning = (np.abs(velocity) > 1e-6) | (np.abs(yaw_rate) > 1e-6)  # standing encoders are exactly still
+        velocity = velocity + turning * sensor.std_mps * rng.standard_normal(stamp.size)
+        yaw_rate = yaw_rate + turning * sensor.yaw_rate_std_radps * rng.standard_normal(stamp.size)
+    x, y, yaw = _dead_reckoning(velocity, yaw_rate, 1.0 / sensor.rate_hz)
+    values = {"velocity_mps": velocity, "yaw_rate_radps": yaw_rate, "x_m": x, "y_m": y, "yaw_rad": yaw}
+    return _finish(stamp, sensor.delay_s, values, faults, noise, name="wheels")
+
+
+def read_imu(truth: Truth, sensor: Imu, faults: Faults, noise: Noise) -> Reading:
+    """Return angular_velocity_radps and specific_force_mps2, (N, 3) in the unit's frame, and orientation_xyzw of the unit in ENU."""
+    stamp = _sample_times(truth, sensor.rate_hz, noise("imu.phase"))
+    at = truth.at(stamp)
+    place = truth.enu_m + rotate(truth.quat_xyzw, np.array(sensor.mounting.xyz_m))
+    acceleration = _interpolated(_second_difference(place, truth), truth, stamp)
+    unit_from_base = inverse(sensor.mounting.quat_xyzw())
+    enu_from_unit = product(at.quat_xyzw, sensor.mounting.quat_xyzw())
+    force = rotate(inverse(enu_from_unit), acceleration + np.array([0.0, 0.0, GRAVITY_MPS2]))
+    rate = rotate(unit_from_base, at.angular_velocity_radps)
+    if faults.imu_bias:
+        rate = rate + _wandering(stamp, sensor.gyro_bias_radps, noise("imu.gyro_bias"))
+        force = force + _wandering(stamp, sensor.accelerometer_bias_mps2, noise("imu.accelerometer_bias"))
+    if faults.imu_noise:
+        rate = rate + sensor.gyro_std_radps * noise("imu.gyro_noise").standard_normal(rate.shape)
+        force = force + sensor.accelerometer_std_mps2 * noise("imu.accelerometer_noise").standard_normal(force.shape)
+    if faults.imu_vibration:
+        size = sensor.vibration_mps2 * np.abs(at.wheel_velocity_mps)
+        force = force + size[:, None] * noise("imu.vibration").standard_normal(force.shape)
+    roll, pitch, yaw = rpy_from_quat(at.quat_xyzw).T
+    if faults.imu_yaw_offset:
+        yaw = yaw + sensor.yaw_offset_rad
+    if faults.imu_noise:
+        error = sensor.orientation_std_rad * noise("imu.orientation").standard_normal((3, stamp.size))
+        roll, pitch, yaw = roll + error[0], pitch + error[1], yaw + error[2]
+    orientation = product(quat_from_rpy(roll, pitch, yaw), sensor.mounting.quat_xyzw())
+    values: dict[str, Any] = {
+        "angular_velocity_radps": rate,
+        "specific_force_mps2": force,
+        "orientation_xyzw": orientation,
+    }
+    return _finish(stamp, sensor.delay_s, values, faults, noise, name="imu")
+
+
+def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> Reading:
+    """Return twist (linear and angular, (N, 3) each, in the camera's frame) and the camera's pose in its own odometry frame."""
+    stamp = _sample_times(truth, sensor.rate_hz, noise("visual.phase"))
+    at = truth.at(stamp)
+    base_from_camera = sensor.mounting.quat_xyzw()
+    lever = np.array(sensor.mounting.xyz_m)
+    body_velocity = rotate(inverse(at.quat_xyzw), at.velocity_enu_mps) + np.cross(at.angular_velocity_radps, lever)
+    linear = rotate(inverse(base_from_camera), body_velocity)
+    angular = rotate(inverse(base_from_camera), at.angular_velocity_radps)
+    wrong = np.zeros_like(linear)
+    if faults.visual_scale:
+        linear = linear * sensor.scale
+    if faults.visual_noise:
+        rng = noise("visual.noise")
+        wrong = wrong + sensor.std_mps * rng.standard_normal(linear.shape)
+        angular = angular + sensor.yaw_rate_std_radps * rng.standard_normal(angular.shape)
+    if faults.visual_outliers:
+        rng = noise("visual.outliers")
+        hit = rng.random(stamp.size) < sensor.outlier_share
+        wrong = wrong + hit[:, None] * sensor.outlier_mps * rng.standard_normal(linear.shape)
+    linear = linear + wrong
+    keep = np.ones(stamp.size, dtype=bool)
+    if faults.visual_dropouts:
+        begin = _middle_ns(truth, noise("visual.dropouts"), sensor.dropout_s)
+        keep = (stamp < begin) | (stamp >= begin + round(sensor.dropout_s * 1e9))
+    position, orientation = _camera_pose(at, sensor, faults, wrong, noise)
+    values: dict[str, Any] = {"linear_mps": linear, "angular_radps": angular}
+    values |= {"position_m": position, "orientation_xyzw": orientation}
+    return _finish(stamp, sensor.delay_s, values, faults, noise, name="visual", keep=keep)
+
+
+def read_power(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Reading:
+    """Return voltage_volt, left_amp and right_amp (the drivers), electronics_amp (all else); drawn positive."""
+    stamp = _sample_times(truth, sensor.rate_hz, noise("power.phase"))
+    right = truth.current_amp * truth.right_share
+    series = {"voltage_volt": truth.voltage_volt, "left_amp": truth.current_amp - right, "right_amp": right}
+    if sensor.averaged:
+        period_ns = round(1e9 / sensor.rate_hz)
+        values = {name: _mean_before(truth, series_values, stamp, period_ns) for name, series_values in series.items()}
+    else:
+        values = {name: np.interp(stamp, truth.stamp_ns, series_values) for name, series_values in series.items()}
+    if faults.power_noise:
+        for name in values:
+            volt = name == "voltage_volt"
+            std = sensor.voltage_std_volt if volt else sensor.current_std_amp
+            step = sensor.voltage_step_volt if volt else sensor.current_step_amp
+            noisy = values[name] + std * noise(f"power.{name}").standard_normal(stamp.size)
+            values[name] = np.round(noisy / step) * step
+    values["electronics_amp"] = sensor.electronics_watt / values["voltage_volt"]
+    keep = np.ones(stamp.size, dtype=bool)
+    if faults.power_gap:
+        begin = _middle_ns(truth, noise("power.gap"), sensor.gap_s)
+        keep = (stamp < begin) | (stamp >= begin + round(sensor.gap_s * 1e9))
+    return _finish(stamp, sensor.delay_s, values, faults, noise, name="power", keep=keep)
+
+
+def read_command(truth: Truth, sensor: Command, faults: Faults, noise: Noise) -> Reading:
+    """Return velocity_mps and yaw_rate_radps as commanded."""
+    stamp = _sample_times(truth, sensor.rate_hz, noise("command.phase"))
+    before = np.maximum(np.searchsorted(truth.stamp_ns, stamp, side="right") - 1, 0)
+    velocity, yaw_rate = truth.command_velocity_mps[before], truth.command_yaw_rate_radps[before]
+    if faults.command_jitter:
+        rng = noise("command.jitter")
+        velocity = velocity * (1.0 - sensor.jitter * np.abs(rng.standard_normal(stamp.size)))
+        yaw_rate = yaw_rate + sensor.jitter * rng.standard_normal(stamp.size) * (velocity != 0.0)
+    values: dict[str, Any] = {"velocity_mps": velocity, "yaw_rate_radps": yaw_rate}
+    return _finish(stamp, sensor.delay_s, values, faults, noise, name="command")
+
+
+def _finish(
+    stamp: NDArray[np.int64],
+    delay_s: float,
+    values: dict[str, Any],
+    faults: Faults,
+    noise: Noise,
+    *,
+    name: str,
+    keep: NDArray[np.bool_] | None = None,
+) -> Reading:
+    reading = Reading(stamp, _log_times(stamp, delay_s, faults, noise(f"{name}.delay")), values)
+    if keep is not None:
+        reading = _kept(reading, keep)
+    return _repeated(reading, faults, noise(f"{name}.duplicates"))
+
+
+def _sample_times(truth: Truth, rate_hz: float, rng: np.random.Generator) -> NDArray[np.int64]:
+    period_ns = 1e9 / rate_hz
+    span_ns = truth.stamp_ns[-1] - truth.stamp_ns[0]
+    first = rng.uniform(0.0, period_ns)
+    times = np.arange(first, span_ns, period_ns)
+    return np.asarray(truth.stamp_ns[0] + np.round(times).astype(np.int64))
+
+
+def _log_times(stamp: NDArray[np.int64], delay_s: float, faults: Faults, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Return when the recorder got the messages: at once, or late by a delay with an exponential tail."""
+    if not faults.transport_delay:
+        return stamp
+    late_s = delay_s * (0.7 + 0.3 * rng.exponential(1.0, stamp.size))
+    return np.asarray(stamp + np.round(late_s * 1e9).astype(np.int64))
+
+
+def _kept(reading: Reading, keep: NDArray[np.bool_]) -> Reading:
+    values = {name: values[keep] for name, values in reading.values.items()}
+    return Reading(reading.stamp_ns[keep], reading.log_time_ns[keep], values)
+
+
+def _repeated(reading: Reading, faults: Faults, rng: np.random.Generator) -> Reading:
+    if not faults.duplicates:
+        return reading
+    times = 1 + (rng.random(reading.stamp_ns.size) < 0.002)
+    values = {name: np.repeat(values, times, axis=0) for name, values in reading.values.items()}
+    return Reading(np.repeat(reading.stamp_ns, times), np.repeat(reading.log_time_ns, times), values)
+
+
+def _offset(name: str, reading: Reading, sensors: Sensors, faults: Faults) -> Reading:
+    """Return the reading with header stamps late by its sensor's constant, if that fault is on; the recorder's clock is right."""
+    if not getattr(faults, f"{_SINGULAR.get(name, name)}_clock_offset", False):
+        return reading
+    return replace(reading, stamp_ns=reading.stamp_ns + round(1e9 * getattr(sensors, name).clock_offset_s))
+
+
+_SINGULAR = {"wheels": "wheel"}
+
+
+def _stepped(reading: Reading, middle_ns: int) -> Reading:
+    return replace(
+        reading, stamp_ns=np.where(reading.stamp_ns < middle_ns, reading.stamp_ns, reading.stamp_ns + CLOCK_STEP_NS)
+    )
+
+
+def _middle_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> int:
+    """Return when something of that length begins, somewhere in the middle half of the drive."""
+    span = int(truth.stamp_ns[-1] - truth.stamp_ns[0])
+    return int(truth.stamp_ns[0] + rng.uniform(0.25, 0.75) * max(span - length_s * 1e9, 0.0))
+
+
+def _dead_reckoning(velocity: Float, yaw_rate: Float, dt_s: float) -> tuple[Float, Float, Float]:
+    yaw = np.concatenate([[0.0], np.cumsum(yaw_rate[1:] + yaw_rate[:-1]) * dt_s / 2])
+    step_x, step_y = velocity * np.cos(yaw) * dt_s, velocity * np.sin(yaw) * dt_s
+    return np.cumsum(step_x) - step_x[0], np.cumsum(step_y) - step_y[0], (yaw + np.pi) % (2 * np.pi) - np.pi
+
+
+def _second_difference(place_m: Float, truth: Truth) -> Float:
+    dt_s = float(truth.stamp_ns[1] - truth.stamp_ns[0]) * 1e-9
+    acceleration = np.zeros_like(place_m)
+    acceleration[1:-1] = (place_m[2:] - 2.0 * place_m[1:-1] + place_m[:-2]) / dt_s**2
+    return acceleration
+
+
+def _interpolated(values: Float, truth: Truth, stamp: NDArray[np.int64]) -> Float:
+    return np.stack([np.interp(stamp, truth.stamp_ns, column) for column in values.T], axis=-1)
+
+
+def _wandering(stamp: NDArray[np.int64], size: float, rng: np.random.Generator) -> Float:
+    """Return a constant of about ``size`` per axis that drifts by a fifth of it with a correlation time of 100 s, shape (N, 3)."""
+    constant = size * np.sign(rng.standard_normal(3)) * rng.uniform(0.6, 1.2, 3)
+    step_s = float(np.median(np.diff(stamp))) * 1e-9
+    white = rng.standard_normal((3, stamp.size))
+    drift = [correlated_noise(np.ascontiguousarray(row), float(np.exp(-step_s / 100.0))) for row in white]
+    return constant + 0.2 * size * np.stack(drift, axis=-1)
+
+
+def _mean_before(truth: Truth, values: Float, stamp: NDArray[np.int64], period_ns: int) -> Float:
+    """Return the mean of a series over the period that ends at each stamp."""
+    steps_s = np.diff(truth.stamp_ns) * 1e-9
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * steps_s)])
+    start = np.maximum(stamp - period_ns, truth.stamp_ns[0])
+    area = np.interp(stamp, truth.stamp_ns, integral) - np.interp(start, truth.stamp_ns, integral)
+    return np.asarray(area / np.maximum((stamp - start) * 1e-9, 1e-12))
+
+
+def _camera_pose(at: Truth, sensor: Visual, faults: Faults, wrong_mps: Float, noise: Noise) -> tuple[Float, Float]:
+    """Return the camera's drifting pose: increments of the true pose, scaled, with the velocity errors integrated."""
+    base_from_camera = sensor.mounting.quat_xyzw()
+    enu_from_camera = product(at.quat_xyzw, base_from_camera)
+    place = at.enu_m + rotate(at.quat_xyzw, np.array(sensor.mounting.xyz_m))
+    drift = np.zeros((at.stamp_ns.size, 3))
+    if faults.visual_noise:
+        white = noise("visual.rotation").standard_normal((at.stamp_ns.size, 3))
+        drift = np.cumsum(white, axis=0) * sensor.yaw_rate_std_radps / sensor.rate_hz
+    start_from_camera = product(inverse(enu_from_camera[0]), product(enu_from_camera, quat_from_rotation_vector(drift)))
+    moved = rotate(inverse(enu_from_camera[:-1]), np.diff(place, axis=0))
+    moved = moved * (sensor.scale if faults.visual_scale else 1.0) + wrong_mps[:-1] / sensor.rate_hz
+    steps = rotate(start_from_camera[:-1], moved)
+    return np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)]), start_from_camera

@@ -1,0 +1,205 @@
+"""The files of a simulated site: rasters, class table, split region, logs, truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe import __version__
+from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.geotiff import write_geotiff
+from tcpipe.formats.json_files import to_json, write_json
+from tcpipe.formats.log_writing import write_bag, write_mcap, write_rosbag2
+from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.simulation.drive import drive
+from tcpipe.simulation.messages import streams
+from tcpipe.simulation.route import Wander
+from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario
+from tcpipe.simulation.scenarios import scenario as scenario_by_name
+from tcpipe.simulation.sensors import Noise, Reading, record
+from tcpipe.simulation.truth import Truth
+from tcpipe.simulation.world import World
+from tcpipe.terrain.classes import PAPER_CLASSES
+
+_HEIGHT_NODATA = -9999.0
+_PALETTE = {
+    0: (255, 255, 255), 10: (200, 60, 60), 20: (20, 80, 30), 30: (70, 130, 50),
+    40: (150, 200, 90), 50: (120, 85, 50), 60: (210, 180, 130), 70: (130, 130, 140),
+}  # fmt: skip
+"""Raster values are ten times the class id, so that the class table's ``value`` column matters."""
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedSite:
+    """Where everything was written; one log and one truth a drive, in order."""
+
+    directory: Path
+    logs: tuple[Path, ...]
+    rasters: dict[str, Path]
+    """height, ortho, terrain, classes (the class table)."""
+    region: Path
+    truths: tuple[Path, ...]
+    world: Path
+    unchanged: bool = False
+    """It was there already."""
+
+
+def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> SimulatedSite:
+    """Write a simulated site to ``out``, whole or not at all: the same scenario and seed give the same bytes.
+
+    Where the same site is already, nothing is done.
+
+    Raises
+    ------
+    UsageError
+        The scenario is unknown, or ``out`` holds something else.
+    """
+    chosen = scenario_by_name(scenario) if isinstance(scenario, str) else scenario
+    about = {"seed": seed, "datum": chosen.world.site.datum, "scenario": chosen, "tcpipe_version": __version__}
+    site = _site_at(out, chosen)
+    if _holds(site, about):
+        return replace(site, unchanged=True)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out}: exists and is not this simulated site; give another directory")
+    with atomic_directory(out) as directory:
+        half = _site_at(directory, chosen)
+        for index, spec in enumerate(chosen.drives):
+            truth, readings = simulated_drive(chosen, index, seed=seed)
+            write_table(truth.table(), half.truths[index])
+            _write_log(half.logs[index], spec, readings, geoid_m=chosen.world.site.geoid_m)
+        write_json(half.region, _region(chosen))
+        write_rasters(directory / "maps", chosen.world, chosen.rasters)
+        write_json(half.world, about)
+    return site
+
+
+def _site_at(out: Path, scenario: Scenario) -> SimulatedSite:
+    suffixes = {"mcap": ".mcap", "bag": ".bag"}
+    return SimulatedSite(
+        out,
+        tuple(out / "logs" / f"{spec.name}{suffixes.get(spec.container, '')}" for spec in scenario.drives),
+        _raster_paths(out / "maps"),
+        out / "region.geojson",
+        tuple(out / "truth" / f"{spec.name}.parquet" for spec in scenario.drives),
+        out / "world.json",
+    )
+
+
+def _holds(site: SimulatedSite, about: Mapping[str, Any]) -> bool:
+    files = (*site.logs, *site.rasters.values(), site.region, *site.truths, site.world)
+    return all(path.exists() for path in files) and site.world.read_bytes() == to_json(about).encode()
+
+
+def simulated_drive(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, dict[str, Reading]]:
+    """Return the truth of one drive of a scenario, and what its sensors said; nothing is written."""
+    spec, noise = scenario.drives[index], Noise(seed, index)
+    plan = spec.plan.plan(scenario.world, noise("plan")) if isinstance(spec.plan, Wander) else spec.plan
+    truth = drive(
+        scenario.world,
+        plan,
+        start_m=spec.start_m,
+        start_yaw_rad=spec.start_yaw_rad,
+        start_ns=scenario.start_ns(index),
+        robot=spec.robot,
+        weave_m=spec.weave_m,
+        rng=noise("drive"),
+    )
+    sensors = spec.recorder.heard(spec.sensors).mounted(spec.faults)
+    return truth, record(truth, scenario.world.site, sensors, spec.faults, noise)
+
+
+def read_truth(path: Path) -> Truth:
+    """Read a truth file that `simulate` wrote."""
+    return Truth.from_table(read_table(path))
+
+
+def _write_log(path: Path, spec: DriveSpec, readings: dict[str, Reading], *, geoid_m: float) -> None:
+    messages = streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=geoid_m)
+    match spec.container:
+        case "mcap":
+            write_mcap(path, messages, encoding="ros1" if spec.recorder.dialect == "ros1" else "cdr")
+        case "bag":
+            write_bag(path, messages)
+        case "rosbag2":
+            write_rosbag2(path, messages)
+        case "rosbag2_mcap":
+            write_rosbag2(path, messages, storage="mcap")
+
+
+def write_rasters(directory: Path, world: World, spec: RasterSpec) -> dict[str, Path]:
+    """Write height (float32), ortho (RGBA) and terrain (palette) GeoTIFFs and the class table."""
+    paths = _raster_paths(directory)
+    _write_raster(
+        paths["height"], world, spec.height_pitch_m, (0.0, 0.0), _height_pixels, dtype="float32", nodata=_HEIGHT_NODATA
+    )
+    _write_raster(paths["ortho"], world, spec.ortho_pitch_m, spec.ortho_shift_m, _ortho_pixels, dtype="uint8", bands=4)
+    _write_raster(
+        paths["terrain"], world, spec.terrain_pitch_m, spec.terrain_shift_m, _terrain_pixels,
+        dtype="uint8", nodata=0, palette=_PALETTE,
+    )  # fmt: skip
+    lines = [f"{10 * c.id},{c.id},{c.name},{str(c.traversable).lower()}" for c in PAPER_CLASSES.classes]
+    write_text(paths["classes"], "\n".join(["value,id,name,traversable", *lines, ""]))
+    return paths
+
+
+def _raster_paths(directory: Path) -> dict[str, Path]:
+    rasters = {name: directory / f"{name}.tif" for name in ("height", "ortho", "terrain")}
+    return {**rasters, "classes": directory / "classes.csv"}
+
+
+def _write_raster(
+    path: Path,
+    world: World,
+    pitch_m: float,
+    shift_m: tuple[float, float],
+    pixels: Callable[[World, NDArray[np.float64], NDArray[np.float64]], NDArray[Any]],
+    **options: Any,
+) -> None:
+    site = world.site
+    rows, cols = round(site.height_m / pitch_m), round(site.width_m / pitch_m)
+    west, north = site.west_m + shift_m[0], site.south_m + site.height_m + shift_m[1]
+    x = (west + (np.arange(cols) + 0.5) * pitch_m).astype(np.float64)
+
+    def strip(first: int, last: int) -> NDArray[Any]:
+        y = (north - (np.arange(first, last) + 0.5) * pitch_m).astype(np.float64)
+        return pixels(world, x[None, :], y[:, None])
+
+    write_geotiff(
+        path,
+        strip,
+        rows=rows,
+        cols=cols,
+        affine=(pitch_m, 0.0, west, 0.0, -pitch_m, north),
+        crs=f"EPSG:{site.epsg}",
+        **options,
+    )
+
+
+def _height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[Any]:
+    return np.where(world.mapped(x, y), world.height_m(x, y), _HEIGHT_NODATA).astype(np.float32)[None]
+
+
+def _ortho_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[Any]:
+    mapped = world.mapped(x, y)
+    rgb = np.where(mapped[..., None], np.clip(np.round(world.ortho(x, y)), 0, 255), 0)
+    return np.concatenate([np.moveaxis(rgb, -1, 0), np.where(mapped, 255, 0)[None]]).astype(np.uint8)
+
+
+def _terrain_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[Any]:
+    return np.where(world.mapped(x, y), 10 * world.terrain_class(x, y), 0).astype(np.uint8)[None]
+
+
+def _region(scenario: Scenario) -> dict[str, Any]:
+    site = scenario.world.site
+    corners = np.array(scenario.region_m) + np.array([site.west_m, site.south_m])
+    lon, lat = site.lonlat_deg(corners[:, 0], corners[:, 1])
+    ring = [[round(float(a), 9), round(float(b), 9)] for a, b in zip(lon, lat, strict=True)]
+    geometry = {"type": "Polygon", "coordinates": [[*ring, ring[0]]]}
+    feature = {"type": "Feature", "properties": {"name": "train and test"}, "geometry": geometry}
+    return {"type": "FeatureCollection", "features": [feature]}

@@ -1,0 +1,155 @@
+"""What really happened: the exact motion and power of a drive, at every step of the simulation, and the true cost of a metre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.compiled import kernel
+from tcpipe.geometry.rotation import normalized, rpy_from_quat
+from tcpipe.simulation.site import Float
+
+_COMPONENTS = {
+    "enu_m": ("east_m", "north_m", "up_m"),
+    "quat_xyzw": ("quat_x", "quat_y", "quat_z", "quat_w"),
+    "velocity_enu_mps": ("velocity_east_mps", "velocity_north_mps", "velocity_up_mps"),
+    "angular_velocity_radps": ("angular_velocity_x_radps", "angular_velocity_y_radps", "angular_velocity_z_radps"),
+}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """One drive at 200 Hz; all arrays have one row a step, and base_link stands on the ground.
+
+    The local plane is east, north, up of the site's datum; ``quat_xyzw`` is enu_from_base_link; velocities are of base_link.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    x_map_m: Float
+    y_map_m: Float
+    lon_deg: Float
+    lat_deg: Float
+    alt_m: Float
+    """Above the ellipsoid."""
+    enu_m: Float
+    quat_xyzw: Float
+    velocity_enu_mps: Float
+    angular_velocity_radps: Float
+    """In base_link, shape (N, 3)."""
+    forward_velocity_mps: Float
+    """Along base_link's x, on the surface."""
+    wheel_velocity_mps: Float
+    slip: Float
+    slope_rad: Float
+    """Along base_link's x, positive uphill."""
+    terrain_class: NDArray[np.uint8]
+    command_velocity_mps: Float
+    command_yaw_rate_radps: Float
+    voltage_volt: Float
+    current_amp: Float
+    """Propulsion, both drivers, drawn positive."""
+    right_share: Float
+    """Of the current, drawn by the right driver."""
+    power_watt: Float
+    energy_joule: Float
+    """Since the start."""
+    distance_m: Float
+    """Horizontal way since the start."""
+
+    def at(self, stamp_ns: NDArray[np.int64]) -> Truth:
+        """Return the truth at other times, linear between steps; beyond the ends it is held."""
+        position = np.interp(stamp_ns, self.stamp_ns, np.arange(self.stamp_ns.size))
+        low = np.minimum(position.astype(np.int64), self.stamp_ns.size - 2)
+        part = position - low
+
+        def between(values: Float) -> Float:
+            weight = part if values.ndim == 1 else part[:, None]
+            return np.asarray(values[low] + weight * (values[low + 1] - values[low]))
+
+        new = {
+            f.name: between(getattr(self, f.name))
+            for f in fields(self)
+            if f.name not in ("stamp_ns", "terrain_class", "quat_xyzw")
+        }
+        first, second = self.quat_xyzw[low], self.quat_xyzw[low + 1]
+        second = np.where(np.sum(first * second, axis=1, keepdims=True) < 0, -second, second)
+        quat = normalized(first + part[:, None] * (second - first))
+        return Truth(
+            stamp_ns=stamp_ns,
+            terrain_class=self.terrain_class[np.round(position).astype(np.int64)],
+            quat_xyzw=quat,
+            **new,
+        )
+
+    def table(self) -> pa.Table:
+        """Return one row a step; what has several components becomes several columns, and roll, pitch, yaw are added."""
+        flat = {f.name: getattr(self, f.name) for f in fields(self) if f.name not in _COMPONENTS}
+        for name, columns in _COMPONENTS.items():
+            flat |= dict(zip(columns, getattr(self, name).T, strict=True))
+        flat |= dict(zip(("roll_rad", "pitch_rad", "yaw_rad"), rpy_from_quat(self.quat_xyzw).T, strict=True))
+        return pa.table({name: np.ascontiguousarray(values) for name, values in flat.items()})
+
+    @classmethod
+    def from_table(cls, table: pa.Table) -> Truth:
+        """Return the truth that `table` made."""
+
+        def column(name: str) -> NDArray[Any]:
+            return np.asarray(table.column(name).to_numpy())
+
+        many = {name: np.stack([column(c) for c in columns], axis=-1) for name, columns in _COMPONENTS.items()}
+        return cls(**many, **{f.name: column(f.name) for f in fields(cls) if f.name not in _COMPONENTS})
+
+
+@dataclass(frozen=True, slots=True)
+class TrueCost:
+    """The cost of the true metre that begins at given times; NaN where the drive ends before a metre is driven."""
+
+    end_ns: Float
+    duration_s: Float
+    energy_joule: Float
+    power_watt: Float
+    velocity_mps: Float
+    arc_length_m: Float
+
+
+def true_cost(truth: Truth, start_ns: NDArray[np.int64], chord_m: float = 1.0) -> TrueCost:
+    """Return what the metre cost that begins where the robot truly was at ``start_ns``, shape (N,).
+
+    It ends at the first crossing of the horizontal distance ``chord_m`` from there, found within a step by linear motion.
+    """
+    seconds = (truth.stamp_ns - truth.stamp_ns[0]) * 1e-9
+    start = (np.asarray(start_ns, dtype=np.int64) - truth.stamp_ns[0]) * 1e-9
+    end = _crossing(seconds, np.ascontiguousarray(truth.enu_m[:, :2]), start, chord_m)
+    duration = end - start
+    energy = np.interp(end, seconds, truth.energy_joule) - np.interp(start, seconds, truth.energy_joule)
+    arc = np.interp(end, seconds, truth.distance_m) - np.interp(start, seconds, truth.distance_m)
+    return TrueCost(truth.stamp_ns[0] + end * 1e9, duration, energy, energy / duration, chord_m / duration, arc)
+
+
+@kernel
+def _crossing(seconds: Float, xy_m: Float, start_s: Float, chord_m: float) -> Float:
+    """Return when the distance from the place at each start first reaches the chord [s]; NaN if never."""
+    end = np.full(start_s.size, np.nan)
+    last = seconds.size - 1
+    for k in range(start_s.size):
+        if not (seconds[0] <= start_s[k] <= seconds[last]):
+            continue
+        i = min(np.searchsorted(seconds, start_s[k], side="right") - 1, last - 1)
+        part = (start_s[k] - seconds[i]) / (seconds[i + 1] - seconds[i])
+        x0 = xy_m[i, 0] + part * (xy_m[i + 1, 0] - xy_m[i, 0])
+        y0 = xy_m[i, 1] + part * (xy_m[i + 1, 1] - xy_m[i, 1])
+        for j in range(i + 1, last + 1):
+            bx, by = xy_m[j, 0] - x0, xy_m[j, 1] - y0
+            if bx * bx + by * by < chord_m * chord_m:
+                continue
+            dx, dy = xy_m[j, 0] - xy_m[j - 1, 0], xy_m[j, 1] - xy_m[j - 1, 1]
+            ax, ay = bx - dx, by - dy
+            a, b, c = dx * dx + dy * dy, ax * dx + ay * dy, ax * ax + ay * ay - chord_m * chord_m
+            u = (-b + np.sqrt(b * b - a * c)) / a
+            end[k] = seconds[j - 1] + u * (seconds[j] - seconds[j - 1])
+            break
+    return end

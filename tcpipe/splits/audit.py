@@ -1,0 +1,116 @@
+"""The leakage audit: how much of what tests has been seen in training, measured on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.splits.neighbours import near_pairs, nearest_m, shared_fraction
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_CONTACT_FRACTION = 1e-3
+"""Footprints that share less of their area than this touch; consecutive segments always do."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """One held-out split against train; counts are of samples or of pairs of samples."""
+
+    split: str
+    """``test`` or ``unseen``."""
+    samples: int
+    """Samples in it."""
+    overlapping_samples: int
+    """Those whose footprint shares ground with a train footprint."""
+    overlapping_pairs: int
+    """Pairs of footprints, one held out and one in train, that share ground."""
+    same_track_pairs: int
+    """Pairs that follow one another on one track, one held out and one in train."""
+    repeated_place_samples: int
+    """Those that share ground with a train footprint of another run."""
+    nearest_train_min_m: float | None
+    """Distance between the nearest footprints of the two splits [m]; None where one is empty."""
+    nearest_train_median_m: float | None
+    """Median over the held-out samples of the distance to the nearest train footprint [m]."""
+
+
+def audit_leakage(
+    split: NDArray[np.str_], run: Ints, start_ns: Ints, corners_xy_m: Floats, *, chord_m: float
+) -> tuple[HeldOut, ...]:
+    """Measure test and unseen against train.
+
+    Parameters
+    ----------
+    split, run
+        Split of each sample, and the number of its run, shape (N,).
+    start_ns
+        Start of each sample's segment [ns], shape (N,).
+    corners_xy_m
+        Corners of the footprints [m], shape (N, 4, 2).
+    chord_m
+        Segment length: samples follow one another if their centres are at most 1.5 chords apart [m].
+
+    Returns
+    -------
+    One entry for ``test`` and one for ``unseen``.
+
+    """
+    follows = _consecutive(run, start_ns, corners_xy_m.mean(axis=1), chord_m=chord_m)
+    return tuple(_audit(name, split, run, follows, corners_xy_m) for name in ("test", "unseen"))
+
+
+def audit_lines(audit: Sequence[HeldOut]) -> Iterator[str]:
+    """Yield the audit as plain lines to print."""
+    for part in audit:
+        if part.samples == 0:
+            continue
+        if part.nearest_train_min_m is None or part.nearest_train_median_m is None:
+            yield f"{part.split}: {part.samples} samples; nothing trains"
+            continue
+        yield (
+            f"{part.split}: {part.samples} samples, {part.overlapping_samples} share ground with train "
+            f"({part.repeated_place_samples} of them with another run), {part.same_track_pairs} neighbours on one track; "
+            f"nearest train footprint {part.nearest_train_min_m:.2f} m, median {part.nearest_train_median_m:.2f} m"
+        )
+
+
+def _consecutive(run: Ints, start_ns: Ints, centres_xy_m: Floats, *, chord_m: float) -> Ints:
+    """Return index pairs of samples that follow one another on one track, shape (P, 2)."""
+    order = np.lexsort((start_ns, run))
+    before, after = order[:-1], order[1:]
+    apart_m = np.linalg.norm(centres_xy_m[after] - centres_xy_m[before], axis=1)
+    adjoining = (run[before] == run[after]) & (apart_m <= 1.5 * chord_m)
+    return np.column_stack([before[adjoining], after[adjoining]])
+
+
+def _audit(name: str, split: NDArray[np.str_], run: Ints, follows: Ints, corners_xy_m: Floats) -> HeldOut:
+    held, train = np.flatnonzero(split == name), np.flatnonzero(split == "train")
+    ours, theirs = corners_xy_m[held], corners_xy_m[train]
+    pairs, overlaps, repeated = 0, np.zeros(len(held), np.bool_), np.zeros(len(held), np.bool_)
+    for i, j in near_pairs(ours.mean(axis=1), theirs.mean(axis=1), within_m=_diagonal_m(corners_xy_m)):
+        real = shared_fraction(ours, theirs, i, j) > _CONTACT_FRACTION
+        pairs += int(real.sum())
+        overlaps[i[real]] = True
+        repeated[i[real & (run[held[i]] != run[train[j]])]] = True
+    crossing = (split[follows] == name).any(axis=1) & (split[follows] == "train").any(axis=1)
+    apart_m = nearest_m(ours, theirs)
+    return HeldOut(
+        split=name,
+        samples=len(held),
+        overlapping_samples=int(overlaps.sum()),
+        overlapping_pairs=pairs,
+        same_track_pairs=int(crossing.sum()),
+        repeated_place_samples=int(repeated.sum()),
+        nearest_train_min_m=float(apart_m.min()) if len(apart_m) else None,
+        nearest_train_median_m=float(np.median(apart_m)) if len(apart_m) else None,
+    )
+
+
+def _diagonal_m(corners_xy_m: Floats) -> float:
+    """Return the longest diagonal: centres farther apart share no ground."""
+    return float(np.linalg.norm(corners_xy_m[:, 2] - corners_xy_m[:, 0], axis=1).max(initial=0.0))

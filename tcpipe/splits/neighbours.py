@@ -1,0 +1,75 @@
+"""Pairs of footprints that are near each other, by their corners in one metric plane, in bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from tcpipe.splits.squares_kernel import pair_distances, pair_overlaps
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_CHUNK = 16_384
+"""Footprints looked at together."""
+
+
+def near_pairs(ours_xy_m: Floats, theirs_xy_m: Floats, *, within_m: float) -> Iterator[tuple[Ints, Ints]]:
+    """Yield the index pairs of points at most ``within_m`` apart [m]: ``ours`` (N, 2) against ``theirs`` (M, 2), chunk by chunk of ours."""
+    if len(ours_xy_m) == 0 or len(theirs_xy_m) == 0:
+        return
+    tree = cKDTree(theirs_xy_m)
+    for first in range(0, len(ours_xy_m), _CHUNK):
+        mine = cKDTree(ours_xy_m[first : first + _CHUNK])
+        found = mine.sparse_distance_matrix(tree, within_m, output_type="ndarray")
+        order = np.lexsort((found["j"], found["i"]))
+        yield found["i"][order] + first, found["j"][order]
+
+
+def shared_fraction(ours: Floats, theirs: Floats, i: Ints, j: Ints) -> Floats:
+    """Return the share of the ground of ``ours[i]`` that ``theirs[j]`` covers too, (P,); corners counter-clockwise, (N, 4, 2)."""
+    shared_m2 = np.empty(len(i))
+    pair_overlaps(ours, theirs, i, j, shared_m2)
+    side_m = np.linalg.norm(ours[:, 1] - ours[:, 0], axis=1)
+    return np.asarray(shared_m2 / side_m[i] ** 2)
+
+
+def nearest_m(ours: Floats, theirs: Floats) -> Floats:
+    """Return the distance from each of ``ours`` to the nearest of ``theirs`` [m], (N,); empty if either is.
+
+    Parameters
+    ----------
+    ours, theirs
+        Corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
+
+    """
+    if len(ours) == 0 or len(theirs) == 0:
+        return np.empty(0)
+    tree = cKDTree(theirs.mean(axis=1))
+    reach_m = _half_diagonal_m(ours) + _half_diagonal_m(theirs)
+    best_m = np.full(len(ours), np.inf)
+    pending = [(rows, 8) for rows in _parts(np.arange(len(ours)), _CHUNK)]
+    while pending:
+        rows, count = pending.pop()
+        asked = min(count, len(theirs))
+        distances_m, j = tree.query(ours[rows].mean(axis=1), k=np.arange(1, asked + 1))
+        apart_m = np.empty(j.size)
+        pair_distances(ours, theirs, np.repeat(rows, asked), j.reshape(-1).astype(np.int64), apart_m)
+        best_m[rows] = apart_m.reshape(-1, asked).min(axis=1)
+        # squares are nearer than their centres by at most two half diagonals: what is farther still cannot win
+        doubtful = rows[(best_m[rows] > np.asarray(distances_m)[:, -1] - reach_m) & (best_m[rows] > 0.0)]
+        if asked < len(theirs):
+            pending += [(part, 4 * count) for part in _parts(doubtful, max(_CHUNK * 2 // count, 1))]
+    return best_m
+
+
+def _parts(rows: Ints, size: int) -> list[Ints]:
+    return [rows[first : first + size] for first in range(0, len(rows), size)]
+
+
+def _half_diagonal_m(corners: Floats) -> float:
+    across: Floats = corners[:, 2] - corners[:, 0]
+    return float(np.hypot(across[:, 0], across[:, 1]).max()) / 2.0

@@ -1,0 +1,119 @@
+"""Regions of a split and the side on which each patch footprint lies (paper section IV-C; docs/explanation/rulings.md, Split).
+
+A footprint belongs to a region only if the whole rotated square is inside; one that straddles a border, or is nearer to it
+than the buffer, belongs to none. What no region covers is unseen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
+
+Floats = NDArray[np.float64]
+Project = Callable[[Floats], Floats]
+
+_EDGE_STEP_DEG = 0.001
+"""Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
+
+_CHUNK = 65_536
+"""Footprints that are geometries at one time (0.5 kB each)."""
+
+
+class Side(IntEnum):
+    """Where a footprint lies."""
+
+    INSIDE = 0
+    """In a train_test region: trains or tests."""
+    UNSEEN = 1
+    """In an unseen region, or outside every region."""
+    BUFFER = 2
+    """On a border, or nearer to one than the buffer: in no split."""
+    EXCLUDED = 3
+    """In an exclude region: not in the dataset."""
+
+
+@dataclass(frozen=True, slots=True)
+class Regions:
+    """Polygons of each kind, dissolved, in one plane; ``exclude`` carves out of the other two."""
+
+    train_test: BaseGeometry
+    unseen: BaseGeometry = field(default_factory=shapely.MultiPolygon)
+    exclude: BaseGeometry = field(default_factory=shapely.MultiPolygon)
+
+    def borders(self) -> BaseGeometry:
+        """Return every border, as lines."""
+        carved = (shapely.difference(self.train_test, self.exclude), shapely.difference(self.unseen, self.exclude))
+        return shapely.union_all([shapely.boundary(part) for part in (*carved, self.exclude)])
+
+
+def project_regions(regions: Regions, project: Project, *, window_deg: tuple[float, float, float, float]) -> Regions:
+    """Carry regions from lon/lat into a metric plane.
+
+    Parameters
+    ----------
+    regions
+        In WGS84 lon/lat [deg].
+    project
+        Takes lon and lat [deg], shape (N, 2), and returns x and y [m], shape (N, 2).
+    window_deg
+        West, south, east, north of what matters: regions are cut to it, since a projection is sound only near its zone.
+
+    Returns
+    -------
+    The regions in the plane of ``project`` [m], their edges followed as straight in lon/lat (RFC 7946).
+
+    """
+
+    def carry(geometry: BaseGeometry) -> BaseGeometry:
+        near = shapely.intersection(geometry, shapely.box(*window_deg))
+        stepped = shapely.segmentize(near, _EDGE_STEP_DEG)
+        return shapely.transform(stepped, project)
+
+    return Regions(carry(regions.train_test), carry(regions.unseen), carry(regions.exclude))
+
+
+def sides_of(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDArray[np.uint8]:
+    """Return the `Side` of every footprint.
+
+    Parameters
+    ----------
+    corners_xy_m
+        Corners of the footprints in order around each square [m], shape (N, 4, 2).
+    regions
+        In the same plane [m].
+    buffer_m
+        A footprint nearer than this to any border goes to `Side.BUFFER` [m].
+
+    Returns
+    -------
+    Sides, shape (N,).
+
+    """
+    usable, borders = shapely.difference(regions.train_test, regions.exclude), regions.borders()
+    for geometry in (usable, regions.exclude, borders):
+        shapely.prepare(geometry)
+    sides = np.full(len(corners_xy_m), Side.UNSEEN, np.uint8)
+    for first in range(0, len(sides), _CHUNK):
+        part = sides[first : first + _CHUNK]
+        squares = shapely.polygons(corners_xy_m[first : first + _CHUNK])
+        centres = shapely.points(corners_xy_m[first : first + _CHUNK].mean(axis=1))
+        part[shapely.contains(usable, centres)] = Side.INSIDE
+        part[_on_border(squares, borders, buffer_m=buffer_m)] = Side.BUFFER
+        part[shapely.covers(regions.exclude, squares)] = Side.EXCLUDED
+    return sides
+
+
+def _on_border(squares: NDArray[np.object_], borders: BaseGeometry, *, buffer_m: float) -> NDArray[np.bool_]:
+    """Tell which squares a border runs through, or passes nearer than the buffer."""
+    found = np.zeros(len(squares), np.bool_)
+    close = np.flatnonzero(shapely.dwithin(borders, squares, buffer_m))
+    near = shapely.distance(borders, squares[close]) < buffer_m
+    through = shapely.intersects(borders, squares[close]) & ~shapely.touches(borders, squares[close])
+    found[close] = near | through
+    return found

@@ -1,0 +1,65 @@
+"""What the sensors' clocks look like: constant offsets between them, for the manifest, and the recipe line that would correct each."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pyarrow.compute as pc
+
+from tcpipe.fusion.clock_offsets import POWER, ClockOffsets, PowerSignal, find_clock_offsets
+from tcpipe.fusion.rails import power_at
+from tcpipe.stages.fuse_inputs import Inputs, rails_of
+from tcpipe.stages.fuse_sanity import longest_epoch
+from tcpipe.tables.levels import Findings, Streams
+
+_MAX_GAP_NS = 300_000_000
+_FINE_S = 0.004
+
+
+def clock_findings(streams: Streams, inputs: Inputs) -> Findings:
+    """Return the offsets between the sensors' clocks in the longest clock epoch; nothing is corrected.
+
+    Facts: every pair compared (``pairs``), the ``reference`` clock, and by role ``offset_s`` (how late its stamps are), ``std_s``,
+    ``noted`` and ``recipe`` (the lines that would correct it, the recipe's own offset included).
+    """
+    if not inputs.measurements:
+        return Findings()
+    epoch = longest_epoch(inputs)
+    found = find_clock_offsets(inputs.measurements[epoch], _power(streams, epoch))
+    given_s: dict[str, float] = streams.findings.facts.get("time_offset_s", {})
+    roles, warnings = {}, []
+    for role, offset in found.offsets.items():
+        entry = f"{role} = {given_s.get(role, 0.0) - offset.offset_s:.{3 if offset.std_s < _FINE_S else 2}f}"
+        roles[role] = {**asdict(offset), "recipe": f"[read.time_offset_s]\n{entry}"}
+        if offset.noted:
+            warnings.append(
+                f"{role}: its stamps seem {abs(offset.offset_s):.2f} s {'late' if offset.offset_s > 0 else 'early'} against "
+                f"{found.reference} (± {2 * offset.std_s:.2f} s, by {_means(found, role)}); nothing is corrected; "
+                f"to correct it, write in the recipe under [read.time_offset_s]: {entry}"
+            )
+    facts = {
+        "epoch": epoch,
+        "reference": found.reference,
+        "pairs": [{**asdict(pair), "determined": pair.determined} for pair in found.pairs],
+        "offsets": roles,
+    }
+    return Findings(tuple(warnings), facts)
+
+
+def _means(found: ClockOffsets, role: str) -> str:
+    """Return by what the role was compared."""
+    return " and ".join(dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against}))
+
+
+def _power(streams: Streams, epoch: int) -> PowerSignal | None:
+    if POWER not in streams.tables:
+        return None
+    table = streams.tables[POWER]
+    rails = rails_of(table.filter(pc.equal(table["epoch"], epoch)))
+    if not rails or any(rail.current_ns.size < 2 for rail in rails):
+        return None
+    stamp_ns = np.unique(np.concatenate([rail.current_ns for rail in rails]))
+    _, _, watt = power_at(rails, stamp_ns, averaged=streams.power_averaged, max_gap_ns=_MAX_GAP_NS)
+    known = np.isfinite(watt)
+    return PowerSignal(stamp_ns[known], watt[known], streams.power_averaged) if known.sum() > 1 else None

@@ -1,0 +1,120 @@
+"""What fusing noticed: facts for the manifest, warnings for people, and the table of refused measurements."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InitialState
+from tcpipe.fusion.stretches import Stretch
+from tcpipe.fusion.trajectory import Trajectory
+from tcpipe.geometry.rotation import rpy_from_quat
+from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.tables.levels import REJECTIONS
+
+_MANY_REFUSED = 0.2
+
+
+def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> dict[str, Any]:
+    """Return the facts of one stretch."""
+    m = stretch.measurements
+    used = {GNSS: m.gnss, IMU: m.imu, WHEELS: m.wheels, VISUAL: m.visual}
+    return {
+        "epoch": stretch.epoch,
+        "start_ns": stretch.start_ns,
+        "end_ns": stretch.end_ns,
+        "rows": int(found.stamp_ns.size),
+        "sensors": [role for role, source in used.items() if source is not None],
+        "gyro_noise_radps": None if m.imu is None else m.imu.gyro_std_radps,
+        "accelerometer_noise_mps2": None if m.imu is None else m.imu.accelerometer_std_mps2,
+        "initial_yaw_rad": float(rpy_from_quat(initial.quat_xyzw)[2]),
+        "initial_yaw_std_rad": initial.yaw_std_rad,
+        "heading_from": initial.heading_from,
+        **found.facts,
+    }
+
+
+def fuse_facts(inputs: Inputs, stretches: list[dict[str, Any]], *, rows: int, skipped_s: float) -> dict[str, Any]:
+    """Return the facts of the run: counts by role over all stretches, what was set aside, and each stretch."""
+    roles = sorted({role for stretch in stretches for role in stretch["measurements"]})
+    counts = {
+        name: {role: sum(stretch[name].get(role, 0) for stretch in stretches) for role in roles}
+        for name in ("measurements", "rejected")
+    }
+    nis: dict[str, float] = {}
+    for role in roles:
+        known = [
+            (s["nis_mean"][role], s["measurements"][role]) for s in stretches if s["nis_mean"].get(role) is not None
+        ]
+        if known:
+            nis[role] = float(np.average([mean for mean, _ in known], weights=[count for _, count in known]))
+    return {
+        "rows": rows,
+        "sensors": sorted({role for stretch in stretches for role in stretch["sensors"]}),
+        **counts,
+        "nis_mean": nis,
+        "set_aside": inputs.counts,
+        "skipped_s": skipped_s,
+        "stretches": stretches,
+    }
+
+
+def fuse_warnings(inputs: Inputs, stretches: list[dict[str, Any]], summary: dict[str, Any]) -> tuple[str, ...]:
+    """Return what a person should know before trusting the track."""
+    found = list(inputs.remarks)
+    if inputs.datum_deg_m is None:
+        found.append(
+            "no GNSS fix: the track is in a local frame that starts at 0, 0, 0; it cannot be sampled from a map"
+        )
+    else:
+        found += [
+            f"clock epoch {stretch['epoch']}: no 5 m of course over ground, so its initial yaw is from {stretch['heading_from']}"
+            for stretch in stretches
+            if stretch["heading_from"] != "course over ground"
+        ]
+    found += [
+        f"gnss: many fixes lie beyond their claimed deviation; it is taken {stretch['gnss_variance_factor'] ** 0.5:.0f} times as large: "
+        "check its clock (read.time_offset_s) and its lever arm (read.placement)"
+        for stretch in stretches
+        if stretch.get("gnss_variance_factor", 1.0) > 1.0
+    ]
+    if IMU not in summary["sensors"]:
+        found.append("no IMU: attitude is inferred from the path; roll and pitch are weak")
+    found += [
+        f"{role}: {summary['rejected'][role]} of {count} measurements were refused by the gate (rejections.parquet)"
+        for role, count in summary["measurements"].items()
+        if summary["rejected"][role] > _MANY_REFUSED * count
+    ]
+    for key, text in (
+        ("variances_replaced", "rows without a usable variance; the recipe's is used"),
+        ("invalid", "rows without a usable value"),
+    ):
+        found += [f"{role}: {count[key]} {text}" for role, count in inputs.counts.items() if count[key]]
+    if summary["skipped_s"]:
+        found.append(f"{summary['skipped_s']:.1f} s between pauses or clock steps hold too little to place a track")
+    return tuple(found)
+
+
+def rejections_table(inputs: Inputs, found: list[Trajectory]) -> pa.Table:
+    """Return every refused measurement in order of time: by the gate, and those without a usable value."""
+    parts = [trajectory.rejections for trajectory in found]
+    invalid = [(role, np.concatenate(stamps)) for role, stamps in sorted(inputs.invalid_ns.items())]
+    size = sum(stamps.size for _, stamps in invalid)
+    unknown = np.full(size, np.nan)
+    columns = {
+        "stamp_ns": [p.stamp_ns for p in parts] + [stamps for _, stamps in invalid],
+        "role": [p.role for p in parts] + [np.full(stamps.size, role) for role, stamps in invalid],
+        "reason": [p.reason for p in parts] + [np.full(size, "invalid")],
+        "normalized_innovation_squared": [p.normalized_innovation_squared for p in parts] + [unknown],
+        "threshold": [p.threshold for p in parts] + [unknown],
+    }
+    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    order = np.lexsort((joined["role"], joined["stamp_ns"]))
+    return REJECTIONS.table(
+        **{
+            name: pa.array(values[order].tolist(), pa.string()) if name in {"role", "reason"} else values[order]
+            for name, values in joined.items()
+        }
+    )

@@ -1,0 +1,119 @@
+"""What fusing needs of the streams: measurements by clock epoch, rails of power, commands; and what was set aside on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tcpipe.fusion import preparation
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.preparation import Columns, Prepared
+from tcpipe.fusion.rails import RailSamples
+from tcpipe.fusion.stamp_jitter import steadied
+from tcpipe.recipe import FuseConfig
+from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.levels import Sensor, Streams
+
+
+@dataclass(slots=True)
+class Inputs:
+    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, stamps of unusable rows, counts and remarks."""
+
+    datum_deg_m: tuple[float, float, float] | None
+    measurements: dict[int, Measurements] = field(default_factory=dict)
+    invalid_ns: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
+    counts: dict[str, dict[str, int]] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)
+
+    def note(self, role: str, prepared: Prepared) -> None:
+        """Remember what was set aside."""
+        self.invalid_ns.setdefault(role, []).append(prepared.invalid_ns)
+        count = self.counts.setdefault(role, {"invalid": 0, "repeated": 0, "variances_replaced": 0})
+        count["invalid"] += prepared.invalid_ns.size
+        count["repeated"] += prepared.repeated
+        count["variances_replaced"] += prepared.variances_replaced
+        self.remarks += [f"{role}: {remark}" for remark in prepared.remarks if f"{role}: {remark}" not in self.remarks]
+
+
+def prepare_inputs(streams: Streams, config: FuseConfig) -> Inputs:
+    """Turn the motion streams into measurements, one set a clock epoch."""
+    tables = {role: streams.tables[role] for role in (GNSS, IMU, WHEELS, VISUAL) if role in streams.tables}
+    datum = None
+    if GNSS in tables:
+        fixes = _columns(tables[GNSS])
+        datum = preparation.find_datum(fixes["lon_deg"], fixes["lat_deg"], fixes["alt_m"])
+    inputs = Inputs(datum)
+    for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
+        parts = {role: table.filter(pc.equal(table["epoch"], epoch)) for role, table in tables.items()}
+        found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
+        gnss, remarks = steadied(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
+        inputs.remarks += remarks
+        inputs.measurements[epoch] = Measurements(
+            gnss=gnss,
+            imu=found.get(IMU),
+            wheels=found.get(WHEELS),
+            visual=found.get(VISUAL),
+            nonholonomic_std_mps=config.nonholonomic_std_mps,
+        )
+    return inputs
+
+
+def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: Inputs) -> Any:
+    stamp_ns, columns = integers(table, "stamp_ns"), _columns(table)
+    place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
+    made: Any
+    if role == GNSS:
+        if inputs.datum_deg_m is None:
+            inputs.note(role, Prepared(stamp_ns))
+            return None
+        made, prepared = preparation.positions(
+            stamp_ns,
+            columns,
+            datum_deg_m=inputs.datum_deg_m,
+            lever_arm_m=sensor.xyz_m,
+            default_std_m=config.gnss_default_std_m,
+            floor_std_m=config.gnss_std_floor_m,
+        )
+    elif role == IMU:
+        made, prepared = preparation.inertial(
+            stamp_ns,
+            columns,
+            **place,
+            gyro_std_radps=config.gyro_noise_radps,
+            accelerometer_std_mps2=config.accelerometer_noise_mps2,
+        )
+    else:
+        std = config.wheel_std_mps if role == WHEELS else config.visual_std_mps
+        made, prepared = preparation.body_velocities(
+            stamp_ns, columns, **place, default_std_mps=std, only_forward=role == WHEELS
+        )
+    inputs.note(role, prepared)
+    return made if made.stamp_ns.size else None
+
+
+def _columns(table: pa.Table) -> Columns:
+    return {name: floats(table, name) for name in table.column_names if pa.types.is_floating(table[name].type)}
+
+
+def rails_of(table: pa.Table) -> list[RailSamples]:
+    """Return the rails of a power table, in order of their names; voltage and current may stand in different rows."""
+    rails = []
+    for name in sorted(pc.unique(table["rail"]).to_pylist()):
+        part = table.filter(pc.equal(table["rail"], name))
+        stamp = integers(part, "stamp_ns")
+        volt, amp = floats(part, "voltage_volt"), floats(part, "current_amp")
+        rails.append(RailSamples(*_known(stamp, volt), *_known(stamp, amp)))
+    return rails
+
+
+def _known(stamp_ns: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the rows with a value, in order of time, one a stamp."""
+    rows = np.flatnonzero(np.isfinite(values))
+    _, first = np.unique(stamp_ns[rows], return_index=True)
+    return stamp_ns[rows][first], values[rows][first]

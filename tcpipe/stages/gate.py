@@ -1,0 +1,119 @@
+"""Track to GatedTrack: mark what is not steady driving, and why; nothing is deleted."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tcpipe.motion import masks
+from tcpipe.motion.pieces import Mask, MotionRows, piece_of_rows
+from tcpipe.motion.uncertainty import along_std_m, chord_ahead_std_m
+from tcpipe.recipe import GateConfig
+from tcpipe.tables.bits import DropReason
+from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, with_findings
+
+
+def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | None, chord_m: float) -> GatedTrack:
+    """Return the track with ``dropped_by``: every reason why a row is not steady driving at the terrain's limit.
+
+    Parameters
+    ----------
+    max_velocity_mps : [m/s], the robot profile's maximum; the recipe's goes first. With neither, no row is dropped as below the limit.
+    chord_m : [m], length of a segment, over which the relative position error counts.
+    """
+    table, period_s = track.table, 1.0 / track.info.rate_hz
+    rows = MotionRows(
+        velocity_mps=floats(table, "forward_velocity_mps"),
+        yaw_rate_radps=floats(table, "yaw_rate_radps"),
+        wheel_velocity_mps=floats(table, "wheel_velocity_mps"),
+        commanded_mps=floats(table, "commanded_velocity_mps"),
+        piece=piece_of_rows(integers(table, "stamp_ns"), integers(table, "epoch"), period_ns=1e9 * period_s),
+        period_s=period_s,
+    )
+    found = {DropReason.GAP: _gap(track, rows, chord_m, config), **_motion(rows, config)}
+    limit_mps = config.max_velocity_mps or max_velocity_mps
+    slowest = limit_mps and config.full_speed_fraction * limit_mps
+    if slowest is not None and config.require_full_speed:
+        found[DropReason.BELOW_LIMIT] = masks.below_limit(rows, limit_mps=slowest, window_s=config.command_window_s)
+    dropped_by = np.bitwise_or.reduce([np.uint32(reason) * mask for reason, mask in found.items()])
+    facts = {
+        "rows": table.num_rows,
+        "rows_kept": int((dropped_by == 0).sum()),
+        "rows_dropped": {str(reason.name).lower(): int((dropped_by & reason != 0).sum()) for reason in DropReason},
+        "max_velocity_mps": limit_mps,
+        "full_speed_mps": slowest,
+    }
+    gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
+    return GatedTrack(gated, with_findings(track.info, "gate", _warnings(rows, dropped_by, limit_mps, config), facts))
+
+
+def _motion(rows: MotionRows, config: GateConfig) -> dict[DropReason, Mask]:
+    stuck = masks.stuck(
+        rows,
+        standing_velocity_mps=config.standing_velocity_mps,
+        wheel_velocity_above_mps=config.stuck_wheel_velocity_mps,
+    )
+    standing = masks.standing(
+        rows, below_velocity_mps=config.standing_velocity_mps, below_yaw_rate_radps=config.standing_yaw_rate_radps
+    )
+    turning = masks.turning_in_place(
+        rows,
+        below_velocity_mps=config.turning_velocity_mps,
+        above_yaw_rate_radps=config.turning_yaw_rate_radps,
+        min_radius_m=config.min_turn_radius_m,
+        min_s=config.min_event_s,
+    )
+    back = masks.reversing(rows, standing_velocity_mps=config.standing_velocity_mps)
+    return {
+        DropReason.STANDING: standing & ~stuck,
+        DropReason.STUCK: stuck,
+        DropReason.TURNING_IN_PLACE: turning & ~standing & ~stuck,
+        DropReason.REVERSING: back & (not config.keep_reversing),
+        DropReason.ACCELERATING: _accelerating(rows, standing | turning, config),
+    }
+
+
+def _accelerating(rows: MotionRows, halted: Mask, config: GateConfig) -> Mask:
+    """Mark commanded changes where there are commands, lasting accelerations where there are none, and ramps beside halts."""
+    slope = masks.forward_acceleration_mps2(rows, window_s=config.acceleration_window_s)
+    lasting = masks.accelerating(
+        rows, slope, above_mps2=config.max_acceleration_mps2, min_s=config.min_event_s, dilate_s=config.dilate_s
+    )
+    changed = masks.command_changed(
+        rows, step_mps=config.command_step_mps, window_s=config.command_window_s, settle_s=config.command_settle_s
+    )
+    beside = masks.ramps(rows, slope, halted, above_mps2=config.ramp_acceleration_mps2, min_s=config.min_event_s)
+    return changed | (lasting & np.isnan(rows.commanded_mps)) | beside
+
+
+def _gap(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Mask:
+    """Mark rows without power in a run that has power, and moving rows whose next chord would not be known well enough."""
+    table, power = track.table, floats(track.table, "power_watt")
+    course = np.arctan2(floats(table, "north_velocity_mps"), floats(table, "east_velocity_mps"))
+    relative_m = chord_ahead_std_m(
+        rows,
+        velocity_std_mps=floats(table, "forward_velocity_std_mps"),
+        position_std_m=along_std_m(floats(table, "x_std_m"), floats(table, "y_std_m"), course),
+        chord_m=chord_m,
+        slowest_mps=config.turning_velocity_mps,
+        smoothed=track.info.estimator == "smoother",
+    )
+    moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
+    without_power = np.isnan(power) & bool(np.isfinite(power).any())
+    return without_power | (moving & (relative_m > config.max_relative_position_std_m))
+
+
+def _warnings(rows: MotionRows, dropped_by: Mask, limit_mps: float | None, config: GateConfig) -> tuple[str, ...]:
+    commanded, moving = np.isfinite(rows.commanded_mps), np.abs(rows.velocity_mps) > config.turning_velocity_mps
+    if not commanded.any():
+        return ("no command topic: it cannot be known whether the robot was driven at its maximum speed",)
+    if limit_mps is None and config.require_full_speed:
+        text = "the robot's maximum speed is not known, so no row is dropped as commanded below it: set gate.max_velocity_mps"
+        return (
+            f"{text} (largest command {np.nanmax(rows.commanded_mps):.2f} m/s), or gate.require_full_speed = false",
+        )
+    slow = (dropped_by & DropReason.BELOW_LIMIT) != 0
+    if slow[moving].sum() > 0.5 * moving.sum():
+        text = f"{slow[moving].mean():.0%} of the moving track was commanded below {config.full_speed_fraction} of {limit_mps} m/s"
+        return (f"{text}: set gate.max_velocity_mps if this robot is slower, or gate.require_full_speed = false",)
+    return ()

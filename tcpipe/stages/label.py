@@ -1,0 +1,81 @@
+"""Segments to LabelledSegments: power, velocity, duration and energy of every metre, how wrong they may be, and what to know of them."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tcpipe.cost.labels import Labels
+from tcpipe.cost.power import Rule, samples_inside
+from tcpipe.cost.quality import bits, means_differ
+from tcpipe.recipe import LabelConfig
+from tcpipe.stages.label_cost import segment_costs
+from tcpipe.stages.label_facts import label_facts, label_warnings
+from tcpipe.stages.label_physics import with_physics
+from tcpipe.stages.label_power import energy_entries, rails_of
+from tcpipe.stages.label_quality import clock_doubtful, motion_flags, power_flags
+from tcpipe.tables.bits import Quality
+from tcpipe.tables.columns import integers
+from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, LabelledSegments, Segments, Streams, with_findings
+
+
+def label_segments(
+    segments: Segments,
+    gated: GatedTrack,
+    streams: Streams,
+    config: LabelConfig,
+    *,
+    flag_arc_to_chord: float,
+    max_position_std_m: float,
+    voltage_range_volt: tuple[float, float] | None,
+) -> LabelledSegments:
+    """Return the segments with w, v, T, E, their standard deviations as costs of the true metre, and quality bits.
+
+    Parameters
+    ----------
+    streams : for its power; without it, or where it does not reach, power and energy are null.
+    flag_arc_to_chord, max_position_std_m, voltage_range_volt : beyond these a label is flagged; no range, no flag.
+    """
+    rule: Rule = "averaged" if streams.power_averaged else config.integration
+    parts, joules, rails_by_epoch = [LABELLED_SEGMENTS.empty()], Counter[str](), {}
+    variance_j2: list[dict[str, NDArray[np.float64]]] = []
+    for epoch in np.unique(integers(gated.table, "epoch")).tolist():
+        rows, cut = (table.filter(pc.equal(table["epoch"], epoch)) for table in (gated.table, segments.table))
+        rails = rails_by_epoch[epoch] = rails_of(streams, epoch)
+        joules.update(energy_entries(rows, rails, rate_hz=gated.info.rate_hz, rule=rule))
+        if not cut.num_rows:
+            continue
+        cost, causes = segment_costs(cut, rows, rails, gated.info, rule=rule)
+        variance_j2.append(causes)
+        count, mean_watt = samples_inside(rails, integers(cut, "start_ns"), integers(cut, "end_ns"))
+        flags = {
+            Quality.MEAN_POWER_DIFFERS: means_differ(mean_watt, cost.power_watt),
+            Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, clock_doubtful(streams, gated.info)),
+            **power_flags(cut, rails, range_volt=voltage_range_volt, averaged=streams.power_averaged),
+            **motion_flags(
+                cut,
+                rows,
+                gated.info,
+                arc_to_chord=flag_arc_to_chord,
+                max_position_std_m=max_position_std_m,
+            ),
+        }
+        parts.append(
+            LABELLED_SEGMENTS.table(
+                **{name: cut[name] for name in cut.column_names},
+                **{name: getattr(cost, name) for name in Labels.__slots__},
+                physics_power_watt=np.full(cut.num_rows, np.nan),
+                power_samples=count,
+                quality=bits(flags, cut.num_rows),
+            )
+        )
+    table, physics = with_physics(pa.concat_tables(parts).combine_chunks(), gated.table)
+    facts = label_facts(
+        table, rails_by_epoch, joules, segments.ledger_m, variance_j2, rule=rule, velocity=config.velocity
+    )
+    info = with_findings(segments.info, "label", label_warnings(facts), {**facts, "physics": physics})
+    return LabelledSegments(table, info, segments.ledger_m)

@@ -1,0 +1,89 @@
+"""What labelling noticed: the run's energy by entry, the noise floor, the count of every quality bit, and warnings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.cost.budget import energy_budget
+from tcpipe.cost.power import Rail, Rule
+from tcpipe.stages.label_power import rail_facts
+from tcpipe.tables.bits import Quality
+from tcpipe.tables.columns import floats
+
+
+def label_facts(
+    table: pa.Table,
+    rails: Mapping[int, list[Rail]],
+    energy_by_entry_joule: Mapping[str, float],
+    ledger_m: Mapping[str, float],
+    energy_variance_j2: Sequence[Mapping[str, NDArray[np.float64]]],
+    *,
+    rule: Rule,
+    velocity: str,
+) -> dict[str, Any]:
+    """Return the facts of a labelled run for its manifest.
+
+    Parameters
+    ----------
+    rails : drive rails by clock epoch.
+    energy_by_entry_joule : [J], what was recorded, by ledger entry.
+    ledger_m : [m], by entry; its sum is the distance.
+    energy_variance_j2 : [J²], of the segments' energies by cause, epoch by epoch in the table's order.
+    velocity : which velocity trains, ground or fused.
+    """
+    powered = any(len(each.stamp_ns) for epoch in rails.values() for each in epoch)
+    quality = table["quality"].to_numpy()
+    energy = floats(table, "energy_joule")
+    return {
+        "distance_m": sum(ledger_m.values()),
+        "energy_joule": sum(energy_by_entry_joule.values()) if powered else None,
+        "energy_by_entry_joule": dict(energy_by_entry_joule) if powered else None,
+        "integration": rule,
+        "velocity": velocity,
+        "rails": {str(epoch): [rail_facts(each) for each in rails[epoch]] for epoch in rails if rails[epoch]},
+        "segments": table.num_rows,
+        "segments_without_power": int(np.isnan(energy).sum()),
+        "relative_std_median": {
+            name: _median(floats(table, f"{name}_std_{unit}") / floats(table, f"{name}_{unit}"))
+            for name, unit in (("duration", "s"), ("velocity", "mps"), ("power", "watt"), ("energy", "joule"))
+        },
+        "energy_budget": _budget(energy, energy_variance_j2),
+        "quality": {str(bit.name).lower(): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
+    }
+
+
+def _budget(
+    energy_joule: NDArray[np.float64], variance_j2: Sequence[Mapping[str, NDArray[np.float64]]]
+) -> dict[str, Any] | None:
+    if not variance_j2:
+        return None
+    return energy_budget(
+        energy_joule, {name: np.concatenate([part[name] for part in variance_j2]) for name in variance_j2[0]}
+    )
+
+
+def label_warnings(facts: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return what a person should look at."""
+    warnings = []
+    if facts["quality"]["low_power_rate"]:
+        rates = [
+            rail[s]["rate_hz"] for epoch in facts["rails"].values() for rail in epoch for s in ("voltage", "current")
+        ]
+        rate = min((rate for rate in rates if rate), default=0.0)
+        warnings.append(
+            f"power comes at {rate:.1f} Hz only: see energy_std_joule (instantaneous power wants 10 Hz, averaged 2 Hz)"
+        )
+    if facts["energy_joule"] is not None and facts["segments"] and facts["segments_without_power"]:
+        count = f"{facts['segments_without_power']} of {facts['segments']} segments"
+        warnings.append(f"{count} have no label: the power record does not reach over them")
+    return tuple(warnings)
+
+
+def _median(values: NDArray[np.float64]) -> float | None:
+    known = values[np.isfinite(values)]
+    return float(np.median(np.abs(known))) if len(known) else None

@@ -1,0 +1,56 @@
+"""The physics baseline of a run: its prediction beside each label, and a flag where the label is far from it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tcpipe.cost.physics import Physics, fit_physics
+from tcpipe.tables.bits import DropReason, Quality
+from tcpipe.tables.columns import floats
+from tcpipe.tables.levels import LABELLED_SEGMENTS
+
+_FEWEST_STANDING = 40
+
+
+def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, dict[str, Any]]:
+    """Return the labelled segments with the power that rolling resistance and grade predict, and the fit.
+
+    Parameters
+    ----------
+    table : labelled segments of a run. rows : its gated track, for the power while standing.
+    """
+    speed = floats(table, "velocity_mps")
+    rise = (floats(table, "end_z_m") - floats(table, "start_z_m")) / floats(table, "chord_m")
+    power = floats(table, "power_watt")
+    standing = _standing_watt(rows)
+    found = fit_physics(power_watt=power, velocity_mps=speed, rise=rise, standing_watt=standing or 0.0)
+    if found is None:
+        return table, {"fitted": False, "standing_watt": standing}
+    predicted = np.where(np.isfinite(power), found.power_watt(velocity_mps=speed, rise=rise), np.nan)
+    odd = found.is_outlier(power - predicted)
+    quality = table["quality"].to_numpy() | np.where(odd, np.uint32(Quality.PHYSICS_OUTLIER), np.uint32(0))
+    columns = {"physics_power_watt": predicted, "quality": quality.astype(np.uint32)}
+    table = LABELLED_SEGMENTS.table(**{name: columns.get(name, table[name]) for name in table.column_names})
+    return table, {"fitted": True, **_facts(found, standing), "outliers": int(odd.sum())}
+
+
+def _standing_watt(rows: pa.Table) -> float | None:
+    power = floats(rows, "power_watt")
+    standing = (rows["dropped_by"].to_numpy() & np.uint32(DropReason.STANDING)) != 0
+    drawn = power[standing & np.isfinite(power)]
+    return float(np.median(drawn)) if drawn.size >= _FEWEST_STANDING else None
+
+
+def _facts(found: Physics, standing: float | None) -> dict[str, Any]:
+    return {
+        "standing_watt": standing,
+        "weight_over_efficiency_newton": found.drive_newton or None,
+        "rolling_newton": found.rolling_newton,
+        "rolling_resistance": found.rolling_resistance,
+        "recovered_downhill": found.recovered,
+        "residual_watt": found.residual_watt,
+        "segments": found.segments,
+    }

@@ -1,0 +1,113 @@
+"""What reading noticed: a warning where a person should look, and the facts of every role for the manifest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from tcpipe.logs.clocks import Step, Timeline
+from tcpipe.logs.power_readings import PowerReadings
+from tcpipe.logs.roles import Assignment
+from tcpipe.stages.read_sources import Source
+from tcpipe.tables.levels import Findings, Sensor
+
+_MANY_DROPPED = 0.01
+
+
+def read_findings(
+    assignment: Assignment,
+    sources: Sequence[Source],
+    timelines: Mapping[str, Timeline],
+    steps: Sequence[Step],
+    *,
+    power: PowerReadings,
+    sensors: Mapping[str, Sensor],
+) -> Findings:
+    """Return the warnings and facts of a read log."""
+    warnings = [*assignment.warnings, *power.warnings]
+    for source in sources:
+        warnings += _warnings(source, timelines.get(source.topic))
+    warnings += [
+        f"clock: header minus log time steps by {step.step_s:+.3f} s at log time {step.log_time_ns} ns on {', '.join(step.topics)}: "
+        "a new epoch begins there, and nothing is integrated across it"
+        for step in steps
+    ]
+    facts: dict[str, Any] = {
+        "robot": {"name": assignment.robot.name, "why": assignment.robot_why},
+        "roles": {role: _role_facts(role, assignment, sources, timelines, sensors) for role in sensors},
+        "left_out": dict(assignment.left_out),
+        "epochs": len(steps) + 1,
+        "clock_steps": [asdict(step) | {"topics": list(step.topics)} for step in steps],
+    }
+    if power.facts:
+        facts["power"] = {**power.facts, "averaged": power.averaged}
+    return Findings(tuple(dict.fromkeys(warnings)), facts)
+
+
+def _warnings(source: Source, timeline: Timeline | None) -> Iterable[str]:
+    name = f"{source.role}: {source.topic}"
+    rows = len(source.columns["log_time_ns"])
+    yield from (f"{name}: {text}" for text in source.readings.warnings)
+    dropped = source.readings.dropped | (timeline.dropped if timeline is not None else {})
+    unexpected = {reason: count for reason, count in dropped.items() if reason != "not_gga"}
+    if sum(unexpected.values()) > _MANY_DROPPED * rows:
+        counts = ", ".join(f"{reason} {count}" for reason, count in unexpected.items())
+        yield f"{name}: {sum(unexpected.values())} of {rows} messages are not used ({counts})"
+    if timeline is None:
+        return
+    if timeline.source == "log" and source.readings.header_ns is not None:
+        yield f"{name}: log time rules, since {timeline.why}"
+    if timeline.notes.get("stamps_replaced"):
+        count = timeline.notes["stamps_replaced"]
+        yield f"{name}: {count} header stamps are unset or wrong and were taken from the log time"
+    for epoch, moved_s in enumerate(timeline.moved_s):
+        if moved_s:
+            yield (
+                f"{name}: its clock is not the other topics': its stamps were moved by {moved_s:+.3f} s in epoch {epoch}; "
+                f"what is left of its delay can be set with read.time_offset_s"
+            )
+
+
+def _role_facts(
+    role: str,
+    assignment: Assignment,
+    sources: Sequence[Source],
+    timelines: Mapping[str, Timeline],
+    sensors: Mapping[str, Sensor],
+) -> dict[str, Any]:
+    return {
+        "why": assignment.roles[role].why,
+        "frame": sensors[role].frame_id,
+        "placed_by": sensors[role].placed_by,
+        "topics": {
+            source.topic: _topic_facts(source, timelines[source.topic])
+            for source in sources
+            if source.role == role and source.topic in timelines
+        },
+    }
+
+
+def _topic_facts(source: Source, timeline: Timeline) -> dict[str, Any]:
+    return {
+        "type": source.type_name,
+        "messages": len(source.columns["log_time_ns"]),
+        "rows": len(timeline.row),
+        "rate_hz": _rate_hz(timeline),
+        "dropped": source.readings.dropped | timeline.dropped,
+        "notes": {name: count for name, count in source.readings.notes.items() if count} | timeline.notes,
+        "time": {
+            "source": timeline.source,
+            "why": timeline.why,
+            "offset_s": timeline.offset_s,
+            "moved_s": list(timeline.moved_s),
+        },
+    }
+
+
+def _rate_hz(timeline: Timeline) -> float | None:
+    """Return one over the median period inside epochs [Hz]."""
+    period_ns = np.diff(timeline.stamp_ns)[np.diff(timeline.epoch) == 0]
+    return 1e9 / float(np.median(period_ns)) if len(period_ns) else None

@@ -1,0 +1,95 @@
+"""Where each stream's sensor sits: from the recipe, from static transforms, or assumed, with a warning."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import get_args
+
+import pyarrow as pa
+
+from tcpipe.geometry.rotation import quat_from_rpy
+from tcpipe.logs.clocks import Timeline
+from tcpipe.logs.messages import frames
+from tcpipe.logs.placements import IDENTITY, Pose, Tree, base_link_from, is_base, static_tree
+from tcpipe.logs.roles import Assignment
+from tcpipe.recipe import ReadConfig, Role
+from tcpipe.stages.message_arrays import transforms
+from tcpipe.stages.protocols import LogReader
+from tcpipe.stages.read_sources import Source
+from tcpipe.tables.levels import Sensor
+
+_WITHOUT_PLACE = ("power", "command")
+
+
+def place_sensors(
+    log: LogReader,
+    tables: Mapping[str, pa.Table],
+    assignment: Assignment,
+    sources: Sequence[Source],
+    timelines: Mapping[str, Timeline],
+    *,
+    config: ReadConfig,
+) -> tuple[dict[str, Sensor], list[str]]:
+    """Return each role's sensor, and warnings: frames that nothing places, topics with several frames.
+
+    /tf is read only where /tf_static leaves a frame unplaced: it is large, and constant only in logs that lack the other.
+    """
+    of_role = {role: [source for source in sources if source.role == role] for role in get_args(Role)}
+    frame_of = {role: _frame(found) for role, found in of_role.items() if found}
+    open_frames = {
+        frame
+        for role, frame in frame_of.items()
+        if role not in config.placement and role not in _WITHOUT_PLACE and not is_base(frame)
+    }
+    tree = _tree(log, tables, assignment, open_frames)
+    sensors, warnings = {}, []
+    for role, frame in frame_of.items():
+        pose, placed_by = _place(role, frame, tree, config)
+        several = frames(of_role[role][0].columns, of_role[role][0].type_name)
+        if role not in _WITHOUT_PLACE and len(several) > 1:
+            warnings.append(
+                f"{role}: its messages name {len(several)} frames ({', '.join(several)}); {frame!r} is taken"
+            )
+        if placed_by == "assumed":
+            warnings.append(
+                f"{role}: nothing places frame {frame!r} of {of_role[role][0].topic}, it is assumed at base_link; place it in the "
+                f"recipe under [read.placement]: {role} = {{ xyz_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}"
+            )
+        sensors[role] = Sensor(
+            topic=" + ".join(source.topic for source in of_role[role]),
+            type_name=of_role[role][0].type_name,
+            frame_id=frame,
+            why=assignment.roles[role].why,
+            xyz_m=(float(pose.xyz_m[0]), float(pose.xyz_m[1]), float(pose.xyz_m[2])),
+            quat_xyzw=tuple(float(component) for component in pose.quat_xyzw),  # type: ignore[arg-type]
+            placed_by=placed_by,
+            time_source=timelines[of_role[role][0].topic].source,
+        )
+    return sensors, warnings
+
+
+def _frame(sources: Sequence[Source]) -> str:
+    return next(iter(frames(sources[0].columns, sources[0].type_name)), "")
+
+
+def _tree(log: LogReader, tables: Mapping[str, pa.Table], assignment: Assignment, open_frames: set[str]) -> Tree:
+    static = [transforms(tables[topic]) for topic in assignment.transforms if topic in tables]
+    tree = static_tree(static)
+    moving = [topic for topic in assignment.transforms if topic not in tables]
+    if moving and any(base_link_from(frame, tree) is None for frame in open_frames):
+        tree = static_tree([*static, *(transforms(table) for table in log.tables(moving).values())])
+    return tree
+
+
+def _place(role: Role, frame: str, tree: Tree, config: ReadConfig) -> tuple[Pose, str]:
+    if role in config.placement:
+        given = config.placement[role]
+        return Pose(IDENTITY.xyz_m + given.xyz_m, quat_from_rpy(*given.rpy_rad)), "recipe"
+    if role in _WITHOUT_PLACE:
+        return IDENTITY, "not needed"
+    found = base_link_from(frame, tree)
+    if frame.rsplit("/", 1)[-1] == "base_link":
+        return IDENTITY, "same frame"
+    if found is not None and frame in tree:
+        return found, "tf_static"
+    return IDENTITY, "same frame" if is_base(frame) else "assumed"

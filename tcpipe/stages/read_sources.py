@@ -1,0 +1,81 @@
+"""The topics that play a role, each with its messages as arrays and its usable readings."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, cast
+
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.logs.imu_units import imu_in_si
+from tcpipe.logs.messages import Readings, needed_fields, read_messages
+from tcpipe.logs.power_readings import PowerReadings, read_power
+from tcpipe.logs.roles import Assignment
+from tcpipe.logs.topics import Topic
+from tcpipe.recipe import ReadConfig, Role
+from tcpipe.stages.message_arrays import message_arrays
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """A topic that plays a role: its messages' fields by dotted name, and what of them is usable."""
+
+    topic: str
+    role: Role
+    type_name: str
+    columns: Mapping[str, NDArray[Any]]
+    readings: Readings
+
+
+def read_sources(
+    tables: Mapping[str, pa.Table], topics: Mapping[str, Topic], assignment: Assignment, config: ReadConfig
+) -> tuple[list[Source], PowerReadings, list[str]]:
+    """Read the tables of every topic that plays a role.
+
+    Returns
+    -------
+    sources : one a topic, in the order of the roles.
+    power : the rails, empty where there is no power or it was refused.
+    warnings : topics that play a role but cannot be decoded.
+    """
+    role_of = {topic: cast("Role", role.name) for role in assignment.roles.values() for topic in role.topics}
+    warnings: list[str] = []
+    arrays: dict[str, Mapping[str, NDArray[Any]]] = {}
+    for topic, role in role_of.items():
+        if topic not in tables:
+            warnings.append(f"{role}: {topic} cannot be decoded and plays no part (see the log's damage)")
+            continue
+        found = message_arrays(tables[topic])
+        needed = () if role == "power" else needed_fields(topics[topic].type_name)
+        if missing := [name for name in needed if name not in found]:
+            warnings.append(f"{role}: {topic} plays no part, its messages have no field {', '.join(missing)}")
+        else:
+            arrays[topic] = found
+    types = {topic: topics[topic].type_name for topic in arrays}
+    power = _power(
+        {topic: (types[topic], arrays[topic]) for topic in arrays if role_of[topic] == "power"}, assignment, config
+    )
+    sources = []
+    for topic, columns in arrays.items():
+        role = role_of[topic]
+        if role != "power":
+            readings = read_messages(columns, role, types[topic])
+            if role == "imu":
+                readings = imu_in_si(readings, config.imu_units)
+            sources.append(Source(topic, role, types[topic], columns, readings))
+        elif topic in power.readings:
+            sources.append(Source(topic, role, types[topic], columns, power.readings[topic]))
+    return sources, power, warnings
+
+
+def _power(
+    topics: Mapping[str, tuple[str, Mapping[str, NDArray[Any]]]], assignment: Assignment, config: ReadConfig
+) -> PowerReadings:
+    wanted = len(assignment.roles["power"].topics) if "power" in assignment.roles else 0
+    if not topics:
+        return PowerReadings()
+    if len(topics) < wanted:
+        return PowerReadings(warnings=("power refused: not all of its topics can be decoded; there will be no energy",))
+    return read_power(topics, assignment.robot, husky_power=config.husky_power, current_sign=config.current_sign)

@@ -1,0 +1,120 @@
+"""LabelledSegments to patches: what each segment's metre of ground looks like on the map, and why some have no patch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from tcpipe.recipe import SampleConfig
+from tcpipe.tables.bits import Loss
+from tcpipe.tables.columns import floats
+from tcpipe.tables.levels import LABELLED_SEGMENTS, Findings
+from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.sampling import Patches, sample_patches
+from tcpipe.terrain.tiles import MapReader, level_for
+
+_LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """L6 before the split: N patches of M segments.
+
+    ``kept`` are the rows of the segments that have a patch, rising, (N,); ``patches`` are in that order; ``terrain_name`` is None without
+    a terrain layer. Footprints are counter-clockwise from rear right, (N, 4, 2): in the map's CRS [m], and as WGS 84 lon, lat [deg].
+    ``lost_by`` is each segment's `Loss`, 0 if kept, (M,); ``ledger_m`` metres driven by loss.
+    """
+
+    map_name: str
+    kept: NDArray[np.int64]
+    patches: Patches
+    terrain_name: NDArray[np.str_] | None
+    footprint_xy_m: NDArray[np.float64]
+    footprint_lonlat_deg: NDArray[np.float64]
+    lost_by: NDArray[np.uint32]
+    ledger_m: Mapping[str, float]
+    findings: Findings
+
+
+def sample_segments(segments: pa.Table, source: MapReader, config: SampleConfig, *, gnss_crs: str) -> Sampled:
+    """Return the patches of all segments that lie on the map.
+
+    Parameters
+    ----------
+    segments : L5 table of any number of runs; the reasons rule in the order position uncertain, outside the map, nodata, not traversable.
+    source : the map.
+    gnss_crs : geographic CRS of the segments' longitudes and latitudes.
+
+    Raises
+    ------
+    TableError : chords and positions contradict each other. MapError : CRSs cannot be connected, or a tile is damaged.
+    """
+    LABELLED_SEGMENTS.check(segments)
+    crs, chord_m = parse_crs(source.grid.crs, where=f"map {source.name}"), floats(segments, "chord_m")
+    projection = Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
+    start, end = (
+        projection.forward(np.stack([floats(segments, f"{name}_{axis}_deg") for axis in ("lon", "lat")], axis=1))
+        for name in ("start", "end")
+    )
+    frames = patch_frames(start, end, chord_m)
+    corners = footprints(frames, config.patch_m)
+    lost_by = np.zeros(segments.num_rows, np.uint32)
+    lost_by[corners_on(source.grid, corners) < (4 if config.min_valid_fraction >= 1.0 else 1)] = Loss.OUTSIDE_MAP
+    lost_by[floats(segments, "position_std_m") > config.max_position_std_m] = Loss.POSITION_UNCERTAIN
+    rows = np.flatnonzero(lost_by == 0)
+    frames = frames.rows(rows)
+    check_scale(frames)
+    patches = sample_patches(source, frames, chord_m[rows], patch_m=config.patch_m, patch_px=config.patch_px)
+    lost_by[rows] = _lost(patches, corners[rows], source, config)
+    good = lost_by[rows] == 0
+    kept, patches = rows[good], patches if good.all() else patches.rows(good)
+    return Sampled(
+        map_name=source.name,
+        kept=kept,
+        patches=patches,
+        terrain_name=None if patches.terrain is None else source.classes.names()[patches.terrain_class],
+        footprint_xy_m=corners[kept],
+        footprint_lonlat_deg=Projection(CRS.from_epsg(4326), crs, projection.area_deg).inverse(corners[kept]),
+        lost_by=lost_by,
+        ledger_m=ledger_by_loss(floats(segments, "arc_length_m"), lost_by),
+        findings=Findings(_warnings(source, config, projection), _facts(lost_by)),
+    )
+
+
+def _lost(
+    patches: Patches, corners: NDArray[np.float64], source: MapReader, config: SampleConfig
+) -> NDArray[np.uint32]:
+    lost = np.zeros(patches.valid_fraction.size, np.uint32)
+    if patches.terrain is not None:
+        lost[~source.classes.traversable()[patches.terrain_class]] = Loss.NOT_TRAVERSABLE
+        lost[patches.terrain_class == 0] = Loss.NODATA
+    thin = patches.valid_fraction < max(config.min_valid_fraction, 1.0 / config.patch_px**2)
+    lost[thin] = Loss.NODATA
+    lost[thin & (corners_on(source.grid, corners) < 4)] = Loss.OUTSIDE_MAP
+    return lost
+
+
+def ledger_by_loss(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -> dict[str, float]:
+    """Return metres driven, kept and by loss."""
+    named = {"kept": 0} | {str(loss.name).lower(): loss for loss in _LOSSES}
+    return {name: float(arc_length_m[lost_by == loss].sum()) for name, loss in named.items()}
+
+
+def _facts(lost_by: NDArray[np.uint32]) -> dict[str, object]:
+    counts = {str(loss.name).lower(): int((lost_by == loss).sum()) for loss in _LOSSES}
+    return {"segments": lost_by.size, "samples": int((lost_by == 0).sum()), "lost": counts}
+
+
+def _warnings(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[str, ...]:
+    doubt, patch_pitch_m = projection.doubt(), config.patch_m / config.patch_px
+    notes = [
+        f"{doubt}; say which datum the GNSS is in (recipe key read.gnss_crs)" if doubt else None,
+        pitch_note(patch_pitch_m, level_for(source, patch_pitch_m).grid.pitch_m),
+    ]
+    return tuple(f"map {source.name}: {note}" for note in notes if note)

@@ -1,0 +1,99 @@
+"""GatedTrack to Segments: cut every steady stretch by chord, and account for every metre of the track."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.geometry.datum import geodetic_from_enu
+from tcpipe.geometry.piecewise_linear import interpolate, mean_between
+from tcpipe.geometry.polyline import Polyline, polyline
+from tcpipe.motion.ledger import by_reason, interval_duration_s, interval_length_m, interval_reason, stretches
+from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.path.cutting import Cut, cut_by_chord
+from tcpipe.recipe import SegmentConfig
+from tcpipe.tables.bits import DropReason, Loss
+from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, with_findings
+
+ENTRIES = ("kept", *(str(bit.name).lower() for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
+"""Names of the ledger's entries, in order."""
+
+
+def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
+    """Return the segments of the track's steady stretches, and the ledger of all its metres: its sum is the odometer."""
+    table, info = gated.table, gated.info
+    stamp_ns, epoch = integers(table, "stamp_ns"), integers(table, "epoch")
+    position_m = np.column_stack([floats(table, f"{axis}_m") for axis in "xyz"])
+    velocity_mps = np.column_stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    piece = piece_of_rows(stamp_ns, epoch, period_ns=1e9 / info.rate_hz)
+    dropped_by = table["dropped_by"].to_numpy()
+    reason = interval_reason(dropped_by, piece)
+    metres = dict.fromkeys(ENTRIES, 0.0) | by_reason(
+        reason, interval_length_m(stamp_ns, position_m, velocity_mps, piece)
+    )
+    seconds = dict.fromkeys(ENTRIES, 0.0) | by_reason(reason, interval_duration_s(stamp_ns, epoch))
+    tables = [SEGMENTS.empty()]
+    spans = stretches(dropped_by, piece)
+    for first, last in spans:
+        rows = slice(first, last + 1)
+        path = polyline(stamp_ns[rows], position_m[rows], velocity_mps[rows])
+        cut = cut_by_chord(path, chord_m=config.chord_m, max_arc_to_chord=config.max_arc_to_chord)
+        for entry, (length_m, duration_s) in cut.ledger(path).items():
+            metres[entry] += length_m
+            seconds[entry] += duration_s
+        if len(cut.start_ns):
+            tables.append(_segments(table.slice(first, last + 1 - first), path, cut, info))
+    segments = pa.concat_tables(tables).combine_chunks()
+    facts = {
+        "segments": segments.num_rows,
+        "stretches": len(spans),
+        "odometer_m": sum(metres.values()),
+        "ledger_s": seconds,
+    }
+    warnings = () if segments.num_rows else (_why_none(metres),)
+    return Segments(segments, with_findings(info, "segment", warnings, facts), metres)
+
+
+def _segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.Table:
+    """Return the segments of one stretch."""
+    start_m, end_m = path.position_at(cut.start_ns), path.position_at(cut.end_ns)
+    step_m, count = end_m - start_m, len(cut.start_ns)
+    columns: dict[str, Any] = {
+        "segment_id": [f"{info.run_id}-{stamp}" for stamp in cut.start_ns],
+        "run_id": [info.run_id] * count,
+        "robot": [info.robot] * count,
+        "epoch": np.full(count, integers(rows, "epoch")[0]),
+        "start_ns": cut.start_ns,
+        "end_ns": cut.end_ns,
+        "chord_m": np.hypot(step_m[:, 0], step_m[:, 1]),
+        "arc_length_m": path.length_at(cut.end_ns) - path.length_at(cut.start_ns),
+        "course_rad": np.arctan2(step_m[:, 1], step_m[:, 0]),
+    }
+    for end, position_m in (("start", start_m), ("end", end_m)):
+        columns |= {f"{end}_{axis}_m": position_m[:, i] for i, axis in enumerate("xyz")}
+        columns |= _lon_lat(end, position_m, info.datum)
+    for name, source in (("fused", "forward"), ("commanded", "commanded")):
+        signal = floats(rows, f"{source}_velocity_mps")
+        columns[f"{name}_velocity_mps"] = mean_between(path.stamp_ns, signal, cut.start_ns, cut.end_ns)
+    std_m = np.maximum(floats(rows, "x_std_m"), floats(rows, "y_std_m"))
+    ends_m = [interpolate(path.stamp_ns, std_m, at_ns) for at_ns in (cut.start_ns, cut.end_ns)]
+    return SEGMENTS.table(**columns, position_std_m=np.maximum(*ends_m))
+
+
+def _lon_lat(end: str, position_m: NDArray[np.float64], datum: Datum | None) -> dict[str, NDArray[np.float64]]:
+    """Return longitude and latitude of one end; nowhere in a local frame."""
+    lon, lat = np.full((2, len(position_m)), np.nan)
+    if datum is not None:
+        lon, lat, _ = geodetic_from_enu(position_m, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m))
+    return {f"{end}_lon_deg": lon, f"{end}_lat_deg": lat}
+
+
+def _why_none(metres: dict[str, float]) -> str:
+    lost = [
+        f"{value:.1f} m {name}" for name, value in sorted(metres.items(), key=lambda entry: -entry[1]) if value > 0.05
+    ]
+    return f"no segments: {sum(metres.values()):.1f} m driven, of them {', '.join(lost) or 'nothing: the robot never moved'}"

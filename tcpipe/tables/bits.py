@@ -1,0 +1,77 @@
+"""The bits of ``dropped_by`` (track rows), of ``quality`` (segments), and the ledger's entries.
+
+A bit, once released, keeps its value: files on disk carry it.
+"""
+
+from __future__ import annotations
+
+from enum import IntFlag
+
+
+class DropReason(IntFlag):
+    """Why a row of the track is not used; 0 means kept. Order is precedence in the loss ledger."""
+
+    GAP = 1 << 0
+    """No usable motion or power estimate: sensor gap, power gap, clock epoch, or relative position error too large."""
+    STANDING = 1 << 1
+    """|v| < 0.05 m/s and |yaw rate| < 0.05 rad/s."""
+    STUCK = 1 << 2
+    """The wheels turn but the ground speed is about zero."""
+    TURNING_IN_PLACE = 1 << 3
+    """|v| < 0.10 m/s and |yaw rate| > 0.10 rad/s for 0.2 s, or a turn radius below 0.5 m."""
+    REVERSING = 1 << 4
+    """Driving backwards."""
+    ACCELERATING = 1 << 5
+    """A commanded change of speed (2 s after it), or, without commands, |dv/dt| > 0.3 m/s² for 0.2 s; start and stop ramps."""
+    BELOW_LIMIT = 1 << 6
+    """Commanded below 0.95 of the robot's maximum: the speed is not the terrain's limit."""
+
+
+class Quality(IntFlag):
+    """What a user may want to know of a label; 0 means clean."""
+
+    LOW_POWER_RATE = 1 << 0
+    """Power sampled below 10 Hz (instantaneous) or 2 Hz (averaged by the source)."""
+    NEAR_GAP = 1 << 1
+    """A gap begins or ends within one chord of the segment."""
+    HIGH_SLIP = 1 << 2
+    """Wheel speed and ground speed differ by more than 20 %."""
+    WEAK_GNSS = 1 << 3
+    """Horizontal position standard deviation above `max_position_std_m` at either end."""
+    CURVED = 1 << 4
+    """Arc over chord above 1.01."""
+    MEAN_POWER_DIFFERS = 1 << 5
+    """The plain mean of the power samples differs from energy / duration by more than 5 %."""
+    NO_COMMAND = 1 << 6
+    """No command topic: it cannot be known whether the robot was driven at its maximum."""
+    VOLTAGE_OUT_OF_RANGE = 1 << 7
+    """The voltage leaves the range of the robot profile."""
+    CLOCK_DOUBTFUL = 1 << 8
+    """A clock of the segment's run stepped or seems constantly off, or the recorder's time had to be used."""
+    PHYSICS_OUTLIER = 1 << 9
+    """The power is more than four robust standard deviations from what rolling resistance and grade, fitted on the run, predict."""
+    NOT_AT_LIMIT = 1 << 10
+    """Commanded on average below `full_speed_fraction` of the robot's maximum: the speed is not the terrain's limit."""
+
+
+class Loss(IntFlag):
+    """Entries of the loss ledger beyond the bits of `DropReason`: metres that are no kept row's fault."""
+
+    CURVED = 1 << 16
+    """Arc over chord above 1.02: cut, but not straight enough to be a segment."""
+    LEFTOVER = 1 << 17
+    """The end of a steady stretch, shorter than a chord."""
+    OUTSIDE_MAP = 1 << 18
+    """The patch leaves every map."""
+    NODATA = 1 << 19
+    """A pixel of the patch, or one of its taps, has no data."""
+    NOT_TRAVERSABLE = 1 << 20
+    """The class under the chord is not traversable."""
+    POSITION_UNCERTAIN = 1 << 21
+    """Absolute position standard deviation above `max_position_std_m` when sampling."""
+    SPLIT_BUFFER = 1 << 22
+    """The footprint straddles, or is nearer than the buffer to, a region's border."""
+    NO_POWER = 1 << 23
+    """A segment without a label: the run has no power source, or none over this stretch."""
+    SPLIT_EXCLUDED = 1 << 24
+    """The footprint lies in a region whose `split` is `exclude`."""

@@ -1,0 +1,124 @@
+"""A column with its unit and meaning, and a table schema that checks Arrow tables against its columns.
+
+Units, frames, flag bits and one-line meanings stand in the Arrow field metadata, so that every Parquet file explains itself.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import IntFlag
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tcpipe.errors import TableError
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """One column: name (its suffix is the unit), Arrow type, unit, meaning, frame, whether null is allowed, flag bits."""
+
+    name: str
+    dtype: pa.DataType
+    unit: str
+    doc: str
+    frame: str = ""
+    nullable: bool = False
+    flags: type[IntFlag] | None = None
+
+    def field(self) -> pa.Field:
+        """Return the Arrow field, with unit, frame, meaning and bit names as metadata."""
+        metadata = {"unit": self.unit, "doc": self.doc}
+        if self.frame:
+            metadata["frame"] = self.frame
+        if self.flags is not None:
+            metadata["flags"] = json.dumps({str(int(bit)): str(bit.name).lower() for bit in self.flags})
+        return pa.field(self.name, self.dtype, nullable=self.nullable, metadata=metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class TableSchema:
+    """A table's contract: its name, its level in the pipeline, its meaning and its columns."""
+
+    name: str
+    level: str
+    doc: str
+    columns: tuple[Column, ...]
+
+    def arrow(self) -> pa.Schema:
+        """Return the Arrow schema, field metadata included."""
+        return pa.schema([column.field() for column in self.columns])
+
+    def names(self) -> list[str]:
+        """Return the column names in order."""
+        return [column.name for column in self.columns]
+
+    def table(self, **arrays: object) -> pa.Table:
+        """Make a checked table from one array (numpy or Arrow) a column; NaN in nullable float columns becomes null."""
+        unknown = set(arrays) - set(self.names())
+        missing = set(self.names()) - set(arrays)
+        if unknown or missing:
+            raise TableError(
+                *(f"table {self.name}: column {name} is not in its schema" for name in sorted(unknown)),
+                *(f"table {self.name}: column {name} is missing" for name in sorted(missing)),
+            )
+        columns = [_arrow_array(arrays[column.name], column) for column in self.columns]
+        table = pa.Table.from_arrays(columns, schema=self.arrow())
+        self.check(table)
+        return table
+
+    def empty(self) -> pa.Table:
+        """Return the table without rows."""
+        return self.arrow().empty_table()
+
+    def check(self, table: pa.Table) -> None:
+        """Raise `TableError` naming every column that is missing, extra, of a wrong type, or null where it must not be."""
+        problems = list(self._problems(table))
+        if problems:
+            raise TableError(*problems)
+
+    def _problems(self, table: pa.Table) -> Iterable[str]:
+        for column in self.columns:
+            if column.name not in table.column_names:
+                yield f"table {self.name}: column {column.name} is missing (wanted {column.dtype}, {column.unit})"
+                continue
+            got = table.schema.field(column.name).type
+            data = table.column(column.name)
+            if got != column.dtype:
+                yield f"table {self.name}: column {column.name} is {got}, wanted {column.dtype}"
+            elif data.null_count and not column.nullable:
+                yield f"table {self.name}: column {column.name} has {data.null_count} nulls, wanted none"
+            elif (
+                pa.types.is_floating(got)
+                and not pc.all(pc.is_finite(data.drop_null())).as_py()
+                and len(data) > data.null_count
+            ):
+                yield f"table {self.name}: column {column.name} has values that are not finite"
+        for name in table.column_names:
+            if name not in self.names():
+                yield f"table {self.name}: column {name} is not in its schema"
+
+
+def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
+    """Return a column as float64, null as NaN, shape (N,)."""
+    values: NDArray[np.float64] = table.column(name).to_numpy().astype(np.float64, copy=False)
+    return values
+
+
+def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
+    """Return a column without nulls as int64, shape (N,)."""
+    values: NDArray[np.int64] = table.column(name).to_numpy().astype(np.int64, copy=False)
+    return values
+
+
+def _arrow_array(values: object, column: Column) -> pa.Array:
+    if isinstance(values, pa.ChunkedArray):
+        values = values.combine_chunks()
+    if isinstance(values, pa.Array):
+        return values if values.type == column.dtype else values.cast(column.dtype)
+    from_pandas = column.nullable and pa.types.is_floating(column.dtype)
+    return pa.array(values, type=column.dtype, from_pandas=from_pandas)

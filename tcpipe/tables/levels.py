@@ -1,0 +1,553 @@
+"""The levels of data, L1 to L6: the contract of every table, and the types that stages hand to each other.
+
+===== ==================== ==========================================================================
+level type                 holds
+===== ==================== ==========================================================================
+L0    the recording        never touched
+L1    `Streams`            one table per role, SI units, in the sensor's own frame
+L2    `Track`              20 Hz: pose in the ENU plane of a datum, twist, deviations, voltage, current
+L3    `GatedTrack`         Track + ``dropped_by`` bits
+L4    `Segments`           span, end states, chord, arc, course
+L5    `LabelledSegments`   power, velocity, duration, energy, their deviations, quality bits
+L6    `Samples`            split, map, terrain class, slope; patches are arrays in the same order
+===== ==================== ==========================================================================
+
+A level is checked when it is made: an invalid Track cannot exist, and one error names every wrong column.
+Frames follow REP-103 and REP-105: base_link is x forward, y left, z up; the track's plane is east, north, up of its datum.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
+
+import pyarrow as pa
+
+from tcpipe.errors import TableError
+from tcpipe.tables.bits import DropReason, Quality
+from tcpipe.tables.columns import Column, TableSchema
+
+DATA_MODEL_VERSION = "1.0"
+"""Version of every table and manifest below; its history stands in docs/reference/data-model.md."""
+
+_METADATA_KEY = b"tcpipe"
+
+_F64 = pa.float64()
+_I64 = pa.int64()
+
+_STAMP = Column("stamp_ns", _I64, "ns", "time of measurement, UTC, since 1970 (or since the epoch of simulated time)")
+_LOG_TIME = Column("log_time_ns", _I64, "ns", "time the recorder received the message")
+_EPOCH = Column(
+    "epoch", pa.int16(), "1", "clock epoch: a lasting step of the clock opens the next; nothing is integrated across it"
+)
+
+
+def _xyz(prefix: str, suffix: str, unit: str, doc: str, frame: str, *, nullable: bool = False) -> tuple[Column, ...]:
+    return tuple(Column(f"{prefix}_{axis}_{suffix}", _F64, unit, f"{doc}, {axis}", frame, nullable) for axis in "xyz")
+
+
+GNSS = TableSchema(
+    "gnss",
+    "L1",
+    "Antenna positions, fixes only.",
+    (
+        _STAMP,
+        _LOG_TIME,
+        _EPOCH,
+        Column("lon_deg", _F64, "deg", "longitude of the antenna", "gnss_crs"),
+        Column("lat_deg", _F64, "deg", "latitude of the antenna", "gnss_crs"),
+        Column("alt_m", _F64, "m", "height of the antenna above the ellipsoid", "gnss_crs"),
+        Column("east_var_m2", _F64, "m2", "variance east; null where the receiver gives none", "enu", nullable=True),
+        Column("north_var_m2", _F64, "m2", "variance north; null where the receiver gives none", "enu", nullable=True),
+        Column("up_var_m2", _F64, "m2", "variance up; null where the receiver gives none", "enu", nullable=True),
+        Column("fix_status", pa.int8(), "1", "NavSatStatus: 0 fix, 1 satellite-based, 2 ground-based augmentation"),
+    ),
+)
+
+IMU = TableSchema(
+    "imu",
+    "L1",
+    "Inertial measurements in the sensor's frame.",
+    (
+        _STAMP,
+        _LOG_TIME,
+        _EPOCH,
+        *_xyz("angular_velocity", "radps", "rad/s", "angular velocity", "sensor"),
+        *_xyz("linear_acceleration", "mps2", "m/s2", "specific force (gravity included)", "sensor"),
+        *(
+            Column(
+                f"quat_{c}", _F64, "1", f"orientation world_from_sensor, {c}; null where absent", "world", nullable=True
+            )
+            for c in "xyzw"
+        ),
+        *(
+            Column(
+                f"{name}_var", _F64, unit, f"mean variance of the {doc}; null where unknown", "sensor", nullable=True
+            )
+            for name, unit, doc in (
+                ("angular_velocity", "rad2/s2", "angular velocity"),
+                ("linear_acceleration", "m2/s4", "specific force"),
+                ("orientation", "rad2", "orientation"),
+            )
+        ),
+    ),
+)
+
+
+def _odometry(name: str, doc: str) -> TableSchema:
+    return TableSchema(
+        name,
+        "L1",
+        doc,
+        (
+            _STAMP,
+            _LOG_TIME,
+            _EPOCH,
+            *_xyz("velocity", "mps", "m/s", "body velocity; null where the source gives none", "child", nullable=True),
+            *_xyz(
+                "angular_velocity", "radps", "rad/s", "body angular velocity; null where none", "child", nullable=True
+            ),
+            *_xyz(
+                "velocity_var",
+                "m2ps2",
+                "m2/s2",
+                "variance of the body velocity; null where unknown",
+                "child",
+                nullable=True,
+            ),
+            Column(
+                "yaw_rate_var", _F64, "rad2/s2", "variance of the yaw rate; null where unknown", "child", nullable=True
+            ),
+            *(
+                Column(
+                    f"{axis}_m",
+                    _F64,
+                    "m",
+                    f"pose {axis} in the source's own odom frame; for increments only",
+                    "odom",
+                    nullable=True,
+                )
+                for axis in "xyz"
+            ),
+            *(
+                Column(
+                    f"quat_{c}",
+                    _F64,
+                    "1",
+                    f"pose orientation odom_from_child, {c}; for increments only",
+                    "odom",
+                    nullable=True,
+                )
+                for c in "xyzw"
+            ),
+        ),
+    )
+
+
+WHEEL_ODOMETRY = _odometry("wheel_odometry", "Wheel odometry: a body twist in the child frame.")
+VISUAL_ODOMETRY = _odometry(
+    "visual_odometry", "Visual odometry: a body twist, or poses to be used as increments, in its own child frame."
+)
+
+POWER = TableSchema(
+    "power",
+    "L1",
+    "Voltage and current of each drive rail; a rail's power is their product, the robot's the sum over rails.",
+    (
+        _STAMP,
+        _LOG_TIME,
+        _EPOCH,
+        Column("rail", pa.string(), "", "name of the rail (profile or topic)"),
+        Column("voltage_volt", _F64, "V", "voltage; null where this row carries only a current", nullable=True),
+        Column(
+            "current_amp",
+            _F64,
+            "A",
+            "current, positive when drawn; null where this row carries only a voltage",
+            nullable=True,
+        ),
+    ),
+)
+
+COMMAND = TableSchema(
+    "command",
+    "L1",
+    "Commanded body velocity.",
+    (
+        _STAMP,
+        _LOG_TIME,
+        _EPOCH,
+        Column("forward_velocity_mps", _F64, "m/s", "commanded forward velocity", "base_link"),
+        Column("yaw_rate_radps", _F64, "rad/s", "commanded yaw rate", "base_link"),
+    ),
+)
+
+STREAMS: dict[str, TableSchema] = {
+    schema.name: schema for schema in (GNSS, IMU, WHEEL_ODOMETRY, VISUAL_ODOMETRY, POWER, COMMAND)
+}
+"""Schema of each role's table."""
+
+_TRACK_COLUMNS = (
+    Column("stamp_ns", _I64, "ns", "time, UTC; a multiple of the track's period"),
+    _EPOCH,
+    *(
+        Column(f"{axis}_m", _F64, "m", f"base_link {name} of the datum", "enu")
+        for axis, name in zip("xyz", ("east", "north", "up"), strict=True)
+    ),
+    Column("lon_deg", _F64, "deg", "longitude of base_link; null in a local frame", "gnss_crs", nullable=True),
+    Column("lat_deg", _F64, "deg", "latitude of base_link; null in a local frame", "gnss_crs", nullable=True),
+    Column("alt_m", _F64, "m", "ellipsoidal height of base_link; null in a local frame", "gnss_crs", nullable=True),
+    Column("roll_rad", _F64, "rad", "roll", "enu"),
+    Column("pitch_rad", _F64, "rad", "pitch, positive nose down (REP-103)", "enu"),
+    Column("yaw_rad", _F64, "rad", "yaw of the body, counter-clockwise from true east, [-pi, pi)", "enu"),
+    *(
+        Column(f"{name}_velocity_mps", _F64, "m/s", f"velocity {name} of base_link", "enu")
+        for name in ("east", "north", "up")
+    ),
+    Column("forward_velocity_mps", _F64, "m/s", "velocity along the body's x axis", "base_link"),
+    Column("yaw_rate_radps", _F64, "rad/s", "angular velocity about the body's z axis", "base_link"),
+    *(Column(f"{axis}_std_m", _F64, "m", f"standard deviation of {axis}", "enu") for axis in "xyz"),
+    Column("yaw_std_rad", _F64, "rad", "standard deviation of yaw", "enu"),
+    Column("forward_velocity_std_mps", _F64, "m/s", "standard deviation of the forward velocity", "base_link"),
+    *(
+        Column(
+            f"displacement_std_{name}_m",
+            _F64,
+            "m",
+            f"standard deviation of the horizontal displacement over the next {name}, along it, the correlation of both ends counted; "
+            "null where the track does not go on, and without a smoother",
+            "enu",
+            nullable=True,
+        )
+        for name in ("500ms", "1s", "2s", "4s")
+    ),
+    Column(
+        "wheel_velocity_mps",
+        _F64,
+        "m/s",
+        "forward velocity by the wheels, interpolated; null without",
+        "base_link",
+        nullable=True,
+    ),
+    Column(
+        "commanded_velocity_mps",
+        _F64,
+        "m/s",
+        "commanded forward velocity, last value; null without",
+        "base_link",
+        nullable=True,
+    ),
+    Column(
+        "commanded_yaw_rate_radps",
+        _F64,
+        "rad/s",
+        "commanded yaw rate, last value; null without",
+        "base_link",
+        nullable=True,
+    ),
+    Column("voltage_volt", _F64, "V", "mean voltage over the rails, interpolated; null without power", nullable=True),
+    Column("current_amp", _F64, "A", "sum of the rails' currents, interpolated; null without power", nullable=True),
+    Column("power_watt", _F64, "W", "sum over rails of voltage times current; null without power", nullable=True),
+)
+
+TRACK = TableSchema("track", "L2", "The fused track, 20 Hz, base_link.", _TRACK_COLUMNS)
+
+GATED_TRACK = TableSchema(
+    "track",
+    "L3",
+    "The fused track with the reasons why rows are not used; nothing is deleted.",
+    (
+        *_TRACK_COLUMNS,
+        Column("dropped_by", pa.uint32(), "bits", "why the row is not used, 0 = kept", flags=DropReason),
+    ),
+)
+
+_SEGMENT_COLUMNS = (
+    Column("segment_id", pa.string(), "", "run_id + '-' + start stamp"),
+    Column("run_id", pa.string(), "", "log stem + first 8 hex of its sha256"),
+    Column("robot", pa.string(), "", "robot profile"),
+    _EPOCH,
+    Column("start_ns", _I64, "ns", "time at the segment's start, interpolated"),
+    Column("end_ns", _I64, "ns", "time at the segment's end, interpolated"),
+    *(
+        Column(
+            f"{end}_{name}_deg", _F64, "deg", f"{doc} of the {end}; null in a local frame", "gnss_crs", nullable=True
+        )
+        for end in ("start", "end")
+        for name, doc in (("lon", "longitude"), ("lat", "latitude"))
+    ),
+    *(
+        Column(f"{end}_{axis}_m", _F64, "m", f"{name} of the {end}", "enu")
+        for end in ("start", "end")
+        for axis, name in zip("xyz", ("east", "north", "up"), strict=True)
+    ),
+    Column("chord_m", _F64, "m", "horizontal straight-line distance start to end", "enu"),
+    Column("arc_length_m", _F64, "m", "horizontal length of the driven path", "enu"),
+    Column("course_rad", _F64, "rad", "direction start to end, counter-clockwise from true east", "enu"),
+    Column(
+        "fused_velocity_mps", _F64, "m/s", "time-mean of the fused forward body velocity (the paper's v*)", "base_link"
+    ),
+    Column("position_std_m", _F64, "m", "largest horizontal position standard deviation of both ends", "enu"),
+    Column(
+        "commanded_velocity_mps",
+        _F64,
+        "m/s",
+        "mean commanded forward velocity; null without commands",
+        "base_link",
+        nullable=True,
+    ),
+)
+
+SEGMENTS = TableSchema("segments", "L4", "Steady, straight pieces of one chord each.", _SEGMENT_COLUMNS)
+
+_LABEL_COLUMNS = (
+    Column("duration_s", _F64, "s", "T: time from start to end"),
+    Column("velocity_mps", _F64, "m/s", "v: chord / duration"),
+    Column("power_watt", _F64, "W", "w: energy / duration; null without power", nullable=True),
+    Column("energy_joule", _F64, "J", "E: integral of voltage times current; null without power", nullable=True),
+    Column("duration_std_s", _F64, "s", "standard deviation of the duration, as a label of the true metre"),
+    Column("velocity_std_mps", _F64, "m/s", "standard deviation of the velocity, likewise"),
+    Column("power_std_watt", _F64, "W", "standard deviation of the power, likewise; null without power", nullable=True),
+    Column(
+        "energy_std_joule", _F64, "J", "standard deviation of the energy, likewise; null without power", nullable=True
+    ),
+    Column(
+        "physics_power_watt",
+        _F64,
+        "W",
+        "power by rolling resistance and grade alone, fitted on the run; null without power or fit",
+        nullable=True,
+    ),
+    Column("power_samples", pa.int32(), "1", "power samples inside the segment"),
+    Column("quality", pa.uint32(), "bits", "what a user may want to know, 0 = clean", flags=Quality),
+)
+
+LABELLED_SEGMENTS = TableSchema(
+    "segments", "L5", "Segments with the cost of the metre each one covers.", (*_SEGMENT_COLUMNS, *_LABEL_COLUMNS)
+)
+
+SAMPLES = TableSchema(
+    "samples",
+    "L6",
+    "One row a sample, in the order of the patches.",
+    (
+        Column("sample_id", pa.string(), "", "the segment's id; joins samples and patches"),
+        Column("split", pa.string(), "", "train, test, unseen or buffer"),
+        Column(
+            "fold",
+            pa.int8(),
+            "1",
+            "fold of spatial cross-validation, blocks kept whole; null unless train or test",
+            nullable=True,
+        ),
+        Column("map", pa.string(), "", "name of the map the patch was sampled from"),
+        *_SEGMENT_COLUMNS,
+        *_LABEL_COLUMNS,
+        Column(
+            "terrain_class",
+            pa.uint8(),
+            "1",
+            "majority class id under the chord; null without a terrain layer",
+            nullable=True,
+        ),
+        Column("terrain_name", pa.string(), "", "its name; null without a terrain layer", nullable=True),
+        Column(
+            "terrain_purity", _F64, "1", "share of the chord on that class; null without a terrain layer", nullable=True
+        ),
+        Column(
+            "slope_rad", _F64, "rad", "slope of a plane fitted to the patch's heights, positive uphill along travel"
+        ),
+        Column("cross_slope_rad", _F64, "rad", "cross slope, positive when the left side is higher"),
+        Column("valid_fraction", _F64, "1", "share of the patch's pixels with data in every layer"),
+        Column("height_min_m", _F64, "m", "smallest height in the patch; the height layer is above it", "map"),
+        Column(
+            "height_clipped_fraction",
+            _F64,
+            "1",
+            "share of pixels more than 1 m above the smallest, clipped in the tensor",
+        ),
+    ),
+)
+
+REJECTIONS = TableSchema(
+    "rejections",
+    "L2",
+    "Measurements that the filter refused, and why.",
+    (
+        Column("stamp_ns", _I64, "ns", "time of the measurement"),
+        Column("role", pa.string(), "", "gnss, imu, wheel_odometry, visual_odometry"),
+        Column("reason", pa.string(), "", "gate: chi-square; invalid: not finite; covariance: unusable"),
+        Column(
+            "normalized_innovation_squared",
+            _F64,
+            "1",
+            "innovation' S^-1 innovation; null where not computed",
+            nullable=True,
+        ),
+        Column("threshold", _F64, "1", "the gate; null where not computed", nullable=True),
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Findings:
+    """What a stage noticed: warnings for people, and counts and facts (JSON values) for the manifest."""
+
+    warnings: tuple[str, ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """Where a stream came from and where its sensor sits.
+
+    ``xyz_m`` and ``quat_xyzw`` are base_link_from_sensor (position of the sensor in base_link; rotation sensor to base_link).
+    """
+
+    topic: str
+    type_name: str
+    frame_id: str
+    why: str
+    xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    quat_xyzw: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 1.0)
+    placed_by: str = "assumed"
+    """``tf_static``, ``recipe``, ``same frame`` (the message is already in base_link), ``assumed``, or ``not needed`` (power, command)."""
+    time_source: str = "header"
+    """``header`` or ``log``: which stamp rules."""
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """L1: one checked table per role that the log has, and where each came from."""
+
+    tables: Mapping[str, pa.Table]
+    sensors: Mapping[str, Sensor]
+    robot: str
+    gnss_crs: str = "EPSG:4326"
+    power_averaged: bool = False
+    """The source averages power over its message period (right-endpoint rectangle) rather than sampling it."""
+    findings: Findings = field(default_factory=Findings)
+
+    def __post_init__(self) -> None:
+        """Check every table against its role's schema."""
+        problems = [f"streams: unknown role {role}" for role in self.tables if role not in STREAMS]
+        for role, table in self.tables.items():
+            if role in STREAMS:
+                try:
+                    STREAMS[role].check(table)
+                except TableError as error:
+                    problems += error.problems
+        if problems:
+            raise TableError(*problems)
+
+
+@dataclass(frozen=True, slots=True)
+class Datum:
+    """Origin of a track's ENU plane; ``crs`` is the geographic CRS of lon/lat. All zero in a local frame."""
+
+    lon_deg: float
+    lat_deg: float
+    alt_m: float
+    crs: str = "EPSG:4326"
+
+
+@dataclass(frozen=True, slots=True)
+class TrackInfo:
+    """What belongs to a whole track; ``datum`` is None for a local frame (a log without GNSS)."""
+
+    run_id: str
+    robot: str
+    datum: Datum | None
+    rate_hz: float
+    estimator: str
+    findings: Findings = field(default_factory=Findings)
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """L2: the fused track and the measurements that fusion refused."""
+
+    table: pa.Table
+    rejections: pa.Table
+    info: TrackInfo
+
+    def __post_init__(self) -> None:
+        """Check both tables."""
+        TRACK.check(self.table)
+        REJECTIONS.check(self.rejections)
+
+
+@dataclass(frozen=True, slots=True)
+class GatedTrack:
+    """L3: the track with ``dropped_by``."""
+
+    table: pa.Table
+    info: TrackInfo
+
+    def __post_init__(self) -> None:
+        """Check the table."""
+        GATED_TRACK.check(self.table)
+
+
+@dataclass(frozen=True, slots=True)
+class Segments:
+    """L4: cut segments and where every metre of the track went (``ledger_m``: kept, then each loss by name)."""
+
+    table: pa.Table
+    info: TrackInfo
+    ledger_m: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        """Check the table."""
+        SEGMENTS.check(self.table)
+
+
+@dataclass(frozen=True, slots=True)
+class LabelledSegments:
+    """L5: segments with their labels."""
+
+    table: pa.Table
+    info: TrackInfo
+    ledger_m: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        """Check the table."""
+        LABELLED_SEGMENTS.check(self.table)
+
+
+def with_findings(info: TrackInfo, stage: str, warnings: tuple[str, ...], facts: Mapping[str, Any]) -> TrackInfo:
+    """Return ``info`` with one more stage's warnings and facts (under the stage's name)."""
+    found = Findings(info.findings.warnings + warnings, {**info.findings.facts, stage: dict(facts)})
+    return replace(info, findings=found)
+
+
+def with_metadata(table: pa.Table, metadata: Mapping[str, Any]) -> pa.Table:
+    """Return the table with ``metadata`` (JSON values) in its schema, under the key ``tcpipe``."""
+    text = json.dumps({"data_model_version": DATA_MODEL_VERSION, **metadata}, sort_keys=True)
+    return table.replace_schema_metadata({_METADATA_KEY: text.encode()})
+
+
+def metadata_of(table: pa.Table) -> dict[str, Any]:
+    """Return what `with_metadata` stored, or an empty dict."""
+    found: dict[str, Any] = json.loads((table.schema.metadata or {}).get(_METADATA_KEY, b"{}"))
+    return found
+
+
+def info_to_json(info: TrackInfo) -> dict[str, Any]:
+    """Return a track's info as JSON values."""
+    return asdict(info)
+
+
+def info_from_json(values: Mapping[str, Any]) -> TrackInfo:
+    """Return the info that `info_to_json` wrote."""
+    datum, findings = values["datum"], values["findings"]
+    return TrackInfo(
+        run_id=values["run_id"],
+        robot=values["robot"],
+        datum=None if datum is None else Datum(**datum),
+        rate_hz=values["rate_hz"],
+        estimator=values["estimator"],
+        findings=Findings(tuple(findings["warnings"]), findings["facts"]),
+    )

@@ -1,0 +1,1 @@
+"""Maps as grids: classes, patch geometry, the sampling kernel, layers."""

@@ -1,0 +1,81 @@
+"""Coarser levels of a map, so that a patch whose pixels are wider than the map's shows what is there on average, not every n-th pixel.
+
+A level's pixel spans ``factor`` x ``factor`` map pixels: height and grey are their mean, class the commonest (ties go to the lower id,
+no data votes like a class). As everywhere, a mean with a part that is missing is missing. A patch takes the coarsest level that is not
+coarser than its own pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.resampling_kernel import block_majority
+
+COARSEST_M = 1.0
+"""No level has wider pixels than this, the length of a segment [m]."""
+
+_WIDEST_FACTOR = 1024
+_SLACK = 1.01
+
+
+def overview_factors(grid: MapGrid) -> tuple[int, ...]:
+    """Return the factors of a map's levels, rising: 1, 2, 4 … while pixels stay below `COARSEST_M` and two remain each way."""
+    factors = [1]
+    while (
+        (factor := 2 * factors[-1]) <= _WIDEST_FACTOR
+        and factor * grid.pitch_m <= COARSEST_M
+        and min(grid.rows, grid.cols) // factor >= 2
+    ):
+        factors.append(factor)
+    return tuple(factors)
+
+
+def overview_grid(grid: MapGrid, factor: int) -> MapGrid:
+    """Return the grid of a level: the same corner, wider pixels; what does not fill one at the far edges is left out."""
+    return replace(grid, pitch_m=grid.pitch_m * factor, rows=grid.rows // factor, cols=grid.cols // factor)
+
+
+def factor_for(factors: Sequence[int], map_pitch_m: float, pitch_m: float) -> int:
+    """Return the largest factor whose pixels are not wider than ``pitch_m``; the smallest where all are."""
+    return max((factor for factor in factors if factor * map_pitch_m <= _SLACK * pitch_m), default=min(factors))
+
+
+def coarser_levels(layer: str, values: NDArray[Any], factors: Sequence[int]) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Yield each factor above 1 and the layer at it.
+
+    Parameters
+    ----------
+    layer
+        ``height``, ``ortho`` or ``terrain``.
+    values
+        Pixels of the map, shape (R, C): heights [m] with NaN, or bytes with 0, as no data.
+    factors
+        Powers of two, rising, as `overview_factors` gives them.
+    """
+    if layer == "terrain":
+        for factor in factors[1:]:
+            out = np.empty((values.shape[0] // factor, values.shape[1] // factor), np.uint8)
+            block_majority(values, factor, out)
+            yield factor, out
+        return
+    means = np.where(values == 0, np.float32(np.nan), values.astype(np.float32)) if layer == "ortho" else values
+    for factor in factors[1:]:
+        means = _halved(means)
+        yield factor, _grey(means) if layer == "ortho" else means
+
+
+def _halved(values: NDArray[Any]) -> NDArray[Any]:
+    """Return means of 2 x 2 pixels; an odd last row or column is left out."""
+    even = values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2]
+    rows = even[0::2] + even[1::2]
+    return np.asarray((rows[:, 0::2] + rows[:, 1::2]) * rows.dtype.type(0.25))
+
+
+def _grey(means: NDArray[np.float32]) -> NDArray[np.uint8]:
+    return np.where(np.isfinite(means), np.rint(means), 0.0).astype(np.uint8)

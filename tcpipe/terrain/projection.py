@@ -1,0 +1,168 @@
+"""Coordinate reference systems of maps: which are metric and upright, and how points get from one to another.
+
+A map's CRS must be one in which a patch may be cut as if the plane were the ground: x and y right-handed, and a unit of the plane
+within one per cent of a metre on the ellipsoid. UTM zones and national grids are; degrees, feet and Web Mercator are not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS, Transformer
+from pyproj.aoi import AreaOfInterest
+from pyproj.database import query_utm_crs_info
+from pyproj.exceptions import CRSError, ProjError
+from pyproj.transformer import AreaOfInterest as TransformArea
+from pyproj.transformer import TransformerGroup
+
+from tcpipe.errors import MapError
+
+FloatArray = NDArray[np.float64]
+
+MAX_SCALE_ERROR = 0.01
+"""A CRS whose unit is further from a metre of ground than this share is not metric enough to cut patches in."""
+
+DOUBTFUL_ACCURACY_M = 0.1
+"""A transformation known no better than this deserves a warning: RTK is half of it."""
+
+_EARTH_RADIUS_M = 6_371_000.0
+
+
+def parse_crs(text: str, *, where: str) -> CRS:
+    """Return the horizontal part of a CRS given as ``EPSG:n`` or WKT; `MapError` names ``where`` it was given."""
+    try:
+        crs = CRS.from_user_input(text)
+    except CRSError as error:
+        raise MapError(f"{where}: {text[:60]!r} is not a coordinate reference system (wanted EPSG:n or WKT)") from error
+    while crs.is_compound or crs.is_bound:
+        crs = crs.sub_crs_list[0] if crs.is_compound else CRS(crs.source_crs)
+    crs = crs.to_2d()
+    if crs.geodetic_crs is None or not (crs.is_projected or crs.is_geographic):
+        raise MapError(f"{where}: the CRS {crs.name!r} is not tied to the earth (wanted a projected or geographic CRS)")
+    radius_m = _ellipsoid(crs)[0]
+    if abs(radius_m / _EARTH_RADIUS_M - 1.0) > 0.02:
+        raise MapError(
+            f"{where}: the CRS {crs.name!r} is of another body (radius {radius_m / 1000:.0f} km), not the earth"
+        )
+    authority = crs.to_authority(min_confidence=100)
+    return CRS.from_authority(*authority) if authority else crs
+
+
+def crs_text(crs: CRS) -> str:
+    """Return ``AUTHORITY:code`` where the CRS is exactly that, else WKT 2."""
+    authority = crs.to_authority(min_confidence=100)
+    return ":".join(authority) if authority else crs.to_wkt()
+
+
+def metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
+    """Return the local map from the CRS plane to the ground, at points of the plane.
+
+    Returns
+    -------
+    numpy.ndarray
+        Shape (N, 2, 2): metres east and north on the ellipsoid per CRS unit in x and y; NaN where the CRS is not defined.
+    """
+    geodetic = CRS(crs.geodetic_crs)
+    step = 1e-4 if crs.is_geographic else 10.0
+    to_lonlat = Transformer.from_crs(crs, geodetic, always_xy=True)
+    x, y = xy[:, 0], xy[:, 1]
+    east, north = (np.array(to_lonlat.transform(x + dx, y + dy)) for dx, dy in ((step, 0.0), (0.0, step)))
+    west, south = (np.array(to_lonlat.transform(x - dx, y - dy)) for dx, dy in ((step, 0.0), (0.0, step)))
+    latitude = np.radians((north[1] + south[1]) / 2.0)
+    a, e2 = _ellipsoid(crs)
+    w = 1.0 - e2 * np.sin(latitude) ** 2
+    per_degree = np.stack([a / np.sqrt(w) * np.cos(latitude), a * (1.0 - e2) / w**1.5]) * (math.pi / 180.0)
+    columns = [difference * per_degree / (2.0 * step) for difference in (east - west, north - south)]
+    found = np.stack(columns, axis=-1).swapaxes(0, 1)
+    return np.where(np.isfinite(found), found, np.nan)
+
+
+def _ellipsoid(crs: CRS) -> tuple[float, float]:
+    ellipsoid = CRS(crs.geodetic_crs).ellipsoid
+    assert ellipsoid is not None  # noqa: S101  (a geodetic CRS has one)
+    a, b = ellipsoid.semi_major_metre, ellipsoid.semi_minor_metre
+    return a, 1.0 - (b / a) ** 2
+
+
+def is_metric(crs: CRS, xy: FloatArray) -> bool:
+    """Return whether the CRS is right-handed and within one per cent of metres at all the given points of its plane."""
+    if not crs.is_projected:
+        return False
+    ground = metres_from_plane(crs, xy)
+    if not np.isfinite(ground).all():
+        return False
+    scales = np.linalg.svd(ground, compute_uv=False)
+    return bool((np.linalg.det(ground) > 0.0).all() and (np.abs(scales - 1.0) < MAX_SCALE_ERROR).all())
+
+
+def utm_crs(crs: CRS, xy: tuple[float, float]) -> CRS:
+    """Return the UTM zone of a point of another CRS, on its datum where that has one, else on WGS 84."""
+    geodetic = CRS(crs.geodetic_crs)
+    lon, lat = Transformer.from_crs(crs, geodetic, always_xy=True).transform(*xy)
+    if not (math.isfinite(lon) and math.isfinite(lat)):
+        raise MapError(f"the point {xy} lies outside the area where the CRS {crs.name!r} is defined")
+    spot = AreaOfInterest(lon, lat, lon, lat)
+    found = query_utm_crs_info(datum_name=geodetic.name, area_of_interest=spot)
+    if found:
+        return CRS.from_authority(found[0].auth_name, found[0].code)
+    zone = min(int((lon + 180.0) // 6.0) + 1, 60)
+    return CRS.from_epsg((32600 if lat >= 0.0 else 32700) + zone)
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The one operation that takes points from one CRS to another over one area, so that neighbours are never taken differently.
+
+    ``area_deg`` is west, south, east, north. Axes are always x (longitude, east) first.
+    """
+
+    source: CRS
+    target: CRS
+    area_deg: tuple[float, float, float, float]
+
+    @cached_property
+    def _transformer(self) -> Transformer:
+        area = TransformArea(*self.area_deg)
+        group = TransformerGroup(self.source, self.target, always_xy=True, area_of_interest=area)
+        if not group.transformers:
+            raise MapError(f"no transformation is known from {self.source.name!r} to {self.target.name!r}")
+        return group.transformers[0]
+
+    def forward(self, xy: FloatArray) -> FloatArray:
+        """Return points of shape (..., 2) in the target CRS; infinite where the CRS is not defined."""
+        return self._transform(xy, "FORWARD")
+
+    def inverse(self, xy: FloatArray) -> FloatArray:
+        """Return points of the target CRS, shape (..., 2), in the source CRS."""
+        return self._transform(xy, "INVERSE")
+
+    def _transform(self, xy: FloatArray, direction: str) -> FloatArray:
+        try:
+            x, y = self._transformer.transform(xy[..., 0], xy[..., 1], direction=direction)
+        except ProjError as error:
+            raise MapError(
+                f"points cannot be taken from {self.source.name!r} to {self.target.name!r}: {error}"
+            ) from error
+        return np.stack([np.asarray(x, np.float64), np.asarray(y, np.float64)], axis=-1)
+
+    def doubt(self) -> str | None:
+        """Return a plain sentence if the two datums differ and the shift between them is known only roughly, else None."""
+        if CRS(self.source.geodetic_crs).datum == CRS(self.target.geodetic_crs).datum:
+            return None
+        accuracy_m = self._transformer.accuracy
+        if "ballpark" not in self._transformer.description.lower() and 0.0 <= accuracy_m <= DOUBTFUL_ACCURACY_M:
+            return None
+        known = f"only to about {accuracy_m:g} m" if accuracy_m > 0.0 else "not at all (taken as none)"
+        names = [CRS(crs.geodetic_crs).name for crs in (self.source, self.target)]
+        return f"the shift between the datums {names[0]} and {names[1]} is known {known}"
+
+
+def area_of(crs: CRS, bounds: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    """Return west, south, east, north [deg] of a rectangle (x min, y min, x max, y max) in a CRS."""
+    transformer = Transformer.from_crs(crs, CRS(crs.geodetic_crs), always_xy=True)
+    west, south, east, north = transformer.transform_bounds(*bounds)
+    return west, south, east, north

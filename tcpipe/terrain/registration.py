@@ -1,0 +1,218 @@
+"""Does the map lie where the track was driven? The ground's height under the track tells.
+
+A track's heights and the map's differ by a constant (ellipsoid against geoid, the robot's own height) that says nothing. What is left is
+the shape of the ground; the horizontal shift at which the two shapes agree best is searched over a small window, as in terrain-aided
+navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary no shift can be
+told, and none is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import minimum_filter
+
+from tcpipe.terrain.tiles import MapReader, groups_by_tile, level_for, read_window
+
+FloatArray = NDArray[np.float64]
+
+REACH_M = 3.0
+"""Shifts are searched this far each way [m]."""
+
+KNOWN_M = 0.25
+"""A direction along which the shift's standard deviation is larger is not determined by the ground [m]."""
+
+_STEP_M = 0.25
+_SPACING_M = 0.5
+_MOST_POINTS = 1_200
+_FEWEST_POINTS = 60
+_BLOCKS = 12
+"""Stretches left out in turn (delete-one-block jackknife): errors of GNSS and of the map are alike over metres."""
+_CHI2_999 = 13.82
+"""99.9 % of χ² with two degrees of freedom."""
+_OUTLIER = 3.5
+_SIGMAS = 5.0
+"""So far must the misfit fall beyond its own uncertainty: the best of 600 shifts falls by three by chance."""
+_LEAST_GAIN = -2.0 * np.log(0.9)
+"""A shift that leaves more than 90 % of the misfit is not what was wrong."""
+_RIVAL_SIGMAS = 3.0
+_APART_M = 0.75
+"""Ground that fits nearly as well somewhere else, this far away, does not tell where the track is [m]."""
+_RIDGE = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """How a map lies against a track.
+
+    ``shift_xy_m`` is what to add to the track's positions to find their ground on the map [m, the map's axes], along determined
+    directions only; ``shift_std_m`` its largest standard deviation along them, NaN where none is determined. ``height_offset_m`` is track
+    minus map; ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left without and with the shift. ``significant``:
+    the shift is not chance. ``at_reach``: the best shift lies at the window's edge, the true one may be larger.
+    """
+
+    points: int
+    shift_xy_m: tuple[float, float]
+    shift_std_m: float
+    height_offset_m: float
+    misfit_m: float
+    shifted_misfit_m: float
+    significant: bool
+    at_reach: bool
+
+    @property
+    def shift_m(self) -> float:
+        """Length of the shift [m]."""
+        return float(np.hypot(*self.shift_xy_m))
+
+
+def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) -> Registration | None:
+    """Find the horizontal shift at which the map's ground fits the track's heights best.
+
+    Parameters
+    ----------
+    source
+        The map.
+    xy_m
+        Positions of the track in the map's CRS, in the order driven, shape (N, 2) [m]; what is not finite or not on the map is passed over.
+    height_m
+        Their heights above any surface, shape (N,) [m].
+
+    Returns
+    -------
+    None where fewer than `_FEWEST_POINTS` points, half a metre apart, lie well inside the map.
+    """
+    level = level_for(source, _STEP_M)
+    finite = np.isfinite(xy_m).all(axis=1) & np.isfinite(height_m)
+    at = np.flatnonzero(finite)[_thinned(xy_m[finite])]
+    at = at[level.grid.contains(xy_m[at])]
+    steps = round(REACH_M / _STEP_M)
+    shift_m = np.arange(-steps, steps + 1, dtype=np.float64) * _STEP_M
+    ground_m = _ground(level, xy_m[at], shift_m)
+    whole = np.isfinite(ground_m).all(axis=(1, 2))
+    if whole.sum() < _FEWEST_POINTS:
+        return None
+    excess_m = ground_m[whole] - height_m[at][whole, None, None]
+    best = _least(np.median(np.abs(excess_m - np.median(excess_m, axis=0)), axis=0))
+    left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
+    good = left <= _OUTLIER * 1.4826 * np.median(left) + 1e-6  # what is not the ground: bridges, trees
+    best = _least(excess_m[good].var(axis=0))
+    return _refined(excess_m[good], best, shift_m)
+
+
+def _thinned(xy_m: FloatArray) -> NDArray[np.int64]:
+    """Return indices of points `_SPACING_M` of path apart, or further where that would be too many."""
+    if len(xy_m) == 0:
+        return np.zeros(0, np.int64)
+    path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(xy_m, axis=0), axis=1))])
+    spacing_m = max(_SPACING_M, path_m[-1] / _MOST_POINTS)
+    return np.unique((path_m / spacing_m).astype(np.int64), return_index=True)[1]
+
+
+def _ground(level: MapReader, xy_m: FloatArray, shift_m: FloatArray) -> FloatArray:
+    """Return the map's heights at every point moved by every pair of shifts (north, east), shape (N, K, K); NaN without data."""
+    px = level.grid.px_from_xy(xy_m)
+    offset_px = shift_m / level.grid.pitch_m
+    reach_px = int(np.ceil(offset_px[-1])) + 2
+    found = np.empty((len(xy_m), shift_m.size, shift_m.size))
+    for group in groups_by_tile(px, level):
+        col0, row0 = np.floor(px[group].min(axis=0)).astype(int) - reach_px
+        col1, row1 = np.floor(px[group].max(axis=0)).astype(int) + reach_px + 1
+        window = read_window(level, "height", row0, row1, col0, col1).astype(np.float64)
+        x = px[group, 0, None] - col0 + offset_px
+        y = px[group, 1, None] - row0 - offset_px  # rows run south
+        found[group] = _bilinear(window, y[:, :, None], x[:, None, :])
+    return found + level.height_reference_m
+
+
+def _bilinear(values: FloatArray, row: FloatArray, col: FloatArray) -> FloatArray:
+    i, j = np.floor(row).astype(np.int64), np.floor(col).astype(np.int64)
+    v, u = row - i, col - j
+    upper = values[i, j] * (1.0 - u) + values[i, j + 1] * u
+    lower = values[i + 1, j] * (1.0 - u) + values[i + 1, j + 1] * u
+    return np.asarray(upper * (1.0 - v) + lower * v)
+
+
+def _least(spread: FloatArray) -> tuple[int, int]:
+    """Return the lattice indices (north, east) of the shift that leaves the least spread."""
+    i, j = np.unravel_index(int(spread.argmin()), spread.shape)
+    return int(i), int(j)
+
+
+def _refined(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray) -> Registration:
+    """Refine the best shift of the lattice by one Gauss-Newton step, and tell how sure it is by leaving stretches out."""
+    last, middle = shift_m.size - 1, shift_m.size // 2
+    i, j = (min(max(index, 1), last - 1) for index in best)
+    east, north = excess_m[:, i, j + 1] - excess_m[:, i, j - 1], excess_m[:, i + 1, j] - excess_m[:, i - 1, j]
+    slope = np.stack([east, north], axis=1) / (2.0 * _STEP_M)
+    slope -= slope.mean(axis=0)
+    unshifted, left = (excess_m[:, a, b] - excess_m[:, a, b].mean() for a, b in ((middle, middle), (i, j)))
+    step_m, covariance = _step(slope, left)
+    variances, axes = np.linalg.eigh(covariance)
+    known = axes[:, variances < KNOWN_M**2]
+    if not _distinct(excess_m, (i, j), known, shift_m):
+        known = axes[:, :0]
+    step_m = known @ np.clip(known.T @ step_m, -_STEP_M, _STEP_M)
+    shifted = left + slope @ step_m
+    fitted = known @ known.T @ np.array([shift_m[j], shift_m[i]]) + step_m
+    weight = float(((known.T @ fitted) ** 2 / variances[: known.shape[1]]).sum())
+    gain, sigmas = _gain(unshifted, shifted)
+    return Registration(
+        points=len(excess_m),
+        shift_xy_m=(float(fitted[0]), float(fitted[1])),
+        shift_std_m=float(np.sqrt(variances[known.shape[1] - 1])) if known.size else float("nan"),
+        height_offset_m=-float(excess_m[:, i, j].mean()),
+        misfit_m=float(unshifted.std()),
+        shifted_misfit_m=float(shifted.std()),
+        significant=weight > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
+        at_reach=bool(known.size) and (i, j) != best,
+    )
+
+
+def _step(slope: FloatArray, left: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the least-squares step (2,) [m] that takes the misfits away, and its covariance (2, 2).
+
+    The covariance is the larger of what independent errors would give and what leaving stretches out gives, direction by direction their
+    sum; where the ground is even it is huge.
+    """
+    information, pull = slope[:, :, None] * slope[:, None, :], -slope * left[:, None]
+    total, force = information.sum(axis=0) + _RIDGE * len(left) * np.eye(2), pull.sum(axis=0)
+    step_m = np.linalg.solve(total, force)
+    without = [
+        np.linalg.solve(total - information[block].sum(axis=0), force - pull[block].sum(axis=0))
+        for block in _stretches(len(left))
+    ]
+    return step_m, np.linalg.inv(total) * (left + slope @ step_m).var() + _jackknife_covariance(np.stack(without))
+
+
+def _distinct(excess_m: FloatArray, best: tuple[int, int], known: FloatArray, shift_m: FloatArray) -> bool:
+    """Tell whether every other shift that fits best around it, away along the known directions, fits clearly worse."""
+    variance = excess_m.var(axis=0)
+    north, east = np.meshgrid(shift_m - shift_m[best[0]], shift_m - shift_m[best[1]], indexing="ij")
+    away = np.linalg.norm(np.stack([east, north], axis=-1) @ known, axis=-1) >= _APART_M
+    rivals = np.argwhere(away & (variance == minimum_filter(variance, 3, mode="nearest")))
+    left = excess_m[:, *best] - excess_m[:, *best].mean()
+    return all(_gain(excess_m[:, a, b] - excess_m[:, a, b].mean(), left)[1] > _RIVAL_SIGMAS for a, b in rivals)
+
+
+def _gain(unshifted: FloatArray, shifted: FloatArray) -> tuple[float, float]:
+    """Return by how much the log of the mean squared misfit falls, and over how many of its standard deviations."""
+    squares = np.stack([unshifted**2, shifted**2])
+    gain = np.log(squares[0].sum() / squares[1].sum())
+    parts = np.stack([squares[:, block].sum(axis=1) for block in _stretches(len(shifted))], axis=1)
+    sums = squares.sum(axis=1, keepdims=True) - parts
+    std = np.sqrt(_jackknife_covariance(np.log(sums[0] / sums[1])[:, None])[0, 0])
+    return float(gain), float(gain / max(std, 1e-12))
+
+
+def _stretches(count: int) -> list[NDArray[np.int64]]:
+    return np.array_split(np.arange(count), _BLOCKS)
+
+
+def _jackknife_covariance(without: FloatArray) -> FloatArray:
+    """Return the covariance of an estimate from its values with each stretch left out, shape (B, K)."""
+    spread = without - without.mean(axis=0)
+    covariance: FloatArray = (len(without) - 1) / len(without) * spread.T @ spread
+    return covariance

@@ -1,0 +1,116 @@
+"""Putting a raster on a map's grid: bilinear where it is as coarse or coarser, mean or majority where it is finer, nearest for classes.
+
+Strict about missing data: a bilinear tap or a part of a mean without data leaves the pixel without data, instead of leaning on what is
+left. A tap of weight zero does not count, so that a raster that lies on the grid already passes unchanged.
+
+All take a *lattice* of positions: source pixel coordinates (centres are integers) of every ``step``-th pixel of the grid, beginning one
+step outside; positions between are interpolated.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.compiled import kernel
+
+SNAP_PX = 1e-4
+"""A position nearer than this to a source pixel's centre is at the centre [source px]."""
+
+
+@kernel
+def _position(lattice: NDArray[np.float64], step: int, row: float, col: float) -> tuple[float, float]:
+    i, j = row / step + 1.0, col / step + 1.0
+    a, b = min(int(i), lattice.shape[0] - 2), min(int(j), lattice.shape[1] - 2)
+    v, u = i - a, j - b
+    x = (1 - v) * ((1 - u) * lattice[a, b, 0] + u * lattice[a, b + 1, 0]) + v * (
+        (1 - u) * lattice[a + 1, b, 0] + u * lattice[a + 1, b + 1, 0]
+    )
+    y = (1 - v) * ((1 - u) * lattice[a, b, 1] + u * lattice[a, b + 1, 1]) + v * (
+        (1 - u) * lattice[a + 1, b, 1] + u * lattice[a + 1, b + 1, 1]
+    )
+    return x, y
+
+
+@kernel
+def bilinear(source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, out: NDArray[np.float64]) -> None:
+    """Interpolate ``source`` (NaN: no data), shape (H, W), at every pixel of ``out``; NaN where a tap has no data or lies outside."""
+    rows, cols = source.shape
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            x, y = _position(lattice, step, i, j)
+            near_x, near_y = np.floor(x + 0.5), np.floor(y + 0.5)
+            x = near_x if abs(x - near_x) < SNAP_PX else x
+            y = near_y if abs(y - near_y) < SNAP_PX else y
+            if not (0.0 <= x <= cols - 1 and 0.0 <= y <= rows - 1):
+                out[i, j] = np.nan
+                continue
+            a, b = int(y), int(x)
+            v, u = y - a, x - b
+            right, below = min(b + 1, cols - 1), min(a + 1, rows - 1)
+            upper, lower = source[a, b], source[below, b]
+            if u > 0.0:
+                upper += u * (source[a, right] - upper)
+                lower += u * (source[below, right] - lower)
+            out[i, j] = upper + v * (lower - upper) if v > 0.0 else upper
+
+
+@kernel
+def mean(
+    source: NDArray[np.float64], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.float64]
+) -> None:
+    """Average ``source`` (NaN: no data) over every pixel of ``out``, taken at parts x parts points; NaN where any has no data."""
+    rows, cols = source.shape
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            total = 0.0
+            for p in range(parts):
+                for q in range(parts):
+                    x, y = _position(lattice, step, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
+                    a, b = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                    total += source[a, b] if 0 <= a < rows and 0 <= b < cols else np.nan
+            out[i, j] = total / (parts * parts)
+
+
+@kernel
+def majority(
+    source: NDArray[np.uint8], lattice: NDArray[np.float64], step: int, parts: int, out: NDArray[np.uint8]
+) -> None:
+    """Take the commonest class over every pixel of ``out`` at parts x parts points (1: nearest); 0 is no data and votes; ties go low."""
+    rows, cols = source.shape
+    votes = np.zeros(256, np.int64)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            best = 0
+            for p in range(parts):
+                for q in range(parts):
+                    x, y = _position(lattice, step, i + (p + 0.5) / parts - 0.5, j + (q + 0.5) / parts - 0.5)
+                    a, b = int(np.floor(y + 0.5)), int(np.floor(x + 0.5))
+                    found = int(source[a, b]) if 0 <= a < rows and 0 <= b < cols else 0
+                    votes[found] += 1
+                    if votes[found] > votes[best] or (votes[found] == votes[best] and found < best) or p + q == 0:
+                        best = found
+            out[i, j] = best
+            if parts == 1:
+                votes[best] = 0
+            else:
+                votes[:] = 0
+
+
+@kernel
+def block_majority(ids: NDArray[np.uint8], factor: int, out: NDArray[np.uint8]) -> None:
+    """Take the commonest class of every whole ``factor`` x ``factor`` block of ``ids``; 0 is no data and votes; ties go low."""
+    votes = np.zeros(256, np.int64)
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            best = ids[i * factor, j * factor]
+            for a in range(i * factor, (i + 1) * factor):
+                for b in range(j * factor, (j + 1) * factor):
+                    found = ids[a, b]
+                    votes[found] += 1
+                    if votes[found] > votes[best] or (votes[found] == votes[best] and found < best):
+                        best = found
+            out[i, j] = best
+            for a in range(i * factor, (i + 1) * factor):
+                for b in range(j * factor, (j + 1) * factor):
+                    votes[ids[a, b]] = 0

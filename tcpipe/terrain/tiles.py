@@ -1,0 +1,188 @@
+"""What a map offers to be sampled from, and a pool that decodes each of its tiles once while samples come tile by tile."""
+
+from __future__ import annotations
+
+from collections import Counter, OrderedDict
+from collections.abc import Iterator
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.overviews import factor_for
+from tcpipe.terrain.sampling_kernel import morton
+
+CACHED_TILES = 96
+"""Decoded tiles kept: 150 MB of three layers at 512 px."""
+
+_STRIP_TILES = CACHED_TILES // 3 - 3
+"""Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
+
+_LAYERS: dict[str, tuple[type, float]] = {
+    "height": (np.float32, np.nan),
+    "ortho": (np.uint8, 0),
+    "terrain": (np.uint8, 0),
+}
+"""Type and nodata of each layer."""
+
+
+class MapReader(Protocol):
+    """A map: its grid, classes, layers, and windows of each layer."""
+
+    @property
+    def name(self) -> str:
+        """The map's name in the store."""
+
+    @property
+    def grid(self) -> MapGrid:
+        """Where its pixels lie."""
+
+    @property
+    def classes(self) -> ClassTable:
+        """Its class table."""
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """Which of ``height``, ``ortho``, ``terrain`` it has."""
+
+    @property
+    def tile_px(self) -> int:
+        """Side of the square tiles that are cheap to read, aligned with pixel (0, 0)."""
+
+    @property
+    def height_reference_m(self) -> float:
+        """What stored heights are above [m]."""
+
+    @property
+    def factors(self) -> tuple[int, ...]:
+        """Levels that `at` gives: how many pixels of the full map a pixel of each spans, rising from 1."""
+
+    def at(self, factor: int) -> MapReader:
+        """Return the map at one of its ``factors``."""
+
+    def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+        """Return rows ``row0:row1`` and columns ``col0:col1`` of a layer.
+
+        ``height`` is float32 metres above `height_reference_m`, NaN where there is no data; ``ortho`` is uint8 grey from 1 to 255 and
+        ``terrain`` uint8 class ids, 0 where there is no data.
+        """
+
+
+def level_for(source: MapReader, pitch_m: float) -> MapReader:
+    """Return the map's level whose pixels are nearest below ``pitch_m`` [m]: coarse enough not to alias, fine enough to show all."""
+    factor = factor_for(source.factors, source.grid.pitch_m, pitch_m)
+    return source if factor == 1 else source.at(factor)
+
+
+def groups_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArray[np.int64]]:
+    """Yield the indices of pixel positions, shape (N, 2), by tile; within a tile in Z-order.
+
+    Tiles come row by row inside strips narrow enough that a tile is still held when the rows above and below want it.
+    """
+    limit = np.array([source.grid.cols - 1, source.grid.rows - 1])
+    cells = np.clip(np.floor(px), 0, limit).astype(np.int64)
+    tile_j, tile_i = (cells // source.tile_px).T
+    fine = morton(cells[:, 0] % source.tile_px, cells[:, 1] % source.tile_px)
+    order = np.lexsort((np.arange(len(px)), fine, tile_j, tile_i, tile_j // _STRIP_TILES))
+    changed = (np.diff(tile_i[order]) != 0) | (np.diff(tile_j[order]) != 0)
+    yield from (group for group in np.split(order, np.flatnonzero(changed) + 1) if group.size)
+
+
+def read_window(  # noqa: PLR0917
+    source: MapReader, layer: str, row0: int, row1: int, col0: int, col1: int
+) -> NDArray[Any]:
+    """Return a window of a layer that may reach beyond the map, where it holds no data."""
+    dtype, nodata = _LAYERS[layer]
+    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), nodata, dtype)
+    top, bottom = max(row0, 0), min(row1, source.grid.rows)
+    left, right = max(col0, 0), min(col1, source.grid.cols)
+    if top < bottom and left < right:
+        out[top - row0 : bottom - row0, left - col0 : right - col0] = source.read(layer, top, bottom, left, right)
+    return out
+
+
+class TilePool:
+    """The tiles that are being sampled, side by side in one array a layer; the least recently used make room.
+
+    A map of one tile is taken as it is read, without a copy.
+    """
+
+    __slots__ = ("_flat", "_held", "_map", "decoded", "slots", "tile_shape")
+
+    def __init__(self, source: MapReader) -> None:
+        grid, side = source.grid, source.tile_px
+        self._map = source
+        self.slots: NDArray[np.int32] = np.full((-(-grid.rows // side), -(-grid.cols // side)), -1, np.int32)
+        """Which of the held tiles is the one in row i and column j; -1 where it is not held."""
+        self.tile_shape = (side, side) if self.slots.size > 1 else (grid.rows, grid.cols)
+        """Rows and columns of a tile."""
+        self._held: OrderedDict[tuple[int, int], int] = OrderedDict()
+        self._flat: dict[str, NDArray[Any]] = {}
+        self.decoded: Counter[tuple[str, int, int]] = Counter()
+        """How often each tile, by layer, row and column, was read."""
+        self._grow(min(CACHED_TILES, self.slots.size))
+
+    @property
+    def layers(self) -> tuple[NDArray[Any], ...]:
+        """Height, ortho and terrain of the held tiles, flat; empty where the map has no such layer."""
+        return tuple(self._flat.get(layer, np.empty(0, dtype)) for layer, (dtype, _) in _LAYERS.items())
+
+    def hold(self, boxes: NDArray[np.int64]) -> None:
+        """Make the tiles available that any of the boxes touches (first row and column, last row and column exclusive; (N, 4))."""
+        wanted = _touched(boxes, self._map.tile_px, self.slots.shape)
+        missing = [tile for tile in wanted if tile not in self._held]
+        for tile in wanted:
+            if tile in self._held:
+                self._held.move_to_end(tile)
+        self._grow(len(wanted))
+        for tile in missing:
+            if len(self._held) < self._room():
+                slot = len(self._held)
+            else:
+                gone, slot = self._held.popitem(last=False)
+                self.slots[gone] = -1
+            self._read(tile, slot)
+            self._held[tile] = slot
+            self.slots[tile] = slot
+
+    def _room(self) -> int:
+        return len(self._flat["height"]) // (self.tile_shape[0] * self.tile_shape[1])
+
+    def _grow(self, tiles: int) -> None:
+        """Make room for so many tiles."""
+        size = tiles * self.tile_shape[0] * self.tile_shape[1]
+        for layer in self._map.layers:
+            dtype, _ = _LAYERS[layer]
+            old = self._flat.get(layer, np.empty(0, dtype))
+            if old.size < size:
+                self._flat[layer] = np.empty(size, dtype)
+                self._flat[layer][: old.size] = old
+
+    def _read(self, tile: tuple[int, int], slot: int) -> None:
+        side, grid, (high, wide) = self._map.tile_px, self._map.grid, self.tile_shape
+        row0, col0 = tile[0] * side, tile[1] * side
+        for layer in self._map.layers:
+            part = self._map.read(layer, row0, min(row0 + side, grid.rows), col0, min(col0 + side, grid.cols))
+            self.decoded[layer, *tile] += 1
+            if self.slots.size == 1:
+                self._flat[layer] = np.ascontiguousarray(part).reshape(-1)
+                continue
+            place = self._flat[layer][slot * high * wide : (slot + 1) * high * wide].reshape(high, wide)
+            if part.shape != place.shape:
+                place[...] = _LAYERS[layer][1]
+            place[: part.shape[0], : part.shape[1]] = part
+
+
+def _touched(boxes: NDArray[np.int64], side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:
+    """Return the tiles of the map that boxes touch, row by row."""
+    first, last = boxes[:, :2] // side, (boxes[:, 2:] - 1) // side
+    spans = last - first + 1
+    tiles = [
+        first + np.array([i, j])
+        for i in range(int(spans[:, 0].max(initial=0)))
+        for j in range(int(spans[:, 1].max(initial=0)))
+    ]
+    inside = [tile[((tile >= 0) & (tile < shape) & (tile <= last)).all(axis=1)] for tile in tiles]
+    return [(int(i), int(j)) for i, j in np.unique(np.concatenate(inside), axis=0)] if inside else []

@@ -1,0 +1,266 @@
+"""The house rules as tests: floors, homes, names, units, purity. ARCHITECTURE.md, pyproject.toml and the tree must say the same."""
+
+import ast
+import re
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from importlinter.cli import lint_imports
+
+from tcpipe.tables import levels
+from tcpipe.tables.columns import TableSchema
+
+ROOT = Path(__file__).parents[2]
+PACKAGE = ROOT / "tcpipe"
+MODULES = sorted(PACKAGE.rglob("*.py"))
+TREES = {path.relative_to(PACKAGE).as_posix(): ast.parse(path.read_text()) for path in MODULES}
+PAGE = (ROOT / "ARCHITECTURE.md").read_text()
+FLOORS = next(
+    contract["layers"]
+    for contract in tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    if contract["type"] == "layers"
+)
+
+VAGUE_NAMES = {"utils", "util", "helpers", "helper", "common", "misc", "core", "manager", "processor"}
+ABOVE_PURITY = ("cli/", "pipeline/", "pipeline.py")
+WALL_CLOCK = {
+    "time.time",
+    "time.time_ns",
+    "time.localtime",
+    "time.gmtime",
+    "time.ctime",
+    "time.strftime",
+    "datetime.datetime.now",
+    "datetime.datetime.utcnow",
+    "datetime.datetime.today",
+    "datetime.date.today",
+}
+SEEDED = {"numpy.random.Generator", "numpy.random.default_rng", "numpy.random.SeedSequence", "numpy.random.PCG64"}
+TEMPORARY_NAMES = "formats/atomic.py"
+"""Names what it writes, until it is complete, as no other process does; nothing of that name remains."""
+UNSEEDED = ("random.", "numpy.random.", "secrets.", "os.urandom", "uuid.uuid1", "uuid.uuid4")
+SUFFIX_OF_UNIT = {
+    "m": "_m",
+    "s": "_s",
+    "ns": "_ns",
+    "rad": "_rad",
+    "deg": "_deg",
+    "m/s": "_mps",
+    "m/s2": "_mps2",
+    "rad/s": "_radps",
+    "px": "_px",
+    "V": "_volt",
+    "A": "_amp",
+    "W": "_watt",
+    "J": "_joule",
+    "m2": "_m2",
+    "m2/s2": "_m2ps2",
+}
+PLAIN_UNITS = {"", "1", "bits"}
+HEAVY = {
+    "numpy", "pyarrow", "polars", "numba", "scipy", "zarr", "rasterio", "pyproj", "shapely", "pydantic", "rosbags", "mcap",
+    "matplotlib", "jinja2", "rich", "filterpy", "isal", "ruamel", "pandas", "torch",
+}  # fmt: skip
+
+
+def _table(heading):
+    """First two cells of each row of the page's table under a heading."""
+    section = re.split(r"^## ", PAGE, flags=re.MULTILINE)
+    rows = next(text for text in section if text.startswith(heading)).splitlines()
+    cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows if row.startswith("|")]
+    return [(row[0], row[1]) for row in cells if not set(row[0]) <= {"-", " "}][1:]
+
+
+def _imported(tree):
+    """Dotted names that a module imports, wherever in it."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def _used(tree):
+    """Dotted names that a module uses, with its import aliases resolved, and whether each is called without arguments."""
+    known = {}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            known |= {
+                alias.asname or alias.name.split(".")[0]: alias.name if alias.asname else alias.name.split(".")[0]
+                for alias in node.names
+            }
+        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+            known |= {alias.asname or alias.name: f"{node.module}.{alias.name}" for alias in node.names}
+    bare = {
+        id(node.func) for node in ast.walk(tree) if isinstance(node, ast.Call) and not node.args and not node.keywords
+    }
+    for node in ast.walk(tree):
+        parts, inner = [], node
+        while isinstance(inner, ast.Attribute):
+            parts.append(inner.attr)
+            inner = inner.value
+        if isinstance(inner, ast.Name) and inner.id in known:
+            yield ".".join([known[inner.id], *reversed(parts)]), id(node) in bare, node.lineno
+
+
+def test_imports_go_only_downward(capsys):
+    status = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
+    assert status == 0, capsys.readouterr().out
+
+
+def test_page_and_linter_show_the_same_floors():
+    block = re.search(r"^```layers\n(.*?)^```", PAGE, flags=re.MULTILINE | re.DOTALL)
+    assert block is not None
+    assert block.group(1).splitlines() == FLOORS
+
+
+def test_page_names_every_room():
+    rooms = {path.name for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").is_file()}
+    rooms = {name if name.endswith(".py") else f"{name}/" for name in rooms if name != "__init__.py"}
+    assert {name.strip("`") for name, _ in _table("Floors")} == rooms
+
+
+def test_each_file_format_has_the_home_that_the_page_gives():
+    homes = {name: {f"{home}" for home in re.findall(r"`([\w/]+\.py)`", cell)} for name, cell in _table("Homes")}
+    assert {"rosbags", "mcap", "rasterio", "zarr", "pydantic", "pyarrow.parquet", "numba"} <= set(homes)
+    importers = {
+        name: {
+            path for path, tree in TREES.items() if any(f"{used}.".startswith(f"{name}.") for used in _imported(tree))
+        }
+        for name in homes
+    }
+    assert importers == homes
+
+
+def test_no_module_has_a_name_that_says_nothing():
+    names = {part for path in TREES for part in Path(path).with_suffix("").parts}
+    assert not {name for name in names if set(name.split("_")) & VAGUE_NAMES}
+
+
+def test_stages_are_thin():
+    lengths = {path.name: len(path.read_text().splitlines()) for path in (PACKAGE / "stages").glob("*.py")}
+    assert lengths
+    assert not {name: length for name, length in lengths.items() if length > 120}
+
+
+def test_nothing_below_the_pipeline_reads_the_wall_clock_or_global_randomness():
+    found = [
+        f"{path}:{line} {name}"
+        for path, tree in TREES.items()
+        if not path.startswith(ABOVE_PURITY)
+        for name, bare, line in _used(tree)
+        if name in WALL_CLOCK
+        or (
+            name.startswith(UNSEEDED)
+            and not name.startswith(tuple(SEEDED))
+            and (path, name) != (TEMPORARY_NAMES, "uuid.uuid4")
+        )
+        or (name == "numpy.random.default_rng" and bare)
+    ]
+    assert not found
+
+
+def test_the_purity_test_sees_what_it_forbids():
+    source = """
+import time, random
+import numpy as np
+from datetime import datetime
+from numpy import random as chance
+time.time(); datetime.now(); random.random(); np.random.rand(3); chance.seed(1); np.random.default_rng(); np.random.default_rng(4)
+"""
+    used = {(name, bare) for name, bare, _ in _used(ast.parse(source))}
+    assert {
+        ("time.time", True),
+        ("datetime.datetime.now", True),
+        ("random.random", True),
+        ("numpy.random.rand", False),
+        ("numpy.random.seed", False),
+        ("numpy.random.default_rng", True),
+        ("numpy.random.default_rng", False),
+    } <= used
+
+
+def _schemas():
+    return {name: schema for name, schema in vars(levels).items() if isinstance(schema, TableSchema)}
+
+
+@pytest.mark.parametrize("table", sorted(_schemas()))
+def test_every_column_ends_in_its_unit(table):
+    wrong = []
+    for column in _schemas()[table].columns:
+        suffix = SUFFIX_OF_UNIT.get(column.unit)
+        claimed = next((unit for unit, end in SUFFIX_OF_UNIT.items() if column.name.endswith(end)), None)
+        squared = column.name.endswith("_var") and column.unit.endswith(("2", "4"))
+        named_right = column.name.endswith(suffix) if suffix else column.unit in PLAIN_UNITS or squared
+        if not named_right or (claimed is not None and claimed != column.unit):
+            wrong.append(f"{column.name} [{column.unit}]")
+        assert column.field().metadata[b"unit"].decode() == column.unit
+        assert column.doc
+    assert not wrong
+
+
+def test_everything_public_is_explained():
+    silent = []
+    for path, tree in TREES.items():
+        if ast.get_docstring(tree) is None and tree.body:
+            silent.append(path)
+        holders = [
+            tree,
+            *(node for node in tree.body if isinstance(node, ast.ClassDef) and not node.name.startswith("_")),
+        ]
+        for node in (node for holder in holders for node in holder.body):
+            named = isinstance(node, ast.FunctionDef | ast.ClassDef)
+            if named and not node.name.startswith("_") and ast.get_docstring(node) is None:
+                silent.append(f"{path}:{node.lineno} {node.name}")
+    assert not silent
+
+
+def test_help_imports_nothing_heavy():
+    program = """
+import sys
+from click.testing import CliRunner
+from tcpipe.cli import cli
+for command in [[], *([name] for name in cli.commands)]:
+    result = CliRunner().invoke(cli, [*command, "--help"])
+    assert result.exit_code == 0 and "Usage" in result.output, result.output
+print(*sorted({name.split(".")[0] for name in sys.modules}))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert not set(done.stdout.split()) & HEAVY
+
+
+def _tracked_files():
+    if shutil.which("git") is None or not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout: which files belong to the project is not known here")
+    listed = subprocess.run(["git", "ls-files", "-z"], capture_output=True, text=True, check=True, cwd=ROOT)
+    return [ROOT / name for name in listed.stdout.split("\0") if name and (ROOT / name).is_file()]
+
+
+def test_no_registry_address_and_no_path_of_one_machine():
+    needles = [
+        "".join(parts)
+        for parts in (
+            ("py", "pi.", "org"),
+            ("files.", "python", "hosted"),
+            ("--index", "-url"),
+            ("conda.", "anaconda", ".org"),
+            ("/", "work", "/"),
+            ("/", "root", "/"),
+            ("/", "home", "/"),
+            ("/", "Users", "/"),
+        )
+    ]
+    machine_path = re.compile(
+        rb"(?<![\w.~$}>])(?:" + b"|".join(re.escape(n.encode()) for n in needles if n.startswith("/")) + rb")\w"
+    )
+    addresses = [needle.encode() for needle in needles if not needle.startswith("/")]
+    found = []
+    for path in _tracked_files():
+        data = path.read_bytes()
+        if any(address in data for address in addresses) or machine_path.search(data):
+            found.append(path.relative_to(ROOT).as_posix())
+    assert not found

@@ -1,0 +1,479 @@
+"""The installed command in the hands of someone who trusts nothing: bad input, signals, races, odd names, full disks."""
+
+import itertools
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+import rasterio
+from installed_command import COMMAND, plain_lines, tcpipe
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from tcpipe.formats.log_writing import MessageStream, write_mcap
+from tcpipe.simulation import Faults, SimulatedSite, simulate, tiny
+
+_SECONDS = (32.0, 17.0, 17.0)
+
+
+@pytest.fixture(scope="session")
+def sites(tmp_path_factory: pytest.TempPathFactory) -> list[SimulatedSite]:
+    """Three short drives over one small world; the first is long enough for some segments."""
+    here = tmp_path_factory.mktemp("sites")
+    return [
+        simulate(here / str(seed), scenario=tiny(Faults(), seconds=seconds), seed=seed)
+        for seed, seconds in enumerate(_SECONDS)
+    ]
+
+
+@pytest.fixture(scope="session")
+def log(sites: list[SimulatedSite]) -> Path:
+    return sites[0].logs[0]
+
+
+@pytest.fixture(scope="session")
+def logs(sites: list[SimulatedSite], tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """The drives' logs in one folder, under names of their own."""
+    folder = tmp_path_factory.mktemp("logs")
+    paths = [folder / f"run{number}.mcap" for number in range(len(sites))]
+    for path, site in zip(paths, sites, strict=True):
+        shutil.copy(site.logs[0], path)
+    return paths
+
+
+@pytest.fixture(scope="session")
+def store(log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A store with one run; tests read it only."""
+    here = tmp_path_factory.mktemp("store")
+    _run("ingest", log, "--tag", "weather=dry", cwd=here)
+    return here / "tcpipe-store"
+
+
+def _run(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None) -> str:
+    done = tcpipe(*arguments, cwd=cwd, env=env)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def _start(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [COMMAND, *map(str, arguments)],
+        cwd=cwd,
+        env={**os.environ, **(env or {})},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def _files(directory: Path) -> set[str]:
+    return {path.relative_to(directory).as_posix() for path in directory.rglob("*") if path.is_file()}
+
+
+def _without_power(log: Path, out: Path) -> tuple[Path, Path]:
+    """Split a log in two by another library: power, and the rest."""
+    paths = out / "drive.mcap", out / "power.mcap"
+    with log.open("rb") as source, paths[0].open("wb") as rest, paths[1].open("wb") as power:
+        writers = [Writer(rest), Writer(power)]
+        channels: list[dict[int, int]] = [{}, {}]
+        for writer in writers:
+            writer.start(profile="ros2")
+        for schema, channel, message in make_reader(source).iter_messages():
+            here = int("power" in channel.topic)
+            if channel.id not in channels[here]:
+                schema_id = writers[here].register_schema(schema.name, schema.encoding, schema.data)
+                channels[here][channel.id] = writers[here].register_channel(
+                    channel.topic, channel.message_encoding, schema_id
+                )
+            number = channels[here][channel.id]
+            writers[here].add_message(number, message.log_time, message.data, message.publish_time)
+        for writer in writers:
+            writer.finish()
+    return paths
+
+
+# --- bad input ------------------------------------------------------------------------------------------------------
+
+
+def _bad_input(kind: str, here: Path) -> Path:
+    path = here / "bad.mcap"
+    match kind:
+        case "there is no such file":
+            return here / "missing.mcap"
+        case "it is empty":
+            path.touch()
+        case "not a log":
+            path.write_bytes(os.urandom(5000))
+        case "no log in this directory":
+            path.mkdir()
+            (path / "readme.txt").touch()
+        case "a pipe or a device":
+            os.mkfifo(path)
+        case "nothing in the log tells motion":
+            times = np.arange(5, dtype=np.int64) * 1_000_000_000
+            write_mcap(path, [MessageStream("/chatter", "std_msgs/msg/String", times)])
+    return path
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "there is no such file",
+        "it is empty",
+        "not a log",
+        "no log in this directory",
+        "a pipe or a device",
+        "nothing in the log tells motion",
+    ],
+)
+def test_what_is_no_log_is_said_in_plain_lines(kind: str, tmp_path: Path) -> None:
+    path = _bad_input(kind, tmp_path)
+    told = plain_lines(tcpipe("ingest", path, "--quiet", cwd=tmp_path), 1)
+    assert kind in told
+    assert path.name in told
+    assert not (tmp_path / "tcpipe-store" / "sources.json").exists()
+    assert not list(tmp_path.glob("tcpipe-store/runs/*"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said", "code"),
+    [
+        (["ingest"], "Missing argument", 2),
+        (["ingest", "LOG", "--nosuch"], "No such option", 2),
+        (["nosuch"], "No such command", 2),
+        (["ingest", "LOG", "--store", ""], "is a variable not set?", 2),
+        (["ingest", "LOG", "--store="], "is a variable not set?", 2),
+        (["ingest", "LOG", "--tag", "=wet"], "wanted KEY=VALUE", 2),
+        (["ingest", "LOG", "--robot", "nosuch"], "robot 'nosuch' is not known", 2),
+        (["ingest", "LOG", "--recipe", "none.toml"], "the recipe cannot be read", 2),
+        (["ingest", "LOG", "--store", "s3://bucket/store"], "give a directory", 1),
+        (["ingest", "LOG", "--store", "LOG"], "is a file, wanted a directory", 1),
+        (["ingest", "LOG", "--store", "LOG/below"], "cannot be written", 1),
+        (["build-dataset", "--store", "nosuch"], "there is no store here", 1),
+        (["inspect", "nosuch"], "there is no such file", 1),
+        (["report", "nosuch"], "there is no such directory", 1),
+        (["export", "LOG", "out", "--topics", "/nosuch"], "topic /nosuch is not in this log", 1),
+        (["export", "LOG", "LOG/below"], "is a file, wanted a directory", 1),
+        (["simulate", "out", "--scenario", "nosuch"], "scenario 'nosuch' is unknown", 2),
+        (["simulate", ".."], "is not this simulated site", 2),
+        (["schemas", "LOG"], "is a file, wanted a directory", 1),
+        (["init", "LOG"], "is a file, wanted a directory", 1),
+        (["add-map", "m", "--height", "LOG"], "not a raster", 1),
+    ],
+)
+def test_what_cannot_be_done_is_one_line_and_an_exit_code(
+    arguments: list[str], said: str, code: int, log: Path, tmp_path: Path
+) -> None:
+    arguments = [argument.replace("LOG", str(log)) for argument in arguments]
+    here = tmp_path / "here"
+    here.mkdir()
+    as_json = arguments[0] in ("ingest", "inspect", "add-map", "simulate")
+    done = tcpipe(*arguments, *(["--json"] if as_json else []), cwd=here)
+    assert said in plain_lines(done, code, most=1)
+    if as_json:
+        told = json.loads(done.stdout)
+        assert told["exit_code"] == code
+        assert said in told["problems"][0]
+    assert not any(path.is_file() for path in here.rglob("*"))
+
+
+def test_every_wrong_key_of_a_recipe_found_upward_is_named(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    (tmp_path / "tcpipe.toml").write_text("[fuse]\nfoo = 1\n[gate]\nbar = 2\n[segment]\nchord_m = -1\n")
+    told = plain_lines(tcpipe("ingest", log, cwd=tmp_path / "a" / "b"), 2)
+    assert str(tmp_path / "tcpipe.toml") in told
+    assert all(key in told for key in ("fuse.foo", "gate.bar", "segment.chord_m"))
+
+
+def test_a_raster_without_crs_and_a_map_that_is_there(sites: list[SimulatedSite], tmp_path: Path) -> None:
+    with rasterio.open(sites[0].rasters["height"]) as raster:
+        profile, data = raster.profile, raster.read()
+    profile.pop("crs")
+    with rasterio.open(tmp_path / "nocrs.tif", "w", **profile) as raster:
+        raster.write(data)
+    assert "has no CRS" in plain_lines(tcpipe("add-map", "m", "--height", "nocrs.tif", cwd=tmp_path), 1, most=1)
+    add = ["add-map", "m", "--height", "nocrs.tif", "--crs", "EPSG:32633"]
+    _run(*add, cwd=tmp_path)
+    before = _files(tmp_path)
+    assert "nothing to do" in _run(*add, cwd=tmp_path)
+    assert _files(tmp_path) == before
+
+
+# --- what is printed ------------------------------------------------------------------------------------------------
+
+
+def test_json_is_one_object_and_nothing_else_and_quiet_says_only_what_went_wrong(
+    logs: list[Path], tmp_path: Path
+) -> None:
+    damaged, junk = tmp_path / "cut.mcap", tmp_path / "junk.bag"
+    damaged.write_bytes(logs[1].read_bytes()[:-200_000])
+    junk.write_bytes(b"junk" * 100)
+    for status in (["damaged", "failed", "done"], ["unchanged", "failed", "unchanged"]):
+        done = tcpipe("ingest", damaged, junk, logs[2], "--json", "--quiet", cwd=tmp_path)
+        assert done.returncode == 3
+        told = json.loads(done.stdout)
+        assert [result["status"] for result in told["results"]] == status
+        assert (told["exit_code"], told["recipe"]) == (3, "built-in defaults")
+        assert told["results"][0]["damage"]
+        assert "junk.bag" in told["results"][1]["problems"][0]
+        (line,) = done.stderr.splitlines()
+        assert line.startswith(f"tcpipe: {junk}: not a log")
+
+
+def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path) -> None:
+    """Standard error closed, or a pipe that nobody reads: the work is done all the same."""
+    for number, redirection in enumerate(("2>&-", "2>&1 | head -c1")):
+        subprocess.run(
+            ["bash", "-c", f"{COMMAND} ingest {logs[1]} --store s{number} {redirection}"], cwd=tmp_path, check=False
+        )
+        assert len(list(tmp_path.glob(f"s{number}/runs/*/*/segments.parquet"))) == 1
+    full = subprocess.run(
+        ["bash", "-c", f"{COMMAND} inspect {logs[1]} --json >/dev/full"], check=False, stderr=-1, text=True
+    )
+    assert full.returncode == 1
+    assert full.stderr == "tcpipe: No space left on device\n"
+
+
+def test_debug_shows_where_an_error_comes_from_inside_workers_too(logs: list[Path], tmp_path: Path) -> None:
+    broken = "import tcpipe.stages.gate as gate\ndef broken(*_, **__): raise ZeroDivisionError('boom')\n"
+    env = _patched(tmp_path, f"{broken}gate.gate_track = broken\n")
+    shown = tcpipe("--debug", "ingest", *logs[1:], "--jobs", "2", cwd=tmp_path, env=env)
+    assert shown.returncode == 1
+    assert "run1.mcap: internal error, ZeroDivisionError: boom" in shown.stderr
+    assert "in broken" in shown.stderr
+
+
+def _patched(directory: Path, program: str) -> dict[str, str]:
+    """Return an environment in which every Python process begins with ``program``."""
+    (directory / "patch").mkdir()
+    (directory / "patch" / "sitecustomize.py").write_text(program)
+    return {"PYTHONPATH": str(directory / "patch")}
+
+
+def test_it_is_a_module_too(tmp_path: Path) -> None:
+    done = subprocess.run([sys.executable, "-m", "tcpipe", "--version"], cwd=tmp_path, capture_output=True, check=True)
+    assert done.stdout == tcpipe("--version", cwd=tmp_path).stdout.encode()
+
+
+# --- names, twins and parts -----------------------------------------------------------------------------------------
+
+
+def test_one_recording_is_one_run_under_any_name(log: Path, tmp_path: Path) -> None:
+    names = [b"a\xff.mcap", "日本 'q\".mcap".encode(), b"new\nline.mcap", b"UPPER.MCAP"]
+    (tmp_path / "logs" / "below").mkdir(parents=True)
+    for name in names:
+        shutil.copy(log, os.fsencode(tmp_path / "logs" / "below") + b"/" + name)
+    (tmp_path / "logs" / "link.mcap").symlink_to(log)
+    (tmp_path / "logs" / "loop").symlink_to(tmp_path / "logs")
+    (tmp_path / "logs" / "dangling.mcap").symlink_to(tmp_path / "nowhere.mcap")
+    done = tcpipe("ingest", "logs", log, log, "--jobs", "2", "--json", cwd=tmp_path)
+    results = json.loads(done.stdout)["results"]
+    assert Counter(result["status"] for result in results) == {"done": 1, "unchanged": 4, "failed": 1}
+    assert {result["run_id"] for result in results if result["status"] != "failed"} == {results[0]["run_id"]}
+    assert sum(result["same_as"] is not None for result in results) == 4
+    assert "dangling.mcap" in done.stderr
+    assert done.returncode == 3
+    again = tcpipe("ingest", "logs/below", cwd=tmp_path)
+    assert again.returncode == 0
+    assert "nothing to do: 4 of 4 logs" in again.stdout
+    assert "new\\nline.mcap is the same recording as" in again.stdout
+    assert len(list((tmp_path / "tcpipe-store" / "runs").iterdir())) == 1
+
+
+def test_power_logged_apart_is_one_drive(log: Path, store: Path, tmp_path: Path) -> None:
+    drive, power = _without_power(log, tmp_path)
+    for paths in itertools.permutations((drive, power)):
+        _run("ingest", *paths, "--as-one", "--store", "joined", cwd=tmp_path)
+    paths = [next(place.glob("runs/*/*/segments.parquet")) for place in (store, tmp_path / "joined")]
+    tables = [pq.read_table(path).drop_columns(["segment_id", "run_id"]) for path in paths]
+    assert tables[0].num_rows > 0
+    assert tables[0].equals(tables[1])
+    assert len(list(tmp_path.glob("joined/runs/*"))) == 1
+    shutil.copy(drive, tmp_path / "twin.mcap")
+    twice = tcpipe("ingest", drive, tmp_path / "twin.mcap", "--as-one", cwd=tmp_path)
+    assert "the same recording as" in plain_lines(twice, 1, most=1)
+
+
+def test_a_log_that_is_still_written_is_not_taken_for_whole(log: Path, tmp_path: Path) -> None:
+    growing = tmp_path / "growing.mcap"
+    shutil.copy(log, growing)
+    grow = "import tcpipe.stages.read as read\nfirst = read.read_run\n"
+    grow += f"def later(*a, **k):\n    open({str(growing)!r}, 'ab').write(b'more')\n    return first(*a, **k)\n"
+    env = _patched(tmp_path, f"{grow}read.read_run = later\n")
+    assert "changed while it was read" in plain_lines(tcpipe("ingest", growing, cwd=tmp_path, env=env), 1, most=1)
+    assert not list(tmp_path.glob("tcpipe-store/runs/*"))
+
+
+# --- where things are found and kept --------------------------------------------------------------------------------
+
+
+def test_recipe_and_store_of_the_environment_rule(logs: list[Path], tmp_path: Path) -> None:
+    for name, chord_m in (("tcpipe.toml", 2.0), ("other.toml", 1.5)):
+        (tmp_path / name).write_text(f"[segment]\nchord_m = {chord_m}\n")
+    env = {"TCPIPE_RECIPE": str(tmp_path / "other.toml"), "TCPIPE_STORE": str(tmp_path / "elsewhere")}
+    assert f"recipe: {tmp_path / 'other.toml'}" in _run("ingest", logs[1], "--quiet", cwd=tmp_path, env=env)
+    (manifest,) = (tmp_path / "elsewhere").glob("runs/*/*/manifest.json")
+    assert json.loads(manifest.read_text())["recipe"]["segment"]["chord_m"] == 1.5
+    assert not (tmp_path / "tcpipe-store").exists()
+
+
+def test_tags_are_kept_and_changed_without_doing_the_work_again(log: Path, store: Path, tmp_path: Path) -> None:
+    shutil.copytree(store, tmp_path / "tcpipe-store")
+    segments = next(tmp_path.glob("tcpipe-store/runs/*/*/segments.parquet"))
+    made = segments.stat().st_mtime_ns
+    assert "1 done" in _run("ingest", log, "--tag", "driver=x", cwd=tmp_path)
+    assert "nothing to do" in _run("ingest", log, cwd=tmp_path)
+    assert segments.stat().st_mtime_ns == made
+    for name in ("run.json", "*/manifest.json"):
+        (path,) = segments.parents[1].glob(name)
+        assert json.loads(path.read_text())["tags"] == {"weather": "dry", "driver": "x"}
+
+
+def test_a_place_without_home_and_with_nothing_writable_but_the_store(logs: list[Path], tmp_path: Path) -> None:
+    env = {"HOME": "/proc", "NUMBA_CACHE_DIR": "/proc/none"}
+    done = subprocess.run(
+        [COMMAND, "ingest", logs[1]], cwd=tmp_path, env=env, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_full_disk_leaves_nothing_half_written(log: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stands for a full disk: the write itself fails."""
+    done = subprocess.run(
+        [COMMAND, "ingest", log, "--quiet"],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (30_000, 30_000)),
+    )
+    told = plain_lines(done, 1, most=1)
+    assert "cannot be written (File too large)" in told
+    assert str(log) in told
+    assert _files(tmp_path) <= {"tcpipe-store/sources.json"}
+
+
+# --- looking at what is there ---------------------------------------------------------------------------------------
+
+
+def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
+    sites: list[SimulatedSite], store: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(store, tmp_path / "tcpipe-store")
+    site = sites[0]
+    commands = [
+        ["add-map", "site", *(str(x) for name in ("height", "ortho") for x in (f"--{name}", site.rasters[name]))],
+        ["build-dataset", "--split", str(site.region)],
+        ["report", "tcpipe-store"],
+        ["init"],
+        ["schemas", "schemas"],
+        ["simulate", "site", "--scenario", "tiny"],
+    ]
+    for command in commands:
+        _run(*command, "--seed", "3", cwd=tmp_path) if command[0] == "simulate" else _run(*command, cwd=tmp_path)
+    before = {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()}
+    for command in commands:
+        seed = ["--seed", "3"] if command[0] == "simulate" else []
+        assert "nothing to do" in _run(*command, *seed, cwd=tmp_path), command
+    assert {path: path.stat().st_mtime_ns for path in tmp_path.rglob("*") if path.is_file()} == before
+    run = next((tmp_path / "tcpipe-store" / "runs").iterdir())
+    expected = {
+        "tcpipe-store": run.name,
+        "tcpipe-store/maps/site.zarr": "EPSG:32633",
+        "dataset": run.name,
+        str(run): "weather=dry",
+        str(next(path for path in run.iterdir() if (path / "manifest.json").exists())): "m kept",
+        "site": "wheel_odometry",
+    }
+    for path, said in expected.items():
+        assert said in _run("inspect", path, cwd=tmp_path)
+
+
+def test_a_damaged_log_can_be_looked_at(log: Path, tmp_path: Path) -> None:
+    (tmp_path / "cut.mcap").write_bytes(log.read_bytes()[:-200_000])
+    (tmp_path / "junk.bag").write_bytes(b"junk" * 100)
+    assert tcpipe("inspect", "cut.mcap", "--full", cwd=tmp_path).returncode == 3
+    both = tcpipe("inspect", ".", cwd=tmp_path)
+    assert both.returncode == 3
+    assert "not a log" in both.stdout
+    exported = tcpipe("export", "cut.mcap", "out", "--topics", "/a200_0000/platform/odom", cwd=tmp_path)
+    assert exported.returncode == 3
+    assert "damage: cut.mcap" in exported.stderr
+    assert pq.read_metadata(tmp_path / "out" / "a200_0000_platform_odom.parquet").num_rows > 100
+
+
+# --- signals and other processes ------------------------------------------------------------------------------------
+
+
+def _processes_of(group: int) -> list[str]:
+    listed = subprocess.run(["ps", "-eo", "pgid=,stat=,args="], capture_output=True, text=True, check=True).stdout
+    rows = [line.split(None, 2) for line in listed.splitlines()]
+    return [row[2] for row in rows if int(row[0]) == group and not row[1].startswith("Z")]
+
+
+def _wait_until_fusing(running: subprocess.Popen[str]) -> None:
+    assert running.stderr is not None
+    for line in running.stderr:
+        if "fusing" in line:
+            return
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL])
+def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs: list[Path], tmp_path: Path) -> None:
+    running = _start("ingest", *logs, "--jobs", "2", cwd=tmp_path)
+    _wait_until_fusing(running)
+    running.send_signal(number)
+    _, told = running.communicate(timeout=60)
+    if number != signal.SIGKILL:
+        assert running.returncode == 128 + number
+        assert "nothing is half-written" in told
+        assert "Traceback" not in told
+        assert not list(tmp_path.rglob(".tmp-*"))
+    end = time.monotonic() + 20
+    while _processes_of(running.pid):
+        assert time.monotonic() < end, _processes_of(running.pid)
+        time.sleep(0.05)
+    _run("ingest", *logs, cwd=tmp_path)
+    assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest.json"))) == len(logs)
+    assert not list(tmp_path.rglob(".tmp-*"))
+
+
+def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_path: Path) -> None:
+    kill = "import os, tcpipe.stages.gate as gate\nfirst = gate.gate_track\n"
+    kill += "def killing(track, *a, **k):\n    if 'run1' in track.info.run_id: os.kill(os.getpid(), 9)\n"
+    env = _patched(tmp_path, f"{kill}    return first(track, *a, **k)\ngate.gate_track = killing\n")
+    done = tcpipe("ingest", *logs, "--jobs", "2", cwd=tmp_path, env=env)
+    assert done.returncode == 3
+    assert "run1.mcap: its worker process died" in plain_lines(done, 3, most=1)
+    assert "2 done, 1 failed" in done.stdout
+    again = _run("ingest", *logs, cwd=tmp_path)
+    assert [line.split()[0] for line in again.splitlines() if "robot husky" in line] == [
+        "unchanged",
+        "done",
+        "unchanged",
+    ]
+
+
+def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_path: Path) -> None:
+    shutil.copy(logs[1], tmp_path / "copy.mcap")
+    batches = [[logs[1]], [tmp_path / "copy.mcap", logs[2]]]
+    running = [_start("ingest", *batch, cwd=tmp_path) for batch in batches]
+    for process in running:
+        _, told = process.communicate(timeout=120)
+        assert process.returncode == 0, told
+    assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest.json"))) == 2
+    assert len(json.loads((tmp_path / "tcpipe-store" / "sources.json").read_text())) == 3
+    assert not list(tmp_path.rglob(".tmp-*"))
+    assert "nothing to do: 3 of 3" in _run("ingest", *batches[0], *batches[1], cwd=tmp_path)

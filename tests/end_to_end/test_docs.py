@@ -1,0 +1,35 @@
+"""The tutorial and the pages that go with it: every command runs, and prints what the page says, numbers aside."""
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+PAGES = ("tutorials/first-dataset.md", "how-to/damaged-logs.md")
+
+
+def _masked(text: str) -> list[str]:
+    """Return lines with runs of digits, hashes and blanks as one sign each; lists in alphabetical order, not by size."""
+    text = re.sub(r"\b[0-9a-f]{8}\b", "#", text)
+    text = re.sub(r"[-+]?\b\d[\d.,e+-]*", "#", text)
+    return [re.sub(r"[\s─═-]+", " ", ", ".join(sorted(line.split(", ")))).strip() for line in text.splitlines()]
+
+
+@pytest.fixture(scope="module")
+def rerun():
+    spec = importlib.util.spec_from_file_location("rerun", DOCS / "rerun.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.rerun
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_page_prints_what_it_says(page: str, rerun, tmp_path: Path) -> None:
+    written = (DOCS / page).read_text(encoding="utf-8")
+    today = rerun(written, tmp_path.resolve())
+    assert "Traceback" not in today
+    assert _masked(today) == _masked(written), f"run 'python docs/rerun.py docs/{page}', read it, and commit the page"

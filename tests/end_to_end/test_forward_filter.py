@@ -1,0 +1,49 @@
+"""The paper's forward filter from a log on disk to a checked track, against the simulator's truth."""
+
+import numpy as np
+import pytest
+
+from tcpipe.formats.log_file import open_log
+from tcpipe.geometry.angles import wrap_to_pi
+from tcpipe.geometry.rotation import rpy_from_quat
+from tcpipe.recipe import FuseConfig, ReadConfig
+from tcpipe.simulation import Faults, read_truth, simulate, tiny
+from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.read import read_run
+
+SETTLED_NS = 8_000_000_000
+
+
+@pytest.fixture(scope="module", params=["no faults", "every fault"])
+def drive(request, tmp_path_factory):
+    faults = Faults() if request.param == "no faults" else Faults.every()
+    site = simulate(tmp_path_factory.mktemp("site"), scenario=tiny(faults, seconds=60.0), seed=5)
+    with open_log(site.logs[0]) as log:
+        streams = read_run(log, ReadConfig(), robot=None)
+    return streams, read_truth(site.truths[0])
+
+
+def test_the_track_is_the_true_drive(drive):
+    streams, truth = drive
+    track = fuse_run(streams, FuseConfig(estimator="ukf"), run_id="tiny")
+    column = {name: track.table[name].to_numpy() for name in track.table.column_names if not name.endswith("amp")}
+    at = truth.at(column["stamp_ns"])
+    north = np.radians(column["lat_deg"] - at.lat_deg) * 6_367_000.0
+    east = np.radians(column["lon_deg"] - at.lon_deg) * 6_378_000.0 * np.cos(np.radians(at.lat_deg))
+    yaw = wrap_to_pi(column["yaw_rad"] - rpy_from_quat(at.quat_xyzw)[:, 2])
+    forward = column["forward_velocity_mps"] - at.forward_velocity_mps
+    settled = column["stamp_ns"] > column["stamp_ns"][0] + SETTLED_NS
+    fixed = settled & (column["x_std_m"] < 0.03)  # not in the ten seconds without GNSS
+
+    def rms(error, rows=settled):
+        return float(np.sqrt(np.mean(np.square(error[rows]))))
+
+    assert track.info.estimator == "ukf"
+    assert fixed.sum() > 0.7 * settled.sum()
+    assert rms(np.hypot(east, north), fixed) < 0.02
+    assert rms(column["alt_m"] - at.alt_m, fixed) < 0.02
+    assert rms(forward) < 0.03
+    assert rms(yaw) < np.radians(1.0)
+    assert rms(east / column["x_std_m"]) < 1.5
+    assert rms(north / column["y_std_m"]) < 1.5
+    assert rms(yaw / column["yaw_std_rad"]) < 1.5

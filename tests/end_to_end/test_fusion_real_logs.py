@@ -1,0 +1,62 @@
+"""The default estimator on real logs of other projects (skipped where they are not at hand)."""
+
+import numpy as np
+import pytest
+from shared_data import shared_data
+
+from tcpipe.formats.log_file import open_log
+from tcpipe.recipe import FuseConfig, Placement, ReadConfig
+from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.read import read_run
+from tcpipe.tables.columns import floats, integers
+
+
+def fused(name, config=None):
+    with open_log(shared_data(name)) as log:
+        streams = read_run(log, config or ReadConfig(), robot=None)
+    return streams, fuse_run(streams, FuseConfig(), run_id="run")
+
+
+def path_m(table):
+    return float(np.hypot(np.diff(floats(table, "x_m")), np.diff(floats(table, "y_m"))).sum())
+
+
+def test_warthog_on_grass_follows_fixes_that_come_late():
+    streams, track = fused("warthog_grass_a/run.mcap")
+    table = track.table
+    # reference.json: the path by ICP is 83.1 m, by the wheels 83.5 m.
+    assert path_m(table) == pytest.approx(83.1, rel=0.03)
+    energy_joule = np.trapezoid(floats(table, "power_watt"), integers(table, "stamp_ns") * 1e-9)
+    assert energy_joule == pytest.approx(69_365.3, rel=0.005)
+    assert any("jittered" in warning for warning in track.info.findings.warnings)
+    assert track.info.findings.facts["fuse"]["rejected"]["gnss"] < 0.1 * streams.tables["gnss"].num_rows
+    # It ends where it was fixed last, having stood there.
+    assert floats(table, "forward_velocity_mps")[-20:] == pytest.approx(np.zeros(20), abs=0.02)
+
+
+def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
+    mounting = Placement(xyz_m=(0.0, -0.3, 0.52), rpy_rad=(np.pi / 2, 0.0, -np.pi / 2))
+    streams, track = fused("robot_localization/test1.bag", ReadConfig(placement={"imu": mounting}))
+    table = track.table
+    gnss = streams.tables["gnss"]
+    stamp = integers(table, "stamp_ns")
+    for name, metres in (
+        ("lat_deg", 111_200.0),
+        ("lon_deg", 111_200.0 * np.cos(np.radians(floats(gnss, "lat_deg")[0]))),
+    ):
+        error_m = metres * (np.interp(integers(gnss, "stamp_ns"), stamp, floats(table, name)) - floats(gnss, name))
+        assert np.median(np.abs(error_m)) < 1.0  # these fixes claim 0.9 m
+    assert np.abs(floats(table, "roll_rad")).max() < 0.15  # a flat campus
+    assert np.abs(floats(table, "pitch_rad")).max() < 0.15
+    moving = floats(table, "wheel_velocity_mps") > 0.5
+    assert np.median(floats(table, "forward_velocity_mps")[moving]) == pytest.approx(0.98, abs=0.1)
+    assert track.info.findings.facts["fuse"]["stretches"][0]["heading_from"] == "course over ground"
+
+
+@pytest.mark.parametrize("name", ["robot_localization/test2.bag", "robot_localization/test1_2014.bag"])
+def test_logs_without_gnss_give_a_local_track(name):
+    _, track = fused(name)
+    assert track.info.datum is None
+    assert track.table.num_rows > 1000
+    assert np.isfinite(floats(track.table, "x_m")).all()
+    assert any("local frame" in warning for warning in track.info.findings.warnings)

@@ -1,0 +1,51 @@
+"""The whole-run energy of a real Warthog against the trapezoid sum published with it, and the difference explained exactly."""
+
+import json
+
+import numpy as np
+import pytest
+from shared_data import shared_data
+
+from tcpipe.cost.power import rail, recorded_energy_joule, samples
+from tcpipe.formats.log_file import open_log
+from tcpipe.recipe import ReadConfig
+from tcpipe.stages.label_power import rails_of
+from tcpipe.stages.read import read_run
+
+
+def test_exact_and_trapezoid_energy_of_the_warthog():
+    log_path = shared_data("warthog_grass_a/run.mcap")
+    reference = json.loads(shared_data("warthog_grass_a/reference.json").read_text())["E_trapezoid_joule"]
+    with open_log(log_path) as log:
+        streams = read_run(log, ReadConfig(), robot=None)
+    rails = rails_of(streams, 0)
+    assert len(rails) == 2
+    begin, end = (np.array([pick(each.stamp_ns[k] for each in rails)]) for pick, k in ((min, 0), (max, -1)))
+    exact = recorded_energy_joule(rails, begin, end, rule="exact")[0]
+    trapezoid, correction = 0.0, 0.0
+    for each in rails:
+        t = (each.stamp_ns - begin[0]) * 1e-9
+        power = each.voltage_volt * each.current_amp
+        trapezoid += np.trapezoid(power, t)
+        # The trapezoid of a product of two straight lines is too large by h ΔV ΔI / 6 on every interval.
+        correction -= (np.diff(t) * np.diff(each.voltage_volt) * np.diff(each.current_amp)).sum() / 6
+    assert trapezoid == pytest.approx(reference, rel=1e-6)
+    assert exact - trapezoid == pytest.approx(correction, rel=1e-6)
+    assert exact == pytest.approx(reference, rel=2e-5)
+
+
+def test_reading_half_the_samples_changes_the_run_little():
+    with open_log(shared_data("warthog_grass_a/run.mcap")) as log:
+        streams = read_run(log, ReadConfig(), robot=None)
+    whole, half = 0.0, 0.0
+    for each in rails_of(streams, 0):
+        thinned = rail(
+            each.name,
+            samples(each.voltage.stamp_ns[::2], each.voltage.value[::2]),
+            samples(each.current.stamp_ns[::2], each.current.value[::2]),
+            averaged=False,
+        )
+        ends = thinned.stamp_ns[:1], thinned.stamp_ns[-1:]
+        whole += recorded_energy_joule([each], *ends, rule="exact")[0]
+        half += recorded_energy_joule([thinned], *ends, rule="exact")[0]
+    assert half == pytest.approx(whole, rel=5e-3)

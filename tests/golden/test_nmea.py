@@ -1,0 +1,84 @@
+"""GGA sentences against positions worked out by hand; checksums are those of the sentences' makers."""
+
+from datetime import UTC, datetime
+
+import numpy as np
+
+from tcpipe.logs.nmea import NS_PER_DAY, read_gga, with_date
+
+S = 1_000_000_000
+
+# The example of the NMEA 0183 manuals: 48 deg 07.038' N, 11 deg 31.000' E, 545.4 m above the geoid, which is 46.9 m above the ellipsoid.
+MANUAL = "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*47"
+
+
+def signed(body: str) -> str:
+    checksum = 0
+    for character in body:
+        checksum ^= ord(character)
+    return f"${body}*{checksum:02X}"
+
+
+def test_the_manuals_sentence() -> None:
+    found = read_gga([MANUAL])
+    assert found.time_of_day_ns[0] == ((12 * 60 + 35) * 60 + 19) * S
+    assert abs(found.lat_deg[0] - 48.1173) < 1e-12  # 48 + 7.038 / 60
+    assert abs(found.lon_deg[0] - 11.516666666666667) < 1e-12  # 11 + 31 / 60
+    assert (found.quality[0], found.hdop[0], found.alt_m[0], found.separation_m[0]) == (1, 0.9, 545.4, 46.9)
+    assert not found.broken[0]
+
+
+def test_south_west_and_the_precision_of_rtk() -> None:
+    # Sugar Loaf: 22 deg 56' 55.7418" S, 43 deg 9' 23.4012" W.
+    body = "GNGGA,235959.950,2256.92903000,S,04309.39002000,W,4,24,0.53,395.123,M,-5.512,M,1.0,0000"
+    found = read_gga([signed(body)])
+    assert found.lat_deg[0] == -(22 + 56.92903 / 60)
+    assert found.lon_deg[0] == -(43 + 9.39002 / 60)
+    assert found.time_of_day_ns[0] == 86_399_950_000_000
+    assert abs(found.alt_m[0] + found.separation_m[0] - 389.611) < 1e-9
+
+
+def test_other_sentences_are_skipped_and_broken_ones_marked() -> None:
+    sentences = [
+        "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A",
+        MANUAL,
+        MANUAL.replace("4807", "4817"),  # the checksum tells
+        "noise before " + MANUAL + "\r\n",
+        "$GPGGA,123519,4807.038,N*47",
+        signed("GPGGA,123519,48x7.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,"),
+        "$GPGGA,123519,4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,",  # without a checksum: optional in the standard
+    ]
+    found = read_gga(sentences)
+    assert found.row.tolist() == [1, 2, 3, 4, 5, 6]
+    assert found.broken.tolist() == [False, True, False, True, True, False]
+
+
+def test_no_fix_has_empty_fields() -> None:
+    found = read_gga([signed("GPGGA,,,,,,0,00,99.99,,,,,,")])
+    assert not found.broken[0]
+    assert found.quality[0] == 0
+    assert np.isnan(found.lat_deg[0])
+    assert found.time_of_day_ns[0] == -1
+
+
+def at(*parts: int) -> int:
+    return int(datetime(*parts, tzinfo=UTC).timestamp()) * S
+
+
+def test_the_date_comes_from_the_log_over_midnight_too() -> None:
+    log = np.array([at(2024, 2, 28, 23, 59, 59), at(2024, 2, 29, 0, 0, 1), at(2024, 2, 29, 0, 0, 2)])
+    # The fix is made just before it is logged: the second sentence still carries the evening's time.
+    time_of_day = np.array([NS_PER_DAY - 2 * S, NS_PER_DAY - S // 2, 2 * S])
+    expected = [at(2024, 2, 28, 23, 59, 58), at(2024, 2, 29) - S // 2, at(2024, 2, 29, 0, 0, 2)]
+    assert with_date(time_of_day, log).tolist() == expected
+
+
+def test_a_clock_half_a_day_off_keeps_its_side_and_unknown_times_are_zero() -> None:
+    log = at(2024, 6, 1, 6) + np.arange(100) * S
+    noise = np.where(np.arange(100) % 2, S // 10, -S // 10)
+    time_of_day = (log - NS_PER_DAY // 2 + noise) % NS_PER_DAY
+    time_of_day[50] = -1
+    found = with_date(time_of_day, log)
+    offset = np.delete(found - log, 50)
+    assert found[50] == 0
+    assert np.ptp(offset) == 2 * (S // 10)

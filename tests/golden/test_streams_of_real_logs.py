@@ -1,0 +1,118 @@
+"""Streams of real recordings, against figures worked out from the same recordings by other means."""
+
+import json
+import tarfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shared_data import shared_data
+
+from tcpipe.errors import RoleError
+from tcpipe.formats.log_file import open_log
+from tcpipe.recipe import Placement, ReadConfig
+from tcpipe.stages.read import read_run
+from tcpipe.tables.levels import Streams
+
+
+def read(path: Path, robot: str | None = None, **config) -> Streams:
+    with open_log(path) as log:
+        return read_run(log, ReadConfig(**config), robot=robot)
+
+
+@pytest.mark.parametrize("robot", [None, "warthog"])
+def test_the_energy_of_a_real_warthog(robot: str | None) -> None:
+    path = shared_data("warthog_grass_a/run.mcap")
+    reference = json.loads((path.parent / "reference.json").read_text())
+    found = read(path, robot)
+    assert found.robot == (robot or "generic")
+    assert found.findings.facts["left_out"].keys() == {"/icp_odom"}
+    assert found.findings.facts["power"]["current_sign"] == "drawn_positive (mean)"
+    power = found.tables["power"]
+    stamps = power["stamp_ns"].to_numpy()
+    watt = power["voltage_volt"].to_numpy() * power["current_amp"].to_numpy()
+    at, first = np.unique(stamps, return_index=True)
+    total = np.add.reduceat(watt, first)
+    energy_joule = np.trapezoid(total, (at - at[0]) / 1e9)
+    assert len(at) == reference["rows"]
+    assert abs(energy_joule / reference["E_trapezoid_joule"] - 1) < 1e-6
+    assert abs(np.mean(total < 0) - reference["negative_power_fraction"]) < 1e-9
+    imu = found.tables["imu"]
+    assert imu["quat_w"].null_count == imu.num_rows  # it says that it has no orientation
+    assert abs(np.mean(imu["linear_acceleration_z_mps2"].to_numpy()) - 9.8) < 0.1
+
+
+def test_a_real_husky_without_power() -> None:
+    found = read(
+        shared_data("robot_localization/test1.bag"),
+        placement={"imu": Placement((0.0, -0.3, 0.52), (np.pi / 2, 0.0, -np.pi / 2))},
+    )
+    assert found.robot == "husky"
+    rows = {role: table.num_rows for role, table in found.tables.items()}
+    assert rows == {"gnss": 989, "imu": 11865, "wheel_odometry": 3952}
+    assert found.findings.warnings[0].startswith("no topic plays power")
+    assert [sensor.placed_by for sensor in found.sensors.values()] == ["assumed", "recipe", "same frame"]
+    assert found.sensors["gnss"].frame_id == "gps"
+    # Turned by its mounting, the IMU's specific force points up.
+    force = np.stack([found.tables["imu"][f"linear_acceleration_{axis}_mps2"].to_numpy() for axis in "xyz"], -1).mean(0)
+    x, y, z, w = found.sensors["imu"].quat_xyzw
+    up = np.array([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)])  # third row of the rotation
+    assert up @ force > 0.99 * np.linalg.norm(force)
+
+
+def test_four_containers_give_the_same_streams(tmp_path: Path) -> None:
+    with tarfile.open(shared_data("damaged/husky_test1_rosbag2_dirs.tar.xz")) as archive:
+        archive.extractall(tmp_path, filter="data")
+    paths = [
+        shared_data("robot_localization/test1.bag"),
+        shared_data("damaged/husky_test1_crc_zstd.mcap"),
+        tmp_path / "husky_test1_ros2_sqlite3",
+        tmp_path / "husky_test1_ros2_mcap",
+    ]
+    first, *others = (read(path) for path in paths)
+    for path, other in zip(paths[1:], others, strict=True):
+        assert list(other.tables) == list(first.tables), path
+        assert all(other.tables[role].equals(first.tables[role], check_metadata=True) for role in first.tables), path
+        assert other.sensors == first.sensors
+        assert other.findings == first.findings
+
+
+def test_a_jackal_in_simulated_time() -> None:
+    found = read(shared_data("robot_localization/test2.bag"))
+    assert found.robot == "jackal"
+    stamps = found.tables["imu"]["stamp_ns"].to_numpy()
+    assert 47e9 < stamps[0] < 48e9
+    assert found.sensors["wheel_odometry"].time_source == "header"
+    assert found.findings.facts["epochs"] == 1
+
+
+def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
+    path = shared_data("robot_localization/test1_2014.bag")
+    found = read(path)
+    assert {role: sensor.topic for role, sensor in found.sensors.items()} == {
+        "imu": "/xsens/imu_data",
+        "wheel_odometry": "/wheel_odometry",
+        "visual_odometry": "/stereo_odometer/odometry",
+    }
+    assert found.findings.facts["epochs"] == 1
+    worse = read(path, topics={"imu": ["/my_odometry2imu/imu_data"]})
+    facts = worse.findings.facts["roles"]["imu"]["topics"]["/my_odometry2imu/imu_data"]
+    assert facts["messages"] == 13333
+    assert sum(facts["dropped"].values()) == 347
+    assert facts["notes"]["sorted"] >= 31
+    assert np.all(np.diff(worse.tables["imu"]["stamp_ns"].to_numpy()) > 0)
+
+
+def test_a_battery_that_says_nothing_and_stamps_in_whole_seconds() -> None:
+    found = read(shared_data("peers/ros_amr_interop/rosbag_demo.bag"))
+    text = "\n".join(found.findings.warnings)
+    assert "/battery: the voltage and the current are zero on all 111 rows" in text
+    assert "/velocity: log time rules, since 98 % of its messages repeat the header stamp" in text
+    assert found.tables["wheel_odometry"].num_rows == 5270
+
+
+def test_two_turtles_tell_no_motion() -> None:
+    with pytest.raises(RoleError) as error:
+        read(shared_data("peers/rosbag.js/fixtures/example.bag"))
+    assert len(error.value.problems) == 2
+    assert "/turtle1/cmd_vel (geometry_msgs/msg/Twist" in error.value.problems[1]

@@ -1,0 +1,53 @@
+"""Energies of random records add up over any division, and agree with a dense sum."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_tracks import stamps
+
+from tcpipe.cost.power import energy_joule, rail, recorded_energy_joule, samples
+
+
+@st.composite
+def rails(draw, averaged=None):
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    averaged = draw(st.booleans()) if averaged is None else averaged
+    made = []
+    for name in "ab"[: draw(st.integers(1, 2))]:
+        signals = []
+        for level, noise in ((24.0, 0.5), (6.0, 6.0)):
+            count = draw(st.integers(2, 80))
+            stamp_ns = stamps(1)[0] + np.cumsum(rng.integers(1, 2 * 4_000_000_000 // count, count))
+            signals.append(samples(stamp_ns, level + rng.normal(0, noise, count)))
+        made.append(rail(name, *signals, averaged=averaged))
+    return made, averaged
+
+
+@settings(max_examples=60, deadline=None)
+@given(rails(), st.lists(st.integers(-(10**9), 5 * 10**9), min_size=2, max_size=8), st.booleans())
+def test_energy_of_the_parts_is_the_energy_of_the_whole(given_rails, offsets, paper):
+    made, averaged = given_rails
+    rule = "averaged" if averaged else ("right_endpoint" if paper else "exact")
+    cuts = stamps(1)[0] + np.sort(np.array(offsets))
+    parts = recorded_energy_joule(made, cuts[:-1], cuts[1:], rule=rule)
+    whole = recorded_energy_joule(made, cuts[:1], cuts[-1:], rule=rule)
+    np.testing.assert_allclose(parts.sum(), whole[0], rtol=1e-9, atol=1e-9)
+    known = energy_joule(made, cuts[:-1], cuts[1:], rule=rule)
+    inside = np.isfinite(known)
+    np.testing.assert_array_equal(known[inside], parts[inside])
+
+
+@settings(max_examples=30, deadline=None)
+@given(rails(averaged=False))
+def test_energy_is_that_of_a_dense_sum(given_rails):
+    (first, *_), _ = given_rails
+    if len(first.stamp_ns) < 2:
+        return
+    ends = first.stamp_ns[[0, -1]]
+    dense = np.linspace(0, ends[1] - ends[0], 40_001)
+    t = (first.stamp_ns - ends[0]).astype(float)
+    power = np.interp(dense, t, first.voltage_volt) * np.interp(dense, t, first.current_amp)
+    wanted = np.trapezoid(power, dense * 1e-9)
+    got = energy_joule([first], ends[:1], ends[1:], rule="exact")[0]
+    scale = np.abs(power).max() * (ends[1] - ends[0]) * 1e-9
+    assert abs(got - wanted) < 1e-3 * scale + 1e-9

@@ -1,0 +1,90 @@
+"""Every metre and every joule of random drives is accounted for: kept and lost add up to what was driven and drawn."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from made_tracks import make_track, power_streams, stamps
+
+from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
+from tcpipe.stages.gate import gate_track
+from tcpipe.stages.label import label_segments
+from tcpipe.stages.segment import segment_track
+from tcpipe.tables.columns import floats
+
+FINE = 50
+"""Steps of the truth to one row of the track."""
+
+
+@st.composite
+def drives(draw):
+    """Return a track with stops, turns, reversing, command changes, holes and clock steps, and its true horizontal length [m]."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    seconds, fine_s = draw(st.integers(5, 60)), 0.05 / FINE
+    t = np.arange(seconds * 20 * FINE + 1) * fine_s
+    knots = np.arange(0.0, seconds + 4.0, draw(st.sampled_from([1.5, 4.0, 15.0])))
+    speed = np.clip(np.interp(t, knots, rng.uniform(-0.5, 1.4, len(knots))), draw(st.sampled_from([-0.3, 0.0])), 1.0)
+    turn = np.interp(t, knots, rng.uniform(-1.0, 1.0, len(knots))) * draw(st.sampled_from([0.0, 0.2, 1.0]))
+    slope = 0.3 * np.sin(t / 5.0)
+    course = np.concatenate(([0.0], np.cumsum(0.5 * (turn[1:] + turn[:-1]) * fine_s)))
+    velocity = speed[:, None] * np.column_stack(
+        (np.cos(course) * np.cos(slope), np.sin(course) * np.cos(slope), np.sin(slope))
+    )
+    position = np.concatenate((np.zeros((1, 3)), np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * fine_s, axis=0)))
+    kept = np.sort(rng.permutation(len(t[::FINE]))[: draw(st.integers(len(t[::FINE]) // 2, len(t[::FINE])))])
+    kept = np.arange(len(t[::FINE])) if draw(st.booleans()) else kept
+    epoch = (kept > draw(st.integers(0, 2 * len(t[::FINE])))).astype(np.int16)
+    rows = kept * FINE
+    way = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(position[:, :2], axis=0).T))))
+    straight = np.hypot(*np.diff(position[rows, :2], axis=0).T)
+    whole = (np.diff(kept) == 1) & (np.diff(epoch) == 0)
+    true_m = np.where(whole, np.diff(way[rows]), straight).sum()
+    track = make_track(
+        position[rows],
+        velocity[rows],
+        stamp_ns=stamps(len(t[::FINE]))[kept],
+        epoch=epoch,
+        forward_mps=speed[rows],
+        yaw_rate_radps=turn[rows],
+        wheel_mps=speed[rows] if draw(st.booleans()) else None,
+        commanded_mps=np.where(rng.random(len(rows)) < 0.95, 1.0, 0.4) if draw(st.booleans()) else None,
+        power_watt=np.full(len(rows), 144.0),
+    )
+    return track, true_m
+
+
+def labelled(track):
+    gated = gate_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    stamp_ns = gated.table["stamp_ns"].to_numpy()
+    t_ns = np.arange(stamp_ns[0] - 10**9, stamp_ns[-1] + 10**9, 40_000_000)
+    power = power_streams({"drive": (t_ns, np.full(len(t_ns), 24.0), np.full(len(t_ns), 6.0))})
+    found = label_segments(
+        segment_track(gated, SegmentConfig()),
+        gated,
+        power,
+        LabelConfig(),
+        flag_arc_to_chord=1.01,
+        max_position_std_m=0.1,
+        voltage_range_volt=None,
+    )
+    return found, 144.0 * (t_ns[-1] - t_ns[0]) * 1e-9
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(drives(), min_size=1, max_size=3))
+def test_kept_and_lost_are_what_was_driven_and_drawn(given_drives):
+    ledgers_m, driven_m = [], []
+    for track, true_m in given_drives:
+        found, drawn_joule = labelled(track)
+        entries = found.ledger_m
+        assert min(entries.values()) >= 0.0
+        assert sum(entries.values()) == pytest.approx(true_m, rel=1e-3, abs=1e-3)
+        assert entries["kept"] == pytest.approx(floats(found.table, "arc_length_m").sum(), rel=1e-9, abs=1e-9)
+        facts = found.info.findings.facts["label"]
+        assert facts["distance_m"] == pytest.approx(sum(entries.values()), rel=1e-12)
+        if not track.table["epoch"].to_numpy().any():  # power is of the first epoch alone
+            assert sum(facts["energy_by_entry_joule"].values()) == pytest.approx(drawn_joule, rel=1e-3)
+        ledgers_m.append(entries)
+        driven_m.append(true_m)
+    summed = {name: sum(ledger[name] for ledger in ledgers_m) for name in ledgers_m[0]}
+    assert sum(summed.values()) == pytest.approx(sum(driven_m), rel=1e-3, abs=1e-3)

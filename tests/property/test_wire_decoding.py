@@ -1,0 +1,189 @@
+"""Messages of any type in any plain serialisation, against a serialiser that writes them value by value."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rosbags.typesys import get_types_from_msg
+
+from tcpipe.formats.arrow_columns import TopicTable
+from tcpipe.formats.log_part import MessageBlock
+from tcpipe.formats.ros_types import MessageType
+from tcpipe.logs.wire_layout import LayoutError, layout_of
+from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, Scalar, Text, in_form, record
+
+CODES = ("?", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8")
+HEADERS = {b"\x00\x00": (">", 8), b"\x00\x01": ("<", 8), b"\x00\x06": (">", 4), b"\x00\x07": ("<", 4), None: ("<", 1)}
+"""CDR big- and little-endian, plain XCDR2 big- and little-endian, ROS 1: byte order and largest alignment."""
+
+
+class Writer:
+    """Serialises one message as the specifications say, one value after the other."""
+
+    def __init__(self, header, form):
+        self.order, self.max_alignment = HEADERS[header]
+        self.header, self.form, self.body = header, form, bytearray()
+
+    def message(self, of, value):
+        self.write(of, value)
+        return (self.header + b"\0\0" if self.header else b"") + bytes(self.body)
+
+    def align(self, size):
+        self.body += bytes(-len(self.body) % min(size, self.max_alignment))
+
+    def number(self, code, value):
+        packed = np.array(value, np.dtype(self.order + code)).tobytes()
+        self.align(len(packed))
+        self.body += packed
+
+    def write(self, of, value):
+        if isinstance(of, Scalar):
+            self.number(of.code, value)
+        elif isinstance(of, Text) and of.wide:
+            text = value.encode(self.form.codec(self.order))
+            self.number("u4", len(text) // self.form.step)
+            self.body += text
+        elif isinstance(of, Text):
+            text = value.encode() + (b"\0" if self.header else b"")
+            self.number("u4", len(text))
+            self.body += text
+        elif isinstance(of, Record):
+            for name, field in of.fields:
+                self.write(field, value[name])
+            if not of.fields and self.header:
+                self.body += b"\0"
+        else:
+            if of.length is None:
+                self.number("u4", len(value))
+            for element in value:
+                self.write(of.element, element)
+
+
+def wire_types(*, wide):
+    scalars = st.builds(Scalar, st.sampled_from(CODES))
+    texts = st.sampled_from([Text(), Text(WIDE_FORMS[0])]) if wide else st.just(Text())
+    leaves = st.one_of(scalars, texts)
+
+    def records(children, *, fewest=0):
+        fields = st.lists(children, min_size=fewest, max_size=4)
+        return fields.map(lambda of: record("a/msg/R", tuple((f"f{n}", field) for n, field in enumerate(of))))
+
+    def arrays(elements):
+        return st.builds(Array, elements, st.none() | st.integers(1, 3))
+
+    # Lists of messages without fields are refused where these take no bytes: a count of them could not be checked.
+    fields = st.recursive(
+        leaves | arrays(leaves), lambda inner: records(inner) | arrays(records(leaves, fewest=1)), max_leaves=8
+    )
+    return st.lists(fields, min_size=1, max_size=5).map(
+        lambda of: record("a/msg/A", tuple((f"f{n}", field) for n, field in enumerate(of)))
+    )
+
+
+def random_value(of, rng, lengths, wide):
+    """A value; ``lengths`` decides how long texts and lists are."""
+    if isinstance(of, Scalar):
+        if of.code == "?":
+            return bool(rng.integers(2))
+        if of.code.startswith("f"):
+            return float(np.dtype(of.code).type(rng.normal()))
+        limits = np.iinfo(of.code)
+        return int(rng.integers(limits.min, limits.max, dtype=of.code, endpoint=True))
+    if isinstance(of, Text):
+        letters = "abcdé€" if not of.wide or wide == 4 else "ab𝄞"
+        return "".join(rng.choice(list(letters)) for _ in range(int(lengths.integers(0, 5))))
+    if isinstance(of, Record):
+        return {name: random_value(field, rng, lengths, wide) for name, field in of.fields}
+    count = int(lengths.integers(0, 5)) if of.length is None else of.length
+    return [random_value(of.element, rng, lengths, wide) for _ in range(count)]
+
+
+def flat(of, value, prefix=""):
+    for name, field in of.fields:
+        if isinstance(field, Record):
+            yield from flat(field, value[name], f"{prefix}{name}.")
+        else:
+            yield prefix + name, value[name]
+
+
+def decoded(of, payloads, encoding):
+    table = TopicTable(MessageType(of, "log", {}), encoding)
+    lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+    rows = np.arange(len(payloads))
+    table.add(
+        MessageBlock(0, memoryview(b"".join(payloads)), np.cumsum(lengths) - lengths, lengths, rows, rows, rows, None)
+    )
+    found = table.take()
+    assert table.undecodable == {}
+    return found
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    header=st.sampled_from(list(HEADERS)),
+    form=st.sampled_from(WIDE_FORMS),
+    alike=st.booleans(),
+    count=st.sampled_from([1, 12, 70]),
+    seed=st.integers(0, 1 << 20),
+    data=st.data(),
+)
+def test_every_type_in_every_serialisation(header, form, alike, count, seed, data):  # noqa: PLR0917
+    of = data.draw(wire_types(wide=header is not None))
+    rng = np.random.default_rng(seed)
+    values = [random_value(of, rng, np.random.default_rng(seed) if alike else rng, form.width) for _ in range(count)]
+    payloads = [Writer(header, form).message(of, value) for value in values]
+    if header is not None and _ambiguous(of, payloads, form):
+        return
+    found = decoded(of, payloads, "cdr" if header else "ros1")
+    columns = [name for name, _ in flat(of, values[0])]
+    assert found.column_names[2:] == columns
+    for name in columns:
+        expected = [dict(flat(of, value))[name] for value in values]
+        assert json.dumps(found[name].to_pylist()) == json.dumps(expected), name
+
+
+def _ambiguous(of, payloads, form):
+    """Whether another form of wide strings fits as many messages, so that nothing can tell."""
+
+    def fitting(of):
+        count = 0
+        for payload in payloads[:32]:
+            try:
+                layout_of(of, payload, encoding="cdr")
+                count += 1
+            except LayoutError:
+                pass
+        return count
+
+    others = [fitting(in_form(of, other)) for other in WIDE_FORMS if other != form]
+    return in_form(of, WIDE_FORMS[0]) != in_form(of, WIDE_FORMS[1]) and max(others) >= fitting(in_form(of, form))
+
+
+@pytest.mark.parametrize("header", list(HEADERS))
+def test_a_message_that_fits_no_definition_costs_only_itself(header):
+    of = record("a/msg/A", (("texts", Array(Text(), None)), ("number", Scalar("f8"))))
+    rng = np.random.default_rng(0)
+    values = [random_value(of, rng, rng, 4) for _ in range(100)]
+    payloads = [Writer(header, WIDE_FORMS[0]).message(of, value) for value in values]
+    order, _ = HEADERS[header]
+    start = 4 if header else 0
+    for row in (3, 50, 99):
+        payloads[row] = payloads[row][:start] + struct.pack(order + "I", 0xFFFFFFF0) + payloads[row][start + 4 :]
+    table = TopicTable(MessageType(of, "log", _definitions()), "cdr" if header else "ros1")
+    lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+    rows = np.arange(len(payloads))
+    buffer = memoryview(b"".join(payloads))
+    table.add(MessageBlock(0, buffer, np.cumsum(lengths) - lengths, lengths, rows, rows, rows, None))
+    found = table.take()
+    kept = [value for row, value in enumerate(values) if row not in (3, 50, 99)]
+    assert found["texts"].to_pylist() == [value["texts"] for value in kept]
+    assert found["number"].to_pylist() == [value["number"] for value in kept]
+    assert sum(table.undecodable.values()) == 3
+
+
+def _definitions():
+
+    return get_types_from_msg("string[] texts\nfloat64 number\n", "a/msg/A")

@@ -1,0 +1,159 @@
+"""A small store for tests of datasets: an analytic map and runs whose segments are laid out on it, without any log."""
+
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyproj
+from map_worlds import World
+
+from tcpipe import __version__
+from tcpipe.formats.map_building import build_map
+from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+from tcpipe.tables.levels import (
+    DATA_MODEL_VERSION,
+    GATED_TRACK,
+    LABELLED_SEGMENTS,
+    REJECTIONS,
+    TRACK,
+    Datum,
+    GatedTrack,
+    LabelledSegments,
+    Track,
+    TrackInfo,
+)
+
+WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)
+
+
+def lonlat(xy_m):
+    """Points around the world's middle [m] as lon, lat [deg]."""
+    xy = np.asarray(xy_m, dtype=float)
+    lon, lat = pyproj.Transformer.from_crs(WORLD.crs, 4326, always_xy=True).transform(
+        WORLD.x_m + xy[..., 0], WORLD.y_m + xy[..., 1]
+    )
+    return np.stack([lon, lat], axis=-1)
+
+
+def lanes(y_m, x_from_m, x_to_m):
+    """Start and end points of segments along eastward lanes [m], shape (N, 2) each."""
+    x = np.arange(x_from_m, x_to_m - 0.5)
+    start = np.array([(east, north) for north in np.atleast_1d(y_m) for east in x])
+    return start, np.add(start, (1.0, 0.0))
+
+
+def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="husky"):
+    """A labelled-segment table of one run; labels follow the place, so that they can be checked."""
+    n = len(start_xy_m)
+    start, end = lonlat(start_xy_m), lonlat(end_xy_m)
+    geod = pyproj.Geod(ellps="WGS84")
+    azimuth_deg, _, chord_m = geod.inv(*start.T, *end.T)
+    stamps = start_ns + np.arange(n) * 1_200_000_000
+    power = 150.0 + np.asarray(start_xy_m)[:, 0]
+    given = {
+        "segment_id": [f"{run_id}-{stamp}" for stamp in stamps],
+        "run_id": [run_id] * n,
+        "robot": [robot] * n,
+        "start_ns": stamps,
+        "end_ns": stamps + 1_200_000_000,
+        "start_lon_deg": start[:, 0],
+        "start_lat_deg": start[:, 1],
+        "end_lon_deg": end[:, 0],
+        "end_lat_deg": end[:, 1],
+        "chord_m": chord_m,
+        "arc_length_m": np.ones(n),
+        "course_rad": np.radians(90.0 - azimuth_deg),
+        "position_std_m": np.full(n, 0.02),
+        "velocity_mps": 0.8 + 0.001 * np.arange(n),
+        "fused_velocity_mps": 0.9 + 0.001 * np.arange(n),
+        "duration_s": np.full(n, 1.2),
+        "power_watt": power if powered else np.full(n, np.nan),
+        "energy_joule": power * 1.2 if powered else np.full(n, np.nan),
+        "power_std_watt": np.ones(n) if powered else np.full(n, np.nan),
+        "energy_std_joule": np.ones(n) if powered else np.full(n, np.nan),
+    }
+    rest = {}
+    for column in LABELLED_SEGMENTS.columns:
+        if column.name not in given:
+            rest[column.name] = np.zeros(n, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
+    return LABELLED_SEGMENTS.table(**given, **rest)
+
+
+def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None):
+    """Put a run with these segments into the store, as ingestion would."""
+    recipe = recipe or Recipe()
+    robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
+    info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother")
+    identity = recipe_id(recipe, robot)
+    metres = float(np.sum(table.column("arc_length_m").to_numpy()))
+    ledger_m = ledger_m or {"kept": metres, "standing": 0.0, "accelerating": 2.5}
+    store.write_run_json(
+        run_id, {"source": {"paths": [f"/logs/{run_id}.mcap"], "size_bytes": 1, "sha256": sha256 or run_id}}
+    )
+    store.write_run(
+        run_id,
+        identity,
+        track=Track(TRACK.empty(), REJECTIONS.empty(), info),
+        gated=GatedTrack(GATED_TRACK.empty(), info),
+        labelled=LabelledSegments(table, info, ledger_m),
+        manifest={
+            "data_model_version": DATA_MODEL_VERSION,
+            "tcpipe_version": __version__,
+            "ingest_key": ingest_key(recipe),
+            "recipe": asdict(recipe),
+            "recipe_id": identity,
+            "run_id": run_id,
+            "robot": robot,
+            "robot_requested": None,
+            "tags": {},
+            "counts": {"segments": table.num_rows},
+            "warnings": [],
+            "damage": [],
+        },
+    )
+
+
+def add_world(store, directory: Path, *, name="site", layers=("ortho", "terrain")):
+    """Put the analytic map into the store."""
+    directory.mkdir(parents=True, exist_ok=True)
+    rasters = WORLD.write(directory, pitch_m=0.1)
+    optional = {layer: rasters[layer] for layer in layers}
+    build_map(store.map_path(name), name=name, height=rasters["height"], **optional)
+
+
+def small_store(directory: Path) -> Store:
+    """Two runs of 8 lanes each, 448 segments, on the 40 m world."""
+    store = Store(directory / "store")
+    store.root.mkdir(parents=True)
+    add_world(store, directory / "rasters")
+    for run_id, first in (("north", 1.0), ("south", -15.5)):
+        start, end = lanes(first + 2.0 * np.arange(8), -14.0, 14.0)
+        add_run(store, run_id, segments(run_id, start, end, start_ns=int(1e18 + first * 1e12)))
+    return store
+
+
+def region_file(path: Path, *rings_xy_m, splits=()):
+    """A GeoJSON file of rings around the world's middle [m]; ``splits`` gives features their property."""
+    import json
+
+    features = []
+    for number, ring in enumerate(rings_xy_m):
+        closed = [*ring, ring[0]]
+        properties = {"split": splits[number]} if number < len(splits) and splits[number] else {}
+        features.append(
+            {
+                "type": "Feature",
+                "properties": properties,
+                "geometry": {"type": "Polygon", "coordinates": [lonlat(closed).tolist()]},
+            }
+        )
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return path
+
+
+def box(x0, y0, x1, y1):
+    """Corners of a rectangle, counter-clockwise."""
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]

@@ -1,0 +1,68 @@
+"""Labels as the cost of the true metre, against drives whose true metre is known."""
+
+import numpy as np
+import pytest
+
+from tcpipe.cost.labels import labels
+
+
+def one(**values):
+    return labels(**{name: np.atleast_1d(np.asarray(value, dtype=float)) for name, value in values.items()})
+
+
+def test_identities():
+    got = one(
+        chord_m=1.0,
+        duration_s=1.25,
+        energy_joule=200.0,
+        end_velocity_mps=0.8,
+        end_power_watt=170.0,
+        displacement_std_m=0.0,
+        energy_noise_joule=3.0,
+    )
+    assert got.velocity_mps[0] == 0.8
+    assert got.power_watt[0] == 160.0
+    assert got.duration_s[0] == pytest.approx(1.0 / got.velocity_mps[0])
+    assert got.energy_joule[0] == pytest.approx(got.power_watt[0] / got.velocity_mps[0])
+    assert (got.duration_std_s[0], got.velocity_std_mps[0]) == (0.0, 0.0)
+    assert got.energy_std_joule[0] == 3.0
+    assert got.power_std_watt[0] == pytest.approx(3.0 / 1.25)
+
+
+def test_deviations_are_those_of_many_estimated_metres():
+    # Speed and power change along the metre; the estimated end is off by e, so the segment covers 1 + e true metres.
+    rng = np.random.default_rng(0)
+    error = rng.normal(0, 0.01, 100_000)
+    t = np.linspace(0, 2, 20_001)
+    speed, power = 0.7 + 0.2 * t, 150 + 60 * t
+    way, energy = (np.concatenate(([0], np.cumsum(0.5 * (x[1:] + x[:-1]) * t[1]))) for x in (speed, power))
+    duration = np.interp(1 + error, way, t)
+    spent = np.interp(duration, t, energy)
+    true_duration = np.interp(1.0, way, t)
+    got = one(
+        chord_m=1.0,
+        duration_s=true_duration,
+        energy_joule=np.interp(true_duration, t, energy),
+        end_velocity_mps=np.interp(true_duration, t, speed),
+        end_power_watt=np.interp(true_duration, t, power),
+        displacement_std_m=0.01,
+        energy_noise_joule=0.0,
+    )
+    assert got.duration_std_s[0] == pytest.approx(duration.std(), rel=0.01)
+    assert got.velocity_std_mps[0] == pytest.approx((1 / duration).std(), rel=0.02)
+    assert got.energy_std_joule[0] == pytest.approx(spent.std(), rel=0.01)
+    assert got.power_std_watt[0] == pytest.approx((spent / duration).std(), rel=0.03)
+
+
+def test_without_energy_there_is_none_of_its_deviations():
+    got = one(
+        chord_m=1.0,
+        duration_s=1.0,
+        energy_joule=np.nan,
+        end_velocity_mps=1.0,
+        end_power_watt=100.0,
+        displacement_std_m=0.01,
+        energy_noise_joule=1.0,
+    )
+    assert np.isnan([got.power_watt[0], got.power_std_watt[0], got.energy_std_joule[0]]).all()
+    assert got.duration_std_s[0] == pytest.approx(0.01)

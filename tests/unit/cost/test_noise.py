@@ -1,0 +1,144 @@
+"""The energy's deviation against the scatter of many noisy, sampled or rounded records of one truth."""
+
+import numpy as np
+import pytest
+from made_tracks import stamps
+from scipy.signal import lfilter
+
+from tcpipe.cost.noise import energy_noise, resolution
+from tcpipe.cost.power import energy_joule, rail, samples
+from tcpipe.cost.roughness import local_scale, roughness
+
+ZERO = stamps(1)[0]
+STARTS = ZERO + (np.arange(5, 595, 1.3) * 1e9).astype(np.int64)
+ENDS = STARTS + 1_200_000_000
+
+NEVER_STILL = np.empty((0, 2), dtype=np.int64)
+
+
+def energy_noise_joule(rails, start_ns, end_ns, *, averaged, still_ns=NEVER_STILL):
+    return energy_noise(rails, start_ns, end_ns, still_ns, averaged=averaged).std_joule()
+
+
+def record(t, amp, *, averaged=False):
+    stamp_ns = ZERO + np.round(t * 1e9).astype(np.int64)
+    return rail("drive", samples(stamp_ns, np.full(len(t), 24.0)), samples(stamp_ns, amp), averaged=averaged)
+
+
+def test_white_noise_of_samples():
+    t = np.arange(0, 600, 0.05)
+    made = [record(t, 6 + np.random.default_rng(1).normal(0, 0.5, len(t)))]
+    error = energy_joule(made, STARTS, ENDS, rule="exact") - 24 * 6 * 1.2
+    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    assert np.sqrt((got**2).mean()) == pytest.approx(error.std(), rel=0.1)
+
+
+@pytest.mark.parametrize("period_s", [0.05, 0.2, 1.0])
+def test_a_rough_current_sampled_slowly(period_s):
+    # A current with a correlation time of 20 ms: what falls between two samples is lost.
+    rng = np.random.default_rng(2)
+    fine, decay = 0.005, np.exp(-0.005 / 0.02)
+    amp = 6 + lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 3.0, 120_000))
+    t = np.arange(120_000) * fine
+    truth = energy_joule([record(t, amp)], STARTS, ENDS, rule="exact")
+    step = round(period_s / fine)
+    made = [record(t[::step], amp[::step])]
+    error = energy_joule(made, STARTS, ENDS, rule="exact") - truth
+    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    assert 0.9 < np.sqrt((got**2).mean()) / error.std() < 1.5
+
+
+@pytest.mark.parametrize("white_amp", [0.0, 0.15, 0.5])
+def test_a_current_that_the_sampling_resolves_with_noise_on_top(white_amp):
+    rng = np.random.default_rng(5)
+    fine, decay = 0.005, np.exp(-0.005 / 0.15)
+    amp = 6 + lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 1.5, 120_000))
+    t = np.arange(120_000) * fine
+    truth = energy_joule([record(t, amp)], STARTS, ENDS, rule="exact")
+    made = [record(t[::10], amp[::10] + rng.normal(0, white_amp, 12_000))]
+    error = energy_joule(made, STARTS, ENDS, rule="exact") - truth
+    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    assert np.sqrt((got**2).mean()) == pytest.approx(error.std(), rel=0.15)
+
+
+def test_a_smooth_current_has_no_noise():
+    t = np.arange(0, 600, 0.05)
+    made = [record(t, 6 + np.sin(t / 5))]
+    assert energy_noise_joule(made, STARTS, ENDS, averaged=False).max() < 0.02
+
+
+def test_rounding_shows_as_resolution_and_noise_as_none():
+    t = np.arange(0, 600, 0.05)
+    rounded = np.round((6 + np.sin(t / 40)) / 0.5) * 0.5
+    assert resolution(samples(stamps(len(t)), rounded)) == pytest.approx(0.5)
+    assert resolution(samples(stamps(len(t)), np.random.default_rng(0).normal(0, 1, len(t)))) == 0
+    made = [record(t, rounded)]
+    error = energy_joule(made, STARTS, ENDS, rule="exact") - energy_joule(
+        [record(t, 6 + np.sin(t / 40))], STARTS, ENDS, rule="exact"
+    )
+    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    assert np.sqrt((got**2).mean()) == pytest.approx(error.std(), rel=0.25)
+
+
+@pytest.mark.parametrize(("correlation_s", "white_amp"), [(0.02, 0.0), (0.15, 0.0), (0.15, 0.15), (2.0, 0.15)])
+def test_means_err_by_their_noise_and_where_a_segment_divides_one(correlation_s, white_amp):
+    rng = np.random.default_rng(6)
+    fine, decay = 0.005, np.exp(-0.005 / correlation_s)
+    amp = 6 + lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 1.5, 120_000))
+    t = (np.arange(120_000) + 1) * fine
+    amp[t > 540] = 1.0  # it stands
+    moving = ENDS < ZERO + 535_000_000_000
+    spans = STARTS[moving], ENDS[moving]
+    truth = energy_joule([record(t, amp, averaged=True)], *spans, rule="averaged")
+    means = amp.reshape(-1, 40).mean(axis=1) + rng.normal(0, white_amp, 3_000)
+    made = [record(t[39::40], means, averaged=True)]
+    error = energy_joule(made, *spans, rule="averaged") - truth
+    got = energy_noise_joule(made, *spans, averaged=True)
+    assert 0.8 < np.sqrt((got**2).mean()) / error.std() < 1.6
+
+
+def test_roughness_is_local():
+    rng = np.random.default_rng(4)
+    t = np.arange(0, 600, 0.05)
+    decay = np.exp(-0.05 / 0.15)
+    rough = lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 1, len(t)))
+    signal = samples(ZERO + np.round(t * 1e9).astype(np.int64), rough * np.where(t < 300, 0.2, 2.0))
+    everywhere, nowhere = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
+    found = roughness(signal, everywhere, nowhere, averaged=False)
+    got = local_scale(found, signal, everywhere, STARTS, ENDS)
+    early = (ENDS - ZERO) * 1e-9 < 290
+    late = (STARTS - ZERO) * 1e-9 > 310
+    whole = 0.5 * (0.2**2 + 2.0**2)
+    assert got[late].mean() * whole == pytest.approx(4.0, rel=0.1)
+    assert got[early].mean() * whole < 0.04 + 0.06 * whole  # the record as a whole is a prior of 4 samples
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+def test_what_scatters_while_standing_is_noise(averaged):
+    rng = np.random.default_rng(7)
+    fine, decay = 0.005, np.exp(-0.005 / 0.1)
+    amp = 6 + lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 0.5, 120_000))
+    amp[102_000:] = 0.5  # it stands for the last 90 s
+    t = (np.arange(120_000) + 1) * fine
+    taken = amp.reshape(-1, 10).mean(axis=1) if averaged else amp[9::10]
+    made = [record(t[9::10], taken + rng.normal(0, 0.2, 12_000), averaged=averaged)]
+    moving = ENDS < ZERO + 505_000_000_000
+    spans = STARTS[moving], ENDS[moving]
+    still_ns = ZERO + np.array([[510, 600]]) * 1_000_000_000
+    got = energy_noise(made, *spans, still_ns, averaged=averaged)
+    assert np.sqrt(got.current.mean()) == pytest.approx(24 * 0.2 * np.sqrt(1.2 * 0.05), rel=0.1)
+    truth = energy_joule([record(t, amp, averaged=averaged)], *spans, rule="averaged" if averaged else "exact")
+    error = energy_joule(made, *spans, rule="averaged" if averaged else "exact") - truth
+    assert np.sqrt((got.std_joule() ** 2).mean()) == pytest.approx(error.std(), rel=0.12)
+
+
+def test_what_a_faster_source_would_leave():
+    rng = np.random.default_rng(8)
+    fine, decay = 0.005, np.exp(-0.005 / 0.5)
+    amp = 6 + lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 1.0, 120_000))
+    t = np.arange(120_000) * fine
+    slow, fast = ([record(t[::step], amp[::step])] for step in (60, 10))
+    told = energy_noise(slow, STARTS, ENDS, NEVER_STILL, averaged=False, rate_hz=20.0).rate.mean()
+    truth = energy_joule([record(t, amp)], STARTS, ENDS, rule="exact")
+    error = energy_joule(fast, STARTS, ENDS, rule="exact") - truth
+    assert np.sqrt(told) == pytest.approx(error.std(), rel=0.25)

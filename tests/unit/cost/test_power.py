@@ -1,0 +1,71 @@
+"""Energies by hand: every rule, several rails, records that do not reach."""
+
+import numpy as np
+import pytest
+from made_tracks import stamps
+
+from tcpipe.cost.power import energy_joule, power_watt, rail, recorded_energy_joule, samples, samples_inside
+
+ZERO = stamps(1)[0]
+
+
+def seconds(*values):
+    return ZERO + np.round(np.array(values) * 1e9).astype(np.int64)
+
+
+def made_rail(t, volt, amp, *, averaged=False):
+    return rail("drive", samples(seconds(*t), np.array(volt)), samples(seconds(*t), np.array(amp)), averaged=averaged)
+
+
+def test_rules_differ_as_they_must():
+    # V rises 20 to 22, I falls 10 to 4, over 1 s: product at t is (20 + 2t)(10 - 6t) = 200 - 100 t - 12 t².
+    straight, steps = (made_rail((0, 1), (20.0, 22.0), (10.0, 4.0), averaged=a) for a in (False, True))
+    span = seconds(0.0), seconds(1.0)
+    assert energy_joule([straight], *span, rule="exact") == pytest.approx([200 - 50 - 4])
+    assert energy_joule([straight], *span, rule="right_endpoint") == pytest.approx([88])
+    assert energy_joule([steps], *span, rule="averaged") == pytest.approx([88])
+    half = seconds(0.0), seconds(0.5)
+    assert energy_joule([straight], *half, rule="exact") == pytest.approx([100 - 12.5 - 0.5])
+    assert energy_joule([straight], *half, rule="right_endpoint") == pytest.approx([44])
+
+
+def test_averaged_samples_hold_backwards():
+    # Means over the second before each stamp: 100 W until 1 s, 300 W until 2 s.
+    source = made_rail((0, 1, 2), (10.0, 10.0, 10.0), (0.0, 10.0, 30.0), averaged=True)
+    assert energy_joule([source], seconds(0.5), seconds(1.5), rule="averaged") == pytest.approx([50 + 150])
+
+
+def test_rails_add_up_and_regeneration_counts():
+    left, right = made_rail((0, 2), (24.0, 24.0), (5.0, 5.0)), made_rail((0, 2), (24.0, 24.0), (-1.0, -1.0))
+    assert energy_joule([left, right], seconds(0.5), seconds(1.5), rule="exact") == pytest.approx([96])
+    assert power_watt([left, right], seconds(1.0)) == pytest.approx([96])
+
+
+def test_energy_is_unknown_where_a_rail_is():
+    left, right = made_rail((0, 2), (24.0, 24.0), (5.0, 5.0)), made_rail((1, 2), (24.0, 24.0), (5.0, 5.0))
+    got = energy_joule([left, right], seconds(0.5, 1.0), seconds(1.5, 2.0), rule="exact")
+    assert np.isnan(got[0])
+    assert got[1] == pytest.approx(240)
+    assert recorded_energy_joule([left, right], seconds(0.5), seconds(1.5), rule="exact") == pytest.approx([120 + 60])
+    assert np.isnan(energy_joule([], seconds(0.5), seconds(1.5), rule="exact")).all()
+
+
+def test_a_rail_whose_signals_never_overlap_has_no_energy():
+    apart = rail("x", samples(seconds(0, 1), np.ones(2)), samples(seconds(2, 3), np.ones(2)), averaged=False)
+    assert len(apart.stamp_ns) == 0
+    assert np.isnan(energy_joule([apart], seconds(0.5), seconds(2.5), rule="exact")).all()
+    assert np.isnan(power_watt([apart], seconds(1.0))).all()
+
+
+def test_samples_are_sorted_finite_and_unique():
+    got = samples(seconds(2, 1, 1, 3), np.array([5.0, 1.0, 7.0, np.nan]))
+    assert got.stamp_ns.tolist() == seconds(1, 2).tolist()
+    assert got.value.tolist() == [7.0, 5.0]
+
+
+def test_samples_inside_are_counted_and_averaged():
+    source = made_rail((0, 1, 2, 3), (10.0,) * 4, (1.0, 2.0, 4.0, 8.0))
+    count, mean = samples_inside([source], seconds(0.0, 0.5, 1.2), seconds(2.0, 3.0, 1.8))
+    assert count.tolist() == [2, 3, 0]
+    assert mean[:2] == pytest.approx([30, 140 / 3])
+    assert np.isnan(mean[2])

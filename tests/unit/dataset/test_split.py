@@ -1,0 +1,267 @@
+import itertools
+import pickle
+
+import numpy as np
+import pytest
+from synthetic_store import box, region_file, small_store
+
+from tcpipe.dataset import batches as batches_module
+from tcpipe.dataset import open_dataset, pixels
+from tcpipe.errors import DatasetError
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.recipe import Recipe
+
+
+@pytest.fixture(scope="module")
+def directory(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("loader")
+    store = small_store(directory)
+    region = region_file(directory / "region.geojson", box(-20, -20, 5, 20))
+    for name in ("zarr", "parquet"):
+        build_dataset(directory / name, store=store.root, split=region, recipe=Recipe(), file_format=name)
+    return directory
+
+
+@pytest.fixture(params=["zarr", "parquet"])
+def path(directory, request):
+    return directory / request.param
+
+
+def test_patches_are_the_papers_tensor(path):
+    train = open_dataset(path)["train"]
+    assert train.patches.shape == (len(train), 40, 40, 3)
+    assert train.patches.dtype == np.float32
+    assert train.patches.min() >= 0.0
+    assert train.patches.max() <= 1.0
+    stored = train.layers(np.arange(5))
+    ortho, terrain, height = (train.patches[:5, ..., channel] for channel in range(3))
+    np.testing.assert_allclose(ortho, stored["ortho"] / 255, rtol=1e-6)
+    np.testing.assert_allclose(terrain, (stored["terrain"] - 1) / 6, rtol=1e-6)
+    np.testing.assert_allclose(height, np.minimum(stored["height"] * 0.0005, 1), rtol=1e-6)
+    assert (height.min(axis=(1, 2)) == 0).all()
+
+
+def test_labels_are_power_and_velocity(path):
+    test = open_dataset(path)["test"]
+    assert test.labels.dtype == np.float32
+    np.testing.assert_array_equal(test.labels[:, 0], test.samples["power_watt"].to_numpy().astype(np.float32))
+    np.testing.assert_array_equal(test.labels[:, 1], test.samples["velocity_mps"].to_numpy().astype(np.float32))
+
+
+def test_it_is_a_mapping_of_splits(path):
+    dataset = open_dataset(path)
+    assert list(dataset) == ["train", "test", "unseen", "buffer"]
+    assert sum(len(part) for part in dataset.values()) == dataset.card["samples"] == 448
+    with pytest.raises(KeyError, match="no split 'validation'"):
+        dataset["validation"]
+
+
+def test_one_sample_and_a_batch_are_rows_of_the_whole(path):
+    train = open_dataset(path)["train"]
+    patch, label = train[7]
+    patches, labels = train.batch([7, -1, 3])
+    whole = open_dataset(path)["train"].patches
+    np.testing.assert_array_equal(patch, whole[7])
+    np.testing.assert_array_equal(label, train.labels[7])
+    np.testing.assert_array_equal(patches, whole[[7, -1, 3]])
+    np.testing.assert_array_equal(labels, train.labels[[7, -1, 3]])
+    with pytest.raises(IndexError):
+        train[len(train)]
+
+
+def test_pieces_read_on_demand_are_the_same_as_all_in_memory(path, monkeypatch):
+    whole = open_dataset(path)["unseen"].patches
+    monkeypatch.setattr(pixels, "IN_MEMORY_BYTES", 0)
+    monkeypatch.setattr(pixels, "CACHED_PIECES", 1)
+    lazy = open_dataset(path)["unseen"]
+    order = np.random.default_rng(0).permutation(len(lazy))
+    np.testing.assert_array_equal(lazy.batch(order)[0], whole[order])
+    assert not lazy.view.stored._memory
+    assert len(lazy.view.stored._pieces) == 1
+
+
+def test_a_split_travels_to_a_worker_without_its_pixels(path):
+    train = open_dataset(path)["train"]
+    whole = train.patches
+    blob = pickle.dumps(train)
+    assert len(blob) < whole.nbytes / 20
+    np.testing.assert_array_equal(pickle.loads(blob)[3][0], whole[3])  # noqa: S301
+
+
+def test_torch_loads_shuffled_batches(path):
+    data = pytest.importorskip("torch.utils.data")
+    torch = pytest.importorskip("torch")
+    train = open_dataset(path)["train"]
+    loader = data.DataLoader(train, batch_size=64, shuffle=True, generator=torch.Generator().manual_seed(0))
+    batches = list(loader)
+    assert batches[0][0].shape == (64, 40, 40, 3)
+    assert batches[0][0].dtype == torch.float32
+    assert batches[0][1].shape == (64, 2)
+    seen = torch.cat([labels for _, labels in batches]).numpy()
+    np.testing.assert_array_equal(np.sort(seen[:, 0]), np.sort(train.labels[:, 0]))
+
+
+def test_opening_imports_no_trainer(path):
+    import subprocess
+    import sys
+
+    code = (
+        f"import sys, tcpipe.dataset as d; d.open_dataset({str(path)!r})['train'][0]; sys.exit('torch' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+@pytest.mark.parametrize("damage", ["none", "no card", "other card", "samples", "patches"])
+def test_what_cannot_be_read_is_said(path, tmp_path, damage):
+    import shutil
+
+    copy = tmp_path / "copy"
+    if damage != "none":
+        shutil.copytree(path, copy)
+    if damage == "no card":
+        (copy / "dataset.json").unlink()
+    elif damage == "other card":
+        (copy / "dataset.json").write_text('{"kind": "other"}')
+    elif damage == "samples":
+        (copy / "samples.parquet").write_bytes(b"PAR1 not really")
+    elif damage == "patches":
+        for part in ("patches.zarr", "data"):
+            shutil.rmtree(copy / part, ignore_errors=True)
+    with pytest.raises(DatasetError) as caught:
+        open_dataset(copy)["train"].batch([0])
+    assert len(caught.value.problems) == 1
+    assert str(copy) in caught.value.problems[0]
+
+
+def numbered(split):
+    """The split with the samples' numbers for labels."""
+    split._labels = np.column_stack([np.arange(len(split))] * 2).astype(np.float32)
+    return split
+
+
+def rebuilt(batches):
+    """Patches and labels of an epoch, in the order of the samples."""
+    patches, labels = (np.concatenate(parts) for parts in zip(*batches, strict=True))
+    order = np.argsort(labels[:, 0])
+    return patches[order], labels[order]
+
+
+@pytest.mark.parametrize("from_disk", [False, True])
+@pytest.mark.parametrize("shuffle", [False, True])
+def test_an_epoch_has_every_sample_once_in_full_batches(path, from_disk, shuffle, monkeypatch):
+    monkeypatch.setattr(batches_module, "_POOL_PIECES", 1)
+    train = numbered(open_dataset(path)["train"])
+    batches = train.batches(50, shuffle=shuffle, seed=3, from_disk=from_disk)
+    found = list(batches)
+    assert len(found) == len(batches) == 5
+    assert [len(labels) for _, labels in found] == [50, 50, 50, 50, 21]
+    patches, labels = rebuilt(found)
+    np.testing.assert_array_equal(labels, train.labels)
+    np.testing.assert_array_equal(patches, train.patches)
+    if not shuffle:
+        np.testing.assert_array_equal(np.concatenate([labels for _, labels in found]), train.labels)
+
+
+@pytest.mark.parametrize("from_disk", [False, True])
+def test_every_epoch_has_its_own_order_and_the_same_seed_the_same(path, from_disk):
+    def orders(seed):
+        batches = open_dataset(path)["train"].batches(64, shuffle=True, seed=seed, from_disk=from_disk, drop_last=True)
+        return [np.concatenate([labels for _, labels in batches]) for _ in range(2)]
+
+    first, second = orders(0)
+    assert len(first) == 192
+    assert not np.array_equal(first, second)
+    for mine, again in zip((first, second), orders(0), strict=True):
+        np.testing.assert_array_equal(mine, again)
+    assert not np.array_equal(first, orders(1)[0])
+
+
+def test_what_keras_wants_never_ends(path):
+    train = open_dataset(path)["train"]
+    batches = train.batches(100, shuffle=True, weights=True)
+    found = list(itertools.islice(batches.forever(), 2 * len(batches)))
+    assert [len(labels) for _, labels, _ in found] == [100, 100, 21] * 2
+    assert found[0][2].shape == (100, 2)
+
+
+def test_weights_are_inverse_variances(path):
+    train = open_dataset(path)["train"]
+    std = train.column("power_std_watt")
+    assert train.weights.mean() == pytest.approx(1)
+    np.testing.assert_allclose(train.weights[:, 0] * std**2, np.mean(train.weights[:, 0] * std**2), rtol=1e-5)
+
+
+def test_a_mirrored_patch_is_reversed_across_and_its_cross_slope_changes_sign(path):
+    train = numbered(open_dataset(path)["train"])
+    mirrored = 0
+    names = ("power_watt", "slope_rad", "cross_slope_rad")
+    for (patches, features), labels in train.batches(64, mirror=True, seed=1, features=names):
+        for patch, values, row in zip(patches, features, labels[:, 0].astype(int), strict=True):
+            expected = np.array([train.column(name)[row] for name in names], np.float32)
+            turned = values[2] == -expected[2]
+            mirrored += int(turned)
+            np.testing.assert_array_equal(patch, train.patches[row][::-1] if turned else train.patches[row])
+            np.testing.assert_array_equal(values, expected * np.where(turned, (1, 1, -1), 1))
+    assert 80 < mirrored < 141  # 110.5 ± 4 sigma
+
+
+def test_channels_are_chosen_and_classes_become_planes(path):
+    train = open_dataset(path)["train"]
+    chosen = train.with_channels("height", "terrain_one_hot")
+    assert chosen.patches.shape == (len(train), 40, 40, 8)
+    np.testing.assert_array_equal(chosen.patches[..., 0], train.patches[..., 2])
+    np.testing.assert_array_equal(chosen.patches[..., 1:].sum(axis=-1), 1)
+    np.testing.assert_array_equal(
+        chosen.patches[..., 1:].argmax(axis=-1) + 1, train.layers(np.arange(len(train)))["terrain"]
+    )
+    assert chosen.layers(np.arange(1)).keys() == {"height", "terrain"}
+    np.testing.assert_array_equal(train.with_channels("ortho").patches[..., 0], train.patches[..., 0])
+    np.testing.assert_array_equal(train.with_channels("terrain").patches[..., 0], train.patches[..., 1])
+    with pytest.raises(DatasetError, match="can give ortho, terrain, height, terrain_one_hot"):
+        train.with_channels("colour")
+
+
+def test_samples_are_left_out_by_quality_and_error(path):
+    train = open_dataset(path)["train"]
+    train._columns._read["quality"] = np.where(np.arange(len(train)) % 3 == 0, 2, 64)
+    train._columns._read["power_std_watt"] = np.arange(len(train)) / 10
+    assert len(train.clean(("near_gap",))) == 147
+    assert len(train.clean(("near_gap", "no_command"))) == 0
+    kept = train.clean(max_power_std_watt=5.0)
+    assert len(kept) == 51
+    np.testing.assert_array_equal(kept.labels, train.labels[:51])
+    np.testing.assert_array_equal(kept.patches, train.patches[:51])
+    assert kept.samples["sample_id"].to_pylist() == train.samples["sample_id"].to_pylist()[:51]
+    with pytest.raises(DatasetError, match="quality fast: wanted some of low_power_rate"):
+        train.clean(("fast",))
+
+
+def test_a_fold_and_the_rest_make_the_whole(path):
+    train = open_dataset(path)["train"]
+    held = [train.fold(number)[1] for number in range(5)]
+    assert sum(len(part) for part in held) == len(train)
+    for number in range(5):
+        rest, mine = train.fold(number)
+        assert len(rest) + len(mine) == len(train)
+        assert set(mine.samples["fold"].to_pylist()) <= {number}
+
+
+@pytest.mark.parametrize("from_disk", [False, True])
+@pytest.mark.parametrize("workers", [0, 2])
+def test_torch_iterates_over_every_sample_once(path, workers, from_disk):
+    data = pytest.importorskip("torch.utils.data")
+    torch = pytest.importorskip("torch")
+    train = open_dataset(path)["train"]
+    iterable = train.torch_iterable(32, shuffle=True, from_disk=from_disk)
+    loader = data.DataLoader(iterable, batch_size=None, num_workers=workers, generator=torch.Generator().manual_seed(0))
+    epochs = [torch.cat([labels for _, labels in loader]).numpy() for _ in range(2)]
+    for seen in epochs:
+        np.testing.assert_array_equal(seen[np.lexsort(seen.T)], train.labels[np.lexsort(train.labels.T)])
+    assert not np.array_equal(*epochs)
+
+
+def test_parts_share_nothing_and_leave_nothing_out(path):
+    batches = open_dataset(path)["train"].batches(32, from_disk=True)
+    parts = [[float(power) for _, labels in batches.part(number, 3) for power in labels[:, 0]] for number in range(3)]
+    whole = [float(power) for _, labels in batches for power in labels[:, 0]]
+    assert sorted(itertools.chain(*parts)) == sorted(whole)

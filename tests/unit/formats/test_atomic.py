@@ -1,0 +1,106 @@
+"""Outputs appear whole or not at all."""
+
+import errno
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import atomic_directory, atomic_file
+
+
+class _Cut(Exception):  # noqa: N818
+    pass
+
+
+def test_a_failed_file_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "f"
+    path.write_text("old")
+    with pytest.raises(_Cut), atomic_file(path) as temporary:  # noqa: PT012
+        temporary.write_text("half")
+        raise _Cut
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_failed_directory_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "d"
+    for content in ("first", "second"):
+        with atomic_directory(path) as temporary:
+            (temporary / "f").write_text(content)
+            (temporary / content).touch()
+    with pytest.raises(_Cut), atomic_directory(path) as temporary:  # noqa: PT012
+        (temporary / "f").write_text("half")
+        raise _Cut
+    assert (path / "f").read_text() == "second"
+    assert sorted(p.name for p in path.iterdir()) == ["f", "second"]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_process_left_goes_when_its_place_is_written_again(tmp_path: Path) -> None:
+    program = (
+        "import os, signal, sys; from pathlib import Path; from tcpipe.formats.atomic import atomic_directory, atomic_file\n"
+        "with atomic_directory(Path(sys.argv[1]) / 'd') as d, atomic_file(Path(sys.argv[1]) / 'f') as f:\n"
+        "    (d / 'half').touch(); f.write_text('half'); os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", program, tmp_path], check=False)
+    assert len(list(tmp_path.iterdir())) == 2
+    with atomic_directory(tmp_path / "d"), atomic_file(tmp_path / "f"):
+        pass
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["d", "f"]
+
+
+def test_what_another_process_is_writing_stays(tmp_path: Path) -> None:
+    with atomic_directory(tmp_path / "d") as slow:
+        (slow / "slow").touch()
+        shutil.rmtree(slow)  # as zarr does with a directory that it is given
+        slow.mkdir()
+        (slow / "slow").touch()
+        with atomic_directory(tmp_path / "d") as fast:
+            (fast / "fast").touch()
+        assert slow.is_dir()
+    assert [p.name for p in (tmp_path / "d").iterdir()] == ["slow"]
+    assert [p.name for p in tmp_path.iterdir()] == ["d"]
+
+
+@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+def test_a_place_that_cannot_be_is_told_by_its_own_name(tmp_path: Path, write: Callable[..., Any]) -> None:
+    (tmp_path / "file").touch()
+    path = tmp_path / "file" / "below" / "it"
+    with (
+        pytest.raises(StoreError, match=f"^{re.escape(str(path))}: cannot be written .*/file is a file, wanted"),
+        write(path),
+    ):
+        pass
+
+
+@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+def test_a_full_disk_is_told_by_the_place_and_new_directories_go(tmp_path: Path, write: Callable[..., Any]) -> None:
+    path = tmp_path / "new" / "er" / "it"
+    full = OSError(errno.ENOSPC, "Error writing bytes to file")  # as pyarrow says it
+    with (
+        pytest.raises(StoreError, match=f"^{re.escape(str(path))}: cannot be written .No space left on device.$"),
+        write(path),
+    ):
+        raise full
+    assert not any(tmp_path.iterdir())
+
+
+def test_an_unreadable_source_is_not_told_as_an_unwritable_place(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "f"):
+        (tmp_path / "source").read_text()
+
+
+def test_a_link_to_a_directory_stays_a_link(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with atomic_directory(tmp_path / "link") as directory:
+        (directory / "f").touch()
+    assert (tmp_path / "link").is_symlink()
+    assert [p.name for p in (tmp_path / "real").iterdir()] == ["f"]

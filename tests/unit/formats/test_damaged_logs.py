@@ -1,0 +1,245 @@
+"""Generated logs, broken in known places: what is intact before and after comes back, the rest is counted."""
+
+import struct
+
+import pytest
+from mcap.writer import CompressionType, IndexType
+from random_messages import (
+    ROS1,
+    assert_same,
+    expected_columns,
+    random_messages,
+    write_bag,
+    write_mcap,
+    write_rosbag2,
+)
+from rosbags.rosbag1 import Writer as BagWriter
+
+from tcpipe.formats.bag_log import BagPart, _borne_out, _joined
+from tcpipe.formats.log_file import open_log
+from tcpipe.formats.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
+
+TYPES = ("sensor_msgs/msg/Imu", "std_msgs/msg/ColorRGBA")
+COMPRESSIONS = (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE)
+
+
+def chunks_of(path):
+    """Byte range of every chunk of an intact .mcap."""
+    data = path.read_bytes()
+    offsets = record_offsets(data[8:]) + 8
+    lengths = [struct.unpack_from("<Q", data, offset + 1)[0] for offset in offsets.tolist()]
+    return [
+        (offset, offset + RECORD_HEAD + length)
+        for offset, length in zip(offsets.tolist(), lengths, strict=True)
+        if data[offset] == OP_CHUNK
+    ]
+
+
+def flip(path, offset, bits=0x10):
+    data = bytearray(path.read_bytes())
+    data[offset] ^= bits
+    path.write_bytes(data)
+
+
+def read(path):
+    with open_log(path) as log:
+        tables = log.tables(log.topics)
+        return tables, log.damage
+
+
+def stamps(tables, topic):
+    return tables[topic]["log_time_ns"].to_pylist()
+
+
+def without(messages, lost):
+    return [message for message in messages if message.log_time_ns not in lost]
+
+
+@pytest.fixture
+def messages():
+    return random_messages(1, count=200, types=TYPES)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_flipped_bit_costs_its_chunk_and_no_more(tmp_path, messages, compression):
+    path = write_mcap(tmp_path / "run.mcap", messages, compression=compression)
+    clean, _ = read(path)
+    start, end = chunks_of(path)[2]
+    flip(path, (start + end) // 2 + 30)
+    tables, damage = read(path)
+    assert len(damage) == 1
+    finding = damage[0]
+    kept = [m for m in messages if not finding.start_ns <= m.log_time_ns <= finding.end_ns]
+    assert finding.messages_lost == len(messages) - len(kept) > 0
+    assert finding.where == f"run.mcap, byte {start}"
+    for topic in clean:
+        assert_same(tables[topic], expected_columns(kept, topic))
+
+
+def test_a_flip_in_a_message_index_costs_nothing(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    clean, _ = read(path)
+    flip(path, chunks_of(path)[1][1] + RECORD_HEAD + 6 + 8)  # the first offset of the first index behind the chunk
+    tables, damage = read(path)
+    assert damage == []
+    assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
+
+
+def test_a_flip_in_the_summary_costs_nothing_and_is_said(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    clean, _ = read(path)
+    flip(path, path.stat().st_size - 200)
+    tables, damage = read(path)
+    assert ["summary's CRC" in finding.what for finding in damage] == [True]
+    assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("what", ["opcode", "length"])
+def test_a_destroyed_chunk_head_without_summary_costs_its_chunk(tmp_path, messages, compression, what):
+    path = write_mcap(tmp_path / "run.mcap", messages, compression=compression)
+    chunks = chunks_of(path)
+    start, _ = chunks[2]
+    path.write_bytes(path.read_bytes()[: chunks[-1][1]])  # no summary
+    clean, _ = read(path)
+    flip(path, start + (0 if what == "opcode" else 3), 0x40)
+    tables, damage = read(path)
+    lost = set(stamps(clean, "/Imu")) - set(stamps(tables, "/Imu"))
+    chunk_messages = len(stamps(clean, "/Imu")) // len(chunks)
+    assert 0 < len(lost) < 2.5 * chunk_messages
+    assert max(stamps(tables, "/Imu")) == max(stamps(clean, "/Imu"))
+    assert any(finding.bytes_lost for finding in damage)
+    assert_same(tables["/Imu"], expected_columns(without(messages, lost), "/Imu"))
+
+
+@pytest.mark.parametrize("options", [{}, {"index_types": IndexType.CHUNK}, {"use_chunking": False}])
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+def test_a_cut_mcap_gives_everything_before_the_cut(tmp_path, messages, options, share):
+    path = write_mcap(tmp_path / "run.mcap", messages, compression=CompressionType.NONE, **options)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    tables, damage = read(path)
+    found = sorted(stamp for topic in tables for stamp in stamps(tables, topic))
+    assert found == [message.log_time_ns for message in messages[: len(found)]]
+    assert len(found) >= int(len(messages) * share * 0.9) - 12
+    assert damage
+    for topic in tables:
+        assert_same(tables[topic], expected_columns(messages[: len(found)], topic))
+
+
+@pytest.mark.parametrize("compression", [None, BagWriter.CompressionFormat.BZ2, BagWriter.CompressionFormat.LZ4])
+def test_a_cut_bag_gives_every_whole_chunk(tmp_path, compression):
+    messages = random_messages(2, count=4000, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, compression)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * 0.8)])
+    tables, damage = read(path)
+    found = {topic: stamps(tables, topic) for topic in tables}
+    for topic, log_times in found.items():
+        assert log_times == [m.log_time_ns for m in messages if m.topic == topic][: len(log_times)]
+        assert len(log_times) > 1000
+    assert any("the file is cut" in finding.what for finding in damage)
+
+
+def test_a_bag_with_a_destroyed_chunk_head_goes_on_behind_it(tmp_path):
+    messages = random_messages(3, count=6000, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, BagWriter.CompressionFormat.LZ4)
+    clean, _ = read(path)
+    data = bytearray(path.read_bytes())
+    first = data.find(b"op=\x05")
+    second = data.find(b"op=\x05", first + 4)
+    index_at = data.find(b"index_pos=") + 10
+    data[index_at : index_at + 8] = bytes(8)  # as a recorder that died leaves it
+    data[second] = 0
+    path.write_bytes(data)
+    tables, damage = read(path)
+    assert 0 < len(stamps(tables, "/Imu")) < len(stamps(clean, "/Imu"))
+    assert stamps(tables, "/Imu")[-1] == stamps(clean, "/Imu")[-1]
+    assert any(finding.bytes_lost for finding in damage)
+
+
+def test_a_cut_db3_gives_the_rows_before_the_cut(tmp_path):
+    messages = random_messages(4, count=400, types=("sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"))
+    bag = write_rosbag2(tmp_path / "run", messages)
+    path = next(bag.glob("*.db3"))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * 0.6)])
+    tables, damage = read(bag)
+    found = sum(table.num_rows for table in tables.values())
+    assert 0.5 * len(messages) < found < 0.7 * len(messages)
+    assert len(messages) - found in [finding.messages_lost for finding in damage]
+    for topic in tables:
+        assert_same(tables[topic], expected_columns(messages[:found], topic))
+
+
+def test_a_db3_with_a_zeroed_page_gives_the_rows_on_both_sides(tmp_path):
+    messages = random_messages(5, count=600, types=("sensor_msgs/msg/Imu",))
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    data = bytearray(path.read_bytes())
+    leaves = [at for at in range(0, len(data), 4096) if data[at] == 0x0D]
+    middle = leaves[len(leaves) // 2]
+    data[middle : middle + 4096] = bytes(4096)
+    path.write_bytes(data)
+    tables, damage = read(path)
+    found = stamps(tables, "/Imu")
+    assert len(messages) - 20 < len(found) < len(messages)
+    assert found[0] == messages[0].log_time_ns
+    assert found[-1] == messages[-1].log_time_ns
+    assert any("cannot be read" in finding.what for finding in damage)
+
+
+def test_a_chunk_that_claims_to_be_huge_is_refused(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    chunks = chunks_of(path)
+    data = bytearray(path.read_bytes()[: chunks[-1][1]])
+    struct.pack_into("<Q", data, chunks[1][0] + RECORD_HEAD + 16, 1 << 60)
+    path.write_bytes(data)
+    tables, damage = read(path)
+    assert tables["/Imu"].num_rows > 0
+    assert any(f"{1 << 60} bytes" in finding.what for finding in damage)
+
+
+def test_lengths_past_the_end_and_endless_sequences_are_counted(tmp_path):
+    messages = random_messages(6, count=12, types=("sensor_msgs/msg/JointState",))
+    evil = []
+    for index, message in enumerate(messages):
+        payload = bytearray(message.payload)
+        if index % 3 == 0:
+            struct.pack_into("<I", payload, 12, 0xFFFFFFFF)  # length of header.frame_id
+        evil.append(type(message)(message.topic, message.type_name, message.log_time_ns, bytes(payload), message.value))
+    tables, damage = read(write_mcap(tmp_path / "run.mcap", evil))
+    kept = [message for index, message in enumerate(messages) if index % 3]
+    assert_same(tables["/JointState"], expected_columns(kept, "/JointState"))
+    assert sum(finding.messages_lost for finding in damage) == 4
+
+
+def test_broken_first_bytes_cost_nothing(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    flip(path, 3)
+    tables, damage = read(path)
+    assert_same(tables["/Imu"], expected_columns(messages, "/Imu"))
+    assert ["first bytes" in finding.what for finding in damage] == [True]
+
+
+def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
+    messages = random_messages(7, count=10, types=("std_msgs/msg/String",))
+    payload = b"\x00\x01\x00\x00\x03\x00\x00\x00a\xff\x00"
+    odd = [type(m)(m.topic, m.type_name, m.log_time_ns, payload, m.value) for m in messages]
+    tables, damage = read(write_mcap(tmp_path / "run.mcap", odd))
+    assert tables["/String"]["data"].to_pylist() == ["a\ufffd"] * 10
+    assert [(finding.topic, finding.messages_lost) for finding in damage] == [("/String", 0)]
+
+
+def test_the_index_of_an_intact_bag_is_used(tmp_path):
+    messages = random_messages(8, count=50, types=TYPES, store=ROS1)
+    part = BagPart(write_bag(tmp_path / "run.bag", messages), "run.bag")
+    chunk = part._chunks[0]
+    record = part._record(chunk.offset)
+    data = part._load(chunk, record)
+    connections, offsets, stamps_ns = _joined(part._index_of(chunk, record))
+    assert len(offsets) == len(messages)
+    assert _borne_out(data, connections, offsets, stamps_ns)
+    assert not _borne_out(data, connections, offsets, stamps_ns + 1)
+    assert not _borne_out(data, connections, offsets + 1, stamps_ns)
+    assert not _borne_out(data, 1 - connections, offsets, stamps_ns)
+    part.close()

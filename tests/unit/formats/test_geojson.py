@@ -1,0 +1,123 @@
+import json
+
+import pytest
+import shapely
+
+from tcpipe.errors import RegionError
+from tcpipe.formats.geojson import read_regions
+
+SQUARE = [[15.0, 47.0], [15.001, 47.0], [15.001, 47.001], [15.0, 47.001], [15.0, 47.0]]
+BESIDE = [[round(lon + 0.001, 7), lat] for lon, lat in SQUARE]
+OVER = [[round(lon + 0.0005, 7), lat] for lon, lat in SQUARE]
+
+
+def polygon(*rings):
+    return {"type": "Polygon", "coordinates": list(rings)}
+
+
+def feature(geometry, **properties):
+    return {"type": "Feature", "properties": properties or None, "geometry": geometry}
+
+
+def collection(*features):
+    return {"type": "FeatureCollection", "features": list(features)}
+
+
+def read(tmp_path, document):
+    path = tmp_path / "region.geojson"
+    path.write_text(document if isinstance(document, str) else json.dumps(document))
+    return read_regions(path)
+
+
+@pytest.mark.parametrize(
+    "document",
+    [
+        polygon(SQUARE),
+        feature(polygon(SQUARE)),
+        collection(feature(polygon(SQUARE))),
+        {"type": "MultiPolygon", "coordinates": [[SQUARE]]},
+        {"type": "GeometryCollection", "geometries": [polygon(SQUARE)]},
+        collection(feature(polygon(SQUARE), name="site", fill="#f00", split=None)),
+        polygon([[*position, 412.5] for position in SQUARE]),
+        {"crs": {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}, **polygon(SQUARE)},
+    ],
+)
+def test_every_way_to_write_one_polygon_is_inside(tmp_path, document):
+    regions = read(tmp_path, document)
+    assert shapely.equals(regions.train_test, shapely.box(15, 47, 15.001, 47.001))
+    assert regions.unseen.is_empty
+    assert regions.exclude.is_empty
+
+
+def test_inside_is_the_union(tmp_path):
+    regions = read(tmp_path, collection(feature(polygon(SQUARE)), feature(polygon(OVER))))
+    assert shapely.equals(regions.train_test, shapely.box(15, 47, 15.0015, 47.001))
+
+
+def test_the_property_split_rules(tmp_path):
+    document = collection(
+        feature(polygon(SQUARE), split="train_test"),
+        feature(polygon(BESIDE), split="unseen"),
+        feature(polygon(OVER), split="exclude"),
+    )
+    regions = read(tmp_path, document)
+    assert shapely.equals(regions.unseen, shapely.box(15.001, 47, 15.002, 47.001))
+    assert shapely.equals(regions.exclude, shapely.box(15.0005, 47, 15.0015, 47.001))
+
+
+def test_a_hole_stays_a_hole(tmp_path):
+    hole = [[15.0004, 47.0004], [15.0004, 47.0006], [15.0006, 47.0006], [15.0006, 47.0004], [15.0004, 47.0004]]
+    assert not read(tmp_path, polygon(SQUARE, hole)).train_test.contains(shapely.Point(15.0005, 47.0005))
+
+
+@pytest.mark.parametrize(
+    ("document", "says"),
+    [
+        ("{not json", "not GeoJSON: not JSON"),
+        ("[1, 2]", "wanted an object with a 'type'"),
+        ('{"type": "Topology"}', "type 'Topology', wanted FeatureCollection"),
+        (collection(), "no polygon in it"),
+        (collection(feature({"type": "Point", "coordinates": [15, 47]})), "'Point', wanted Polygon"),
+        (collection(feature(None)), "its geometry is empty"),
+        (polygon(), "its geometry is empty"),
+        ({"type": "MultiPolygon", "coordinates": []}, "its geometry is empty"),
+        (polygon([[15, 47], [15.001, 47], [15, 47]]), "a ring of 3 positions is not closed"),
+        (polygon(SQUARE[:-1]), "not closed"),
+        (polygon([SQUARE[0], SQUARE[2], SQUARE[1], SQUARE[3], SQUARE[0]]), "Self-intersection"),
+        (polygon([SQUARE[0], SQUARE[1], SQUARE[2], SQUARE[1], SQUARE[0]]), "not a sound polygon"),
+        (polygon([["a", "b"]] * 4), "not rings of [lon, lat]"),
+        (polygon([[533000, 5212000], [533100, 5212000], [533100, 5212100], [533000, 5212000]]), "they look projected"),
+        (polygon([[-33.9, 151.2], [-33.9, 151.3], [-33.8, 151.3], [-33.9, 151.2]]), "axes look swapped"),
+        (collection(feature(polygon(SQUARE), split="validation")), "split is 'validation', wanted one of train_test"),
+        (collection(feature(polygon(SQUARE), split="unseen")), "nothing could train"),
+        ({"crs": {"properties": {"name": "urn:ogc:def:crs:EPSG::32633"}}, **polygon(SQUARE)}, "export it again"),
+        (polygon([[15, float("nan")], *SQUARE[1:-1], [15, float("nan")]]), "finite"),
+    ],
+)
+def test_a_region_that_cannot_be_used_is_one_plain_line(tmp_path, document, says):
+    with pytest.raises(RegionError) as caught:
+        read(tmp_path, document)
+    assert len(caught.value.problems) == 1
+    assert says in caught.value.problems[0]
+    assert "region.geojson" in caught.value.problems[0]
+
+
+def test_regions_that_disagree_are_refused_where_they_overlap(tmp_path):
+    document = collection(feature(polygon(SQUARE)), feature(polygon(OVER), split="unseen"))
+    with pytest.raises(RegionError, match=r"overlap by 4\.\d+e\+03 m²"):  # 38 m by 111 m
+        read(tmp_path, document)
+
+
+def test_regions_that_share_a_border_agree(tmp_path):
+    read(tmp_path, collection(feature(polygon(SQUARE)), feature(polygon(BESIDE), split="unseen")))
+
+
+def test_all_problems_come_at_once(tmp_path):
+    with pytest.raises(RegionError) as caught:
+        read(tmp_path, collection(feature(None), feature(polygon(SQUARE), split="val")))
+    assert [problem.split(": ")[1] for problem in caught.value.problems] == ["feature 0", "feature 1"]
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(RegionError, match="No such file"):
+        read_regions(tmp_path / "nowhere.geojson")

@@ -1,0 +1,123 @@
+"""The error-state unscented filter and smoother written out in plain numpy and scipy, for comparison with the kernel."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from tcpipe.fusion import error_state_kernel as kernel
+
+N = 17
+
+
+def plus(x, d):
+    y = x.copy()
+    y[:9] = (x[:9].reshape(3, 3) @ Rotation.from_rotvec(d[:3]).as_matrix()).ravel()
+    y[9:] = x[9:] + d[3:]
+    return y
+
+
+def minus(y, x):
+    turn = Rotation.from_matrix(x[:9].reshape(3, 3).T @ y[:9].reshape(3, 3)).as_rotvec()
+    return np.concatenate((turn, y[9:] - x[9:]))
+
+
+def move(x, w, a, dt, mode, decay):  # noqa: PLR0917
+    R, v = x[:9].reshape(3, 3), x[15:18]
+    w = w - (x[9:12] if mode >= kernel.GYRO_TURN else 0)
+    half = Rotation.from_rotvec(w * dt / 2).as_matrix()
+    later = R @ Rotation.from_rotvec(w * dt).as_matrix()
+    fall = np.array([0, 0, kernel.GRAVITY_MPS2])
+    faster = v + dt * (R @ half @ (a - x[12:15]) - fall) if mode == kernel.INERTIAL else later @ R.T @ v
+    y = x.copy()
+    y[:9], y[15:18], y[18:21] = later.ravel(), faster, x[18:21] + dt / 2 * (v + faster)
+    y[21] *= 1 - dt * decay
+    return y
+
+
+def expect(kind, x, w, lever):
+    R = x[:9].reshape(3, 3)
+    body = R.T @ x[15:18] + np.cross(w - x[9:12], lever)
+    return {
+        kernel.GNSS_POSITION: x[18:21] + R @ lever,
+        kernel.WHEEL_VELOCITY: body * [1 + x[21], 1, 1],
+        kernel.VISUAL_VELOCITY: body * (1 + x[22]),
+        kernel.STANDING: x[15:18],
+        kernel.STANDING_RATE: x[9:12],
+        kernel.SIDEWAYS: np.array([body[1], body[2], 0]),
+        kernel.LEVEL: np.array([R[2, 0], R[2, 1], 0]),
+    }[kind]
+
+
+def sigma(P):
+    root = np.sqrt(N) * np.linalg.cholesky(P)
+    mean_weight = np.concatenate(([0.0], np.full(2 * N, 0.5 / N)))
+    return np.vstack((np.zeros(N), root.T, -root.T)), mean_weight, np.concatenate(([2.0], mean_weight[1:]))
+
+
+def predict(x, P, q, dt, w, a, mode):  # noqa: PLR0917
+    """Return x⁻, P⁻ and the cross covariance."""
+    d, wm, wc = sigma(P)
+    centre = move(x, w, a, dt, mode, q[N])
+    D = np.array([minus(move(plus(x, e), w, a, dt, mode, q[N]), centre) for e in d])
+    mean = wm @ D
+    return plus(centre, mean), (D - mean).T * wc @ (D - mean) + np.diag(q[:N] * dt), d.T * wc @ (D - mean)
+
+
+def update(kind, x, P, z, r, w, lever):  # noqa: PLR0917
+    """Return x, P and the innovation's squared length."""
+    d, wm, wc = sigma(P)
+    Z = np.array([expect(kind, plus(x, e), w, lever) for e in d])
+    mean = wm @ Z
+    S = (Z - mean).T * wc @ (Z - mean) + np.diag(r)
+    cross = d.T * wc @ (Z - mean)
+    K = cross @ np.linalg.inv(S)
+    y = z - mean
+    J = reset(K @ y)
+    return plus(x, K @ y), J @ (P - K @ S @ K.T) @ J.T, y @ np.linalg.inv(S) @ y
+
+
+def reset(correction):
+    """Return what an error becomes in the axes that a correction has turned: d log(exp(-t) exp(t + e)) / d e, by differences."""
+    J, step = np.eye(N), 1e-5
+    centre = Rotation.from_rotvec(correction[:3])
+    for k in range(3):
+        ahead, behind = (Rotation.from_rotvec(correction[:3] + s * step * np.eye(3)[k]) for s in (1, -1))
+        J[:3, k] = ((centre.inv() * ahead).as_rotvec() - (centre.inv() * behind).as_rotvec()) / (2 * step)
+    return J
+
+
+def filter_and_smooth(timeline, densities, levers, x, P):
+    """Return filtered and smoothed states and covariances at every event of a timeline without refusals, and the smoother's gains."""
+    before, after, resets = [], [], []
+    for e in range(timeline.stamp_ns.size):
+        C = P
+        if timeline.dt_s[e] > 0:
+            mode = timeline.mode[e]
+            x, P, C = predict(
+                x, P, densities[mode], timeline.dt_s[e], timeline.turn_rate_radps[e], timeline.force_mps2[e], mode
+            )
+        before.append((x, P, C))
+        x_before = x
+        kind = int(timeline.kind[e])
+        if kind != kernel.PREDICT:
+            now = timeline.turn_rate_now_radps[e]
+            x, P, _ = update(kind, x, P, timeline.value[e], timeline.variance[e], now, levers[kind])
+        after.append((x, P))
+        resets.append(reset(minus(x, x_before)))
+    smoothed, gains = [after[-1]], []
+    for e in range(len(after) - 2, -1, -1):
+        x_minus, P_minus, C = before[e + 1]
+        G = C @ np.linalg.inv(P_minus)
+        x_s, P_s = smoothed[0]
+        back = np.linalg.inv(resets[e + 1])  # into the axes before the update
+        gains.insert(0, G @ back)
+        P_s = back @ P_s @ back.T
+        smoothed.insert(0, (plus(after[e][0], G @ minus(x_s, x_minus)), after[e][1] + G @ (P_s - P_minus) @ G.T))
+    return after, smoothed, gains
+
+
+def displacement_variance(smoothed, gains, first, last):
+    """Return the variance of the horizontal displacement between two events, along it."""
+    link = np.linalg.multi_dot([*gains[first:last], smoothed[last][1]])[12:14, 12:14]
+    joint = smoothed[first][1][12:14, 12:14] + smoothed[last][1][12:14, 12:14] - link - link.T
+    along = smoothed[last][0][18:20] - smoothed[first][0][18:20]
+    return along @ joint @ along / (along @ along)

@@ -1,0 +1,190 @@
+"""The estimator against the truth of a simulated drive over hills, with every sensor fault on."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from unit.fusion import drive
+
+from tcpipe.errors import FusionError
+from tcpipe.fusion.error_state import run_error_state
+from tcpipe.fusion.initial import find_initial_state
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
+from tcpipe.fusion.standing import standing_intervals
+
+PERIOD_NS = 50_000_000
+
+
+@cache
+def truth():
+    return drive.make_drive(150.0)
+
+
+def fuse(measurements, **options):
+    motion = [s for s in (measurements.gnss, measurements.wheels, measurements.visual) if s is not None]
+    start, end = int(min(s.stamp_ns[0] for s in motion)), int(max(s.stamp_ns[-1] for s in motion))
+    initial = find_initial_state(measurements, standing_intervals(measurements), start)
+    output = np.arange(-(-start // PERIOD_NS) * PERIOD_NS, end, PERIOD_NS, dtype=np.int64)
+    return run_error_state(measurements, initial, output_ns=output, **options)
+
+
+@cache
+def smoothed(**faults):
+    return fuse(drive.measure(truth(), 1, **faults))
+
+
+def test_figures_with_every_fault_on():
+    found = drive.errors(truth(), smoothed())
+    assert found["xy"] <= 0.006
+    assert found["z"] <= 0.006
+    assert found["forward"] <= 0.004
+    assert found["yaw_deg"] <= 0.15
+    assert found["max_xy"] <= 0.03
+    assert found["yaw_rate"] <= 0.005
+
+
+def test_the_smoother_beats_the_filter_and_both_are_honest():
+    forward = drive.errors(truth(), fuse(drive.measure(truth(), 1), smooth=False), after_s=10.0)
+    both = drive.errors(truth(), smoothed(), after_s=10.0)
+    assert both["forward"] <= 0.6 * forward["forward"]
+    assert both["xy"] <= 0.7 * forward["xy"]
+    for found in (forward, both):
+        assert 0.5 <= found["nees_position"] <= 1.6
+        assert 0.1 <= found["nees_yaw"] <= 2.0
+        assert 0.25 <= found["nees_forward"] <= 1.6
+
+
+@pytest.mark.parametrize("faults", [{}, {"gnss_std": 0.05}, {"visual": False}], ids=str)
+def test_the_error_of_a_displacement_is_as_large_as_it_says(faults):
+    found = smoothed(**faults)
+    t = (found.stamp_ns - drive.ZERO_NS) * 1e-9
+    error = (found.position_enu_m - truth().at(truth().position, t))[:, :2]
+    for column, lag in enumerate((10, 20, 40)):
+        way = found.position_enu_m[lag:, :2] - found.position_enu_m[:-lag, :2]
+        length = np.linalg.norm(way, axis=1)
+        moving = length > 0.3
+        along = (np.sum((error[lag:] - error[:-lag]) * way, axis=1) / length)[moving]
+        std = found.displacement_std_m[:-lag, column][moving]
+        assert 0.55 < np.mean(np.abs(along) < std) < 0.95
+        assert np.mean(np.abs(along) < 2 * std) > 0.88
+
+
+def test_facts_name_what_the_sensors_were():
+    facts = smoothed().facts
+    assert facts["gyro_bias_radps"] == pytest.approx([0.006, -0.004, 0.008], abs=1e-3)
+    assert facts["visual_scale"] == pytest.approx(1.02, abs=0.01)
+    assert set(facts["nis_mean"]) == {GNSS, WHEELS, VISUAL}
+    assert all(0.7 < facts["nis_mean"][role] < 1.3 for role in (GNSS, VISUAL))
+    assert 0.05 < facts["nis_mean"][WHEELS] < 1.0  # slip lasts: their variance is taken five times
+    assert facts["covariance_repairs"] == 0
+
+
+def test_outliers_are_refused_and_listed():
+    found = smoothed()
+    role = found.rejections.role
+    assert found.facts["rejected"] == {r: int((role == r).sum()) for r in (GNSS, WHEELS, VISUAL)}
+    # 2 % of the fixes were thrown 1.5 m away in each axis; a few of them land near enough to pass.
+    assert 15 <= found.facts["rejected"][GNSS] <= 50
+    assert (np.diff(found.rejections.stamp_ns) >= 0).all()
+    assert (found.rejections.normalized_innovation_squared > found.rejections.threshold).all()
+    assert found.rejections.threshold[role == GNSS] == pytest.approx(16.266, abs=1e-3)
+    assert found.rejections.threshold[role == WHEELS] == pytest.approx(10.828, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("faults", "xy_m", "forward_mps", "yaw_deg"),
+    [
+        ({"visual": False}, 0.01, 0.01, 0.4),
+        ({"wheels": False}, 0.01, 0.01, 0.3),
+        ({"wheels": False, "visual": False}, 0.01, 0.01, 0.5),
+        ({"imu": False}, 0.10, 0.05, 6.0),
+        ({"imu": False, "visual": False}, 0.15, 0.05, 6.0),
+        ({"gnss_std": 1.0, "gnss_hz": 1.0}, 0.6, 0.01, 0.5),
+        ({"imu_hz": 20.0}, 0.01, 0.01, 0.4),
+    ],
+    ids=["no visual", "no wheels", "gnss and imu", "no imu", "gnss and wheels", "sbas", "slow imu"],
+)
+def test_any_sensor_may_be_missing_or_weak(faults, xy_m, forward_mps, yaw_deg):
+    found = drive.errors(truth(), smoothed(**faults))
+    assert found["xy"] <= xy_m
+    assert found["forward"] <= forward_mps
+    assert found["yaw_deg"] <= yaw_deg
+    assert found["nees_position"] <= 3.5
+    assert found["nees_yaw"] <= 2.0
+
+
+def test_an_outage_of_a_minute_shows_in_the_deviations():
+    outage = smoothed(gnss_outages=((50.0, 110.0),))
+    found = drive.errors(truth(), outage)
+    assert found["xy"] <= 0.10
+    assert 0.3 <= found["nees_position"] <= 2.5
+    t = (outage.stamp_ns - drive.ZERO_NS) * 1e-9
+    inside, outside = outage.position_std_m[(t > 70) & (t < 90), 0], outage.position_std_m[(t > 20) & (t < 45), 0]
+    assert np.median(inside) > 4 * np.median(outside)
+
+
+def test_a_multipath_jump_of_ten_seconds_leaves_no_trace():
+    jumped = smoothed(gnss_jump=(70.0, 80.0, (3.0, -2.0, 1.0)))
+    assert drive.errors(truth(), jumped)["max_xy"] <= 0.05
+    assert jumped.facts["reopened"][GNSS] == 0
+
+
+def test_a_jump_that_stays_is_followed_in_the_end():
+    jumped = smoothed(gnss_jump=(70.0, 1e9, (3.0, 0.0, 0.0)))
+    assert jumped.facts["reopened"][GNSS] == 1
+    t = (jumped.stamp_ns - drive.ZERO_NS) * 1e-9
+    late = t > 100
+    shift = jumped.position_enu_m[late] - truth().at(truth().position, t[late])
+    assert np.abs(shift - [3.0, 0.0, 0.0]).max() < 0.05
+
+
+def test_without_gnss_the_track_starts_at_the_origin_and_keeps_its_shape():
+    found = smoothed(gnss=False)
+    assert np.linalg.norm(found.position_enu_m[0]) < 0.01
+    assert abs(found.quat_xyzw[0, 2]) < 0.02
+    assert drive.errors(truth(), found)["forward"] <= 0.02
+    # Nothing tells how long a metre of odometry is, and the deviations say so.
+    moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
+    assert found.forward_velocity_std_mps[moving].min() > 0.025
+    assert np.nanmin(found.displacement_std_m[moving, 1][:-20]) > 0.025
+    t = (found.stamp_ns - drive.ZERO_NS) * 1e-9
+    true = truth().at(truth().position, t)
+    # Laid over the truth by the best rotation and shift, the path differs by little.
+    a, b = (
+        complex(1, 0) * p[:, 0] + 1j * p[:, 1]
+        for p in (found.position_enu_m - found.position_enu_m.mean(0), true - true.mean(0))
+    )
+    turned = a * np.exp(1j * np.angle(np.vdot(a, b)))
+    assert np.sqrt(np.mean(np.abs(turned - b) ** 2)) < 0.5
+
+
+def test_the_same_input_gives_the_same_bytes():
+    again = fuse(drive.measure(truth(), 1))
+    assert again.position_enu_m.tobytes() == smoothed().position_enu_m.tobytes()
+    assert again.quat_xyzw.tobytes() == smoothed().quat_xyzw.tobytes()
+
+
+def test_an_estimate_that_is_not_finite_is_an_error():
+    measurements = drive.measure(truth(), 1)
+    broken = replace(measurements.gnss, position_enu_m=measurements.gnss.position_enu_m.copy())
+    broken.position_enu_m[5] = np.nan
+    wanted = replace(measurements, gnss=broken)
+    initial = find_initial_state(measurements, standing_intervals(measurements), int(measurements.gnss.stamp_ns[0]))
+    output = np.array([measurements.gnss.stamp_ns[100]])
+    found = run_error_state(wanted, initial, output_ns=output)  # the gate refuses what compares to nothing
+    assert np.isfinite(found.position_enu_m).all()
+    with pytest.raises(FusionError, match="not finite"):
+        run_error_state(wanted, replace(initial, position_enu_m=np.full(3, np.nan)), output_ns=output)
+
+
+def test_a_receiver_whose_clock_is_off_is_trusted_less_rather_than_refused():
+    late = drive.measure(truth(), 1)
+    shifted = replace(late.gnss, stamp_ns=late.gnss.stamp_ns + 250_000_000)
+    found = fuse(replace(late, gnss=shifted))
+    assert found.facts["gnss_variance_factor"] > 1
+    assert found.facts["rejected"][GNSS] < 0.1 * found.facts["measurements"][GNSS]
+    error = drive.errors(truth(), found, after_s=5.0)
+    assert 0.1 < error["xy"] < 0.3  # a quarter of a second of way, but no more
+    assert error["forward"] < 0.03
+    assert smoothed().facts["gnss_variance_factor"] == 1

@@ -1,0 +1,233 @@
+"""Columns to measurements, by hand and against PROJ and scipy."""
+
+import numpy as np
+import pyproj
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tcpipe.fusion.preparation import body_velocities, find_datum, inertial, positions
+
+NAN = np.nan
+ARM = (0.1, 0.2, 0.3)
+
+
+def stamps(count, period=100_000_000):
+    return np.arange(count, dtype=np.int64) * period + 1_700_000_000_000_000_000
+
+
+def gnss_columns(lon, lat, alt, variance=0.0004):
+    lon = np.asarray(lon, float)
+    columns = {"lon_deg": lon, "lat_deg": np.asarray(lat, float), "alt_m": np.asarray(alt, float)}
+    return columns | {f"{axis}_var_m2": np.full(lon.size, variance) for axis in ("east", "north", "up")}
+
+
+def test_fixes_become_enu_and_a_fix_at_null_island_is_set_aside():
+    datum = (15.0, 47.0, 400.0)
+    columns = gnss_columns([15.0, 0.0, 15.001, 15.002], [47.0, 0.0, 47.001, 47.002], [400.0, 0.0, 410.0, 420.0])
+    stamp = stamps(4)
+    stamp[3] = stamp[2]
+    found, prepared = positions(
+        stamp, columns, datum_deg_m=datum, lever_arm_m=ARM, default_std_m=0.05, floor_std_m=0.01
+    )
+    assert found.stamp_ns.tolist() == stamp[[0, 2]].tolist()
+    assert prepared.invalid_ns.tolist() == [stamp[1]]
+    assert prepared.repeated == 1
+    assert found.lever_arm_m == ARM
+    pipeline = pyproj.Transformer.from_pipeline(
+        "+proj=pipeline +step +proj=unitconvert +xy_in=deg +xy_out=rad +step +proj=cart +ellps=WGS84 "
+        "+step +proj=topocentric +ellps=WGS84 +lon_0=15 +lat_0=47 +h_0=400"
+    )
+    assert found.position_enu_m[1] == pytest.approx(pipeline.transform(15.001, 47.001, 410.0), abs=1e-6)
+
+
+@pytest.mark.parametrize("claimed", [NAN, 0.0, -1.0, np.inf])
+def test_a_variance_that_says_nothing_is_the_recipes(claimed):
+    columns = gnss_columns([15.0], [47.0], [400.0], claimed)
+    found, prepared = positions(
+        stamps(1), columns, datum_deg_m=(15.0, 47.0, 400.0), lever_arm_m=ARM, default_std_m=0.05, floor_std_m=0.01
+    )
+    assert found.variance_m2[0] == pytest.approx([0.0025, 0.0025, 0.01])
+    assert prepared.variances_replaced == 1
+
+
+def test_a_variance_too_good_to_be_true_is_floored():
+    columns = gnss_columns([15.0], [47.0], [400.0], 1e-12)
+    found, prepared = positions(
+        stamps(1), columns, datum_deg_m=(15.0, 47.0, 400.0), lever_arm_m=ARM, default_std_m=0.05, floor_std_m=0.01
+    )
+    assert found.variance_m2[0] == pytest.approx([1e-4] * 3)
+    assert prepared.variances_replaced == 0
+
+
+def test_datum_is_the_median_of_the_first_fixes_also_at_the_date_line():
+    lon = np.array([179.99999, -179.99999, 179.99998, 0.0, -179.99998, 90.0, 180.0])
+    lat = np.array([10.0, 10.0, 10.0, 0.0, 10.0, 10.0, 10.0])
+    found = find_datum(lon, lat, np.array([1.0, 2.0, 3.0, 0.0, 4.0, 500.0, 6.0]))
+    assert abs(found[0]) == pytest.approx(180.0, abs=1e-4)
+    assert found[1:] == (10.0, 3.5)
+    assert find_datum(np.zeros(3), np.zeros(3), np.zeros(3)) is None
+
+
+def odometry_columns(count, **known):
+    names = [f"velocity_{a}_mps" for a in "xyz"] + [f"angular_velocity_{a}_radps" for a in "xyz"]
+    names += [f"velocity_var_{a}_m2ps2" for a in "xyz"] + ["yaw_rate_var", "x_m", "y_m", "z_m"]
+    names += [f"quat_{c}" for c in "xyzw"]
+    return {name: np.full(count, NAN) for name in names} | {k: np.asarray(v, float) for k, v in known.items()}
+
+
+def test_a_twist_is_turned_into_base_link_with_its_variance():
+    # A camera with x right, y down, z forward.
+    quat = Rotation.from_matrix([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]).as_quat()
+    columns = odometry_columns(
+        1,
+        velocity_x_mps=[0.1],
+        velocity_y_mps=[0.2],
+        velocity_z_mps=[1.0],
+        angular_velocity_x_radps=[0.0],
+        angular_velocity_y_radps=[-0.5],
+        angular_velocity_z_radps=[0.0],
+        velocity_var_x_m2ps2=[0.01],
+        velocity_var_y_m2ps2=[0.04],
+        velocity_var_z_m2ps2=[0.09],
+    )
+    found, _ = body_velocities(
+        stamps(1), columns, xyz_m=ARM, quat_xyzw=tuple(quat), default_std_mps=0.05, only_forward=False
+    )
+    assert found.velocity_mps[0] == pytest.approx([1.0, -0.1, -0.2])
+    assert found.variance_m2ps2[0] == pytest.approx([0.09, 0.01, 0.04])
+    assert found.yaw_rate_radps[0] == pytest.approx(0.5)
+    assert found.lever_arm_m == ARM
+
+
+def test_wheels_measure_forward_only_and_rows_without_velocity_are_set_aside():
+    columns = odometry_columns(
+        3, velocity_x_mps=[1.0, NAN, 99.0], velocity_y_mps=[0.3, NAN, 0.0], velocity_z_mps=[0, NAN, 0]
+    )
+    found, prepared = body_velocities(
+        stamps(3), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=True
+    )
+    assert found.velocity_mps[0, 0] == 1.0
+    assert np.isnan(found.velocity_mps[0, 1:]).all()
+    assert found.variance_m2ps2[0, 0] == pytest.approx(0.05**2)
+    assert np.isnan(found.yaw_rate_var[0])
+    assert prepared.invalid_ns.size == 2
+    assert prepared.variances_replaced == 1
+
+
+@pytest.mark.parametrize("twist", [NAN, 0.0])
+def test_poses_become_the_velocity_of_a_circle_where_the_twist_is_empty(twist):
+    # 2 m radius at 0.5 rad/s: forward 1 m/s, in an odom frame of its own; the quaternion's sign flips on the way.
+    t = np.arange(50) * 0.1
+    turn = Rotation.from_euler("ZYX", np.column_stack((0.5 * t + 2.0, 0 * t, 0 * t)))
+    xy = 2.0 * np.column_stack((np.sin(0.5 * t + 2.0), -np.cos(0.5 * t + 2.0)))
+    quat = turn.as_quat() * np.where(np.arange(50) % 3 == 0, -1, 1)[:, None]
+    columns = odometry_columns(
+        50,
+        x_m=xy[:, 0],
+        y_m=xy[:, 1],
+        z_m=0 * t,
+        **dict(zip(("quat_x", "quat_y", "quat_z", "quat_w"), quat.T, strict=True)),
+    )
+    for axis in "xyz":
+        columns[f"velocity_{axis}_mps"] = np.full(50, twist)
+    found, prepared = body_velocities(
+        stamps(50), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=False
+    )
+    assert prepared.remarks == ("no twist: pose increments are used",)
+    chord = 2 * 2.0 * np.sin(0.025) / 0.1  # a chord is shorter than its arc
+    assert found.velocity_mps == pytest.approx(np.tile([chord, 0, 0], (49, 1)), abs=1e-9)
+    assert found.yaw_rate_radps == pytest.approx(np.full(49, 0.5), abs=1e-9)
+    assert found.stamp_ns.tolist() == (stamps(50)[:-1] + 50_000_000).tolist()
+
+
+def test_a_robot_that_stands_has_a_twist_of_zero():
+    columns = odometry_columns(
+        5,
+        velocity_x_mps=np.zeros(5),
+        velocity_y_mps=np.zeros(5),
+        velocity_z_mps=np.zeros(5),
+        x_m=np.ones(5),
+        y_m=np.ones(5),
+        z_m=np.zeros(5),
+    )
+    found, prepared = body_velocities(
+        stamps(5), columns, xyz_m=ARM, quat_xyzw=(0, 0, 0, 1), default_std_mps=0.05, only_forward=True
+    )
+    assert prepared.remarks == ()
+    assert found.velocity_mps[:, 0].tolist() == [0.0] * 5
+
+
+def imu_columns(force, rate, quat=None):
+    count = len(force)
+    columns = {f"linear_acceleration_{a}_mps2": np.asarray(force, float)[:, k] for k, a in enumerate("xyz")}
+    columns |= {f"angular_velocity_{a}_radps": np.asarray(rate, float)[:, k] for k, a in enumerate("xyz")}
+    quat = np.full((count, 4), NAN) if quat is None else np.asarray(quat, float)
+    return columns | {f"quat_{c}": quat[:, k] for k, c in enumerate("xyzw")}
+
+
+def test_imu_is_turned_by_its_mounting_orientation_too():
+    # robot_localization's test1: rolled by +90° and yawed by -90°, so that the unit's y axis points up.
+    mounting = Rotation.from_euler("xyz", [np.pi / 2, 0, -np.pi / 2])
+    attitude = Rotation.from_euler("ZYX", [0.5, 0.1, -0.2])
+    up = attitude.inv().apply([0, 0, 9.8])
+    force, rate = mounting.inv().apply(np.tile(up, (9, 1))), mounting.inv().apply(np.tile([0.1, 0.2, 0.3], (9, 1)))
+    quat = np.tile((attitude * mounting).as_quat(), (9, 1))
+    found, prepared = inertial(
+        stamps(9),
+        imu_columns(force, rate, quat),
+        xyz_m=ARM,
+        quat_xyzw=tuple(mounting.as_quat()),
+        gyro_std_radps=0.003,
+        accelerometer_std_mps2=0.1,
+    )
+    assert found.specific_force_mps2[0] == pytest.approx(up)
+    assert found.angular_velocity_radps[0] == pytest.approx([0.1, 0.2, 0.3])
+    assert found.quat_xyzw[0] == pytest.approx(attitude.as_quat(canonical=True))
+    assert found.accelerometer_usable
+    assert prepared.remarks == ()
+
+
+def test_noise_is_what_the_samples_show_where_that_is_more():
+    rng = np.random.default_rng(7)
+    force = [0, 0, 9.8] + rng.normal(size=(5000, 3)) * [0.2, 0.5, 0.1]
+    found, _ = inertial(
+        stamps(5000),
+        imu_columns(force, rng.normal(size=(5000, 3)) * 0.001),
+        xyz_m=ARM,
+        quat_xyzw=(0, 0, 0, 1),
+        gyro_std_radps=0.003,
+        accelerometer_std_mps2=0.1,
+    )
+    assert found.accelerometer_std_mps2 == pytest.approx(0.5, rel=0.05)
+    assert found.gyro_std_radps == 0.003
+
+
+def test_the_force_is_moved_to_base_link():
+    # Turning at 0.5 rad/s and faster by 0.2 rad/s each second: a unit 2 m ahead feels -0.5 m/s² along and 0.4 m/s² across.
+    t = np.arange(200) * 0.01
+    rate = np.column_stack((0 * t, 0 * t, 0.2 * t + 0.5))
+    force = np.column_stack((-2.0 * rate[:, 2] ** 2, 0 * t + 0.4, 0 * t + 9.8))
+    found, _ = inertial(
+        stamps(200, 10_000_000),
+        imu_columns(force, rate),
+        xyz_m=(2.0, 0.0, 0.3),
+        quat_xyzw=(0, 0, 0, 1),
+        gyro_std_radps=0.003,
+        accelerometer_std_mps2=0.1,
+    )
+    assert found.specific_force_mps2[3:-3] == pytest.approx(np.tile([0.0, 0.0, 9.8], (194, 1)), abs=1e-9)
+    assert found.lever_arm_m == (0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("norm", [1.0, 0.05])
+def test_a_force_in_g_or_without_gravity_is_not_used(norm):
+    found, prepared = inertial(
+        stamps(9),
+        imu_columns(np.tile([0, 0, norm], (9, 1)), np.zeros((9, 3))),
+        xyz_m=ARM,
+        quat_xyzw=(0, 0, 0, 1),
+        gyro_std_radps=0.003,
+        accelerometer_std_mps2=0.1,
+    )
+    assert not found.accelerometer_usable
+    assert "only the gyroscope" in prepared.remarks[0]

@@ -1,0 +1,199 @@
+"""Which stamp rules, where a clock steps, and in what order messages were measured."""
+
+import numpy as np
+
+from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
+
+S = 1_000_000_000
+START = 1_700_000_000 * S
+
+
+def log_times(rate_hz: float = 20.0, duration_s: float = 60.0) -> np.ndarray:
+    return START + np.round(np.arange(0, duration_s, 1 / rate_hz) * S).astype(np.int64)
+
+
+def times(log: np.ndarray, header: np.ndarray | None, **options) -> TopicTimes:
+    content = options.pop("content", np.arange(len(log), dtype=np.float64)[:, None])
+    return TopicTimes(log, header, content, **options)
+
+
+def settle(**topics: TopicTimes):
+    return settle_clocks(topics)
+
+
+def one(topic: TopicTimes) -> tuple[Timeline, int]:
+    found, steps = settle(topic=topic)
+    return found["topic"], len(steps)
+
+
+def test_a_header_that_follows_rules_to_the_nanosecond() -> None:
+    log = log_times()
+    header = log - 12_345_678
+    found, steps = one(times(log, header))
+    assert found.source == "header"
+    assert steps == 0
+    np.testing.assert_array_equal(found.stamp_ns, header)
+    np.testing.assert_array_equal(found.row, np.arange(len(log)))
+    assert found.offset_s == -0.012345678
+    assert found.dropped == found.notes == {}
+
+
+def test_no_header_and_unset_headers_leave_the_log_time() -> None:
+    log = log_times()
+    for header, why in ((None, "have no header"), (np.zeros_like(log), "none of its header stamps is set")):
+        found, _ = one(times(log, header))
+        assert found.source == "log"
+        assert why in found.why
+        np.testing.assert_array_equal(found.stamp_ns, log)
+
+
+def test_a_header_on_a_clock_of_its_own_is_not_believed() -> None:
+    log = log_times()
+    drifting = START + (log - START) * 2  # a minute too far at the end
+    found, steps = one(times(log, drifting))
+    assert (found.source, steps) == ("log", 0)
+    assert "do not follow the log time" in found.why
+
+
+def test_whole_second_stamps_with_new_content_are_not_believed() -> None:
+    log = log_times()
+    found, steps = one(times(log, log // S * S))
+    assert (found.source, steps) == ("log", 0)
+    assert "repeat" in found.why
+
+
+def test_simulated_time_is_kept_and_topics_without_a_header_join_it() -> None:
+    log = log_times()
+    simulated = log - START + 47_600_000_000
+    found, steps = settle(odom=times(log, simulated), imu=times(log, simulated - 5_000_000), command=times(log, None))
+    assert steps == []
+    assert (found["odom"].stamp_ns[0], found["odom"].source) == (47_600_000_000, "header")
+    assert found["command"].source == "log"
+    assert abs(found["command"].stamp_ns - simulated).max() < 5_000_001  # on the headers' clock, to within their delays
+    assert found["command"].moved_s[0] < -1e9
+    assert found["odom"].moved_s == (0.0,)
+
+
+def test_one_receiver_on_gps_time_is_brought_to_the_clock_of_the_others() -> None:
+    log = log_times()
+    found, _ = settle(gnss=times(log, log + 18 * S), imu=times(log, log - 3_000_000), odom=times(log, log - 1_000_000))
+    assert found["gnss"].source == "header"
+    assert abs(found["gnss"].moved_s[0] + 18.0) < 0.01
+    assert abs(found["gnss"].stamp_ns - log).max() <= 3_000_000
+    assert found["imu"].moved_s == found["odom"].moved_s == (0.0,)
+
+
+def test_delays_below_a_second_are_left_alone() -> None:
+    log = log_times()
+    found, _ = settle(vo=times(log, log - 400_000_000), imu=times(log, log))
+    assert found["vo"].moved_s == (0.0,)
+    np.testing.assert_array_equal(found["vo"].stamp_ns, log - 400_000_000)
+
+
+def test_a_lasting_step_opens_an_epoch_for_every_topic() -> None:
+    log, slow = log_times(), log_times(rate_hz=1.0)
+    at = START + 30 * S
+    found, steps = settle(
+        imu=times(log, log + np.where(log >= at, 2 * S, 0)),
+        gnss=times(slow, slow + np.where(slow >= at, 2 * S, 0)),
+        command=times(log, None),
+    )
+    assert len(steps) == 1
+    assert steps[0].step_s == 2.0
+    assert steps[0].topics == ("gnss", "imu")
+    for name, rows in (("imu", log), ("gnss", slow), ("command", log)):
+        np.testing.assert_array_equal(found[name].epoch, (rows >= at).astype(int))
+
+
+def test_a_backward_step_keeps_every_row_and_orders_by_epoch_first() -> None:
+    log = log_times()
+    header = log - np.where(log >= START + 30 * S, 20 * S, 0)
+    found, steps = one(times(log, header))
+    assert steps == 1
+    assert found.dropped == {}
+    np.testing.assert_array_equal(found.stamp_ns, header)
+
+
+def test_a_step_of_0_4_s_and_a_slow_drift_are_no_steps() -> None:
+    log = log_times()
+    assert one(times(log, log + np.where(log >= START + 30 * S, 400_000_000, 0)))[1] == 0
+    assert one(times(log, log + (log - START) // 40))[1] == 0  # 1.5 s in a minute
+
+
+def test_a_delay_that_comes_back_is_no_step() -> None:
+    log = log_times()
+    delayed = (log >= START + 20 * S) & (log < START + 26 * S)
+    found, steps = one(times(log, log - np.where(delayed, 800_000_000, 0)))
+    assert (steps, found.source) == (0, "header")
+
+
+def test_a_stalled_recorder_is_no_step() -> None:
+    header = log_times(rate_hz=200.0)
+    log = header.copy()
+    for begin, length in ((10, 3), (40, 8)):  # nothing is written for so long, then all of it within 10 ms
+        stalled = (header >= START + begin * S) & (header < START + (begin + length) * S)
+        log[stalled] = START + (begin + length) * S + np.linspace(0, 1e7, stalled.sum()).astype(np.int64)
+    log = np.maximum.accumulate(log)
+    found, steps = one(times(log, header))
+    assert (steps, found.source, found.dropped) == (0, "header", {})
+    np.testing.assert_array_equal(found.stamp_ns, header)
+
+
+def test_single_wrong_stamps_are_replaced_and_counted() -> None:
+    log = log_times()
+    header = log - 1_000_000
+    header[100] += 86_400 * S  # a day ahead
+    header[200] += 3 * S  # measured after it was received
+    header[300] = 0
+    found, steps = one(times(log, header))
+    assert steps == 0
+    assert found.notes == {"stamps_replaced": 3}
+    assert len(found.row) == len(log)
+    np.testing.assert_array_equal(found.stamp_ns, log - 1_000_000)
+
+
+def test_messages_late_by_less_than_a_second_are_sorted_others_dropped() -> None:
+    log = log_times()
+    header = log.copy()
+    header[100] -= 725_000_000
+    header[200] -= 4 * S
+    found, _ = one(times(log, header))
+    assert found.notes == {"sorted": 1}
+    assert found.dropped == {"late": 1}
+    assert np.all(np.diff(found.stamp_ns) > 0)
+    assert 100 in found.row
+    assert 200 not in found.row
+
+
+def test_exact_duplicates_and_repeated_stamps_are_told_apart() -> None:
+    log = log_times()
+    header, content = log.copy(), np.arange(len(log), dtype=np.float64)[:, None]
+    header[101], content[101] = header[100], content[100]
+    header[201] = header[200]
+    content[300] = content[301] = np.nan
+    header[301] = header[300]
+    found, _ = one(times(log, header, content=content))
+    assert found.dropped == {"duplicates": 2, "repeated_stamps": 1}
+    assert len(found.row) == len(log) - 3
+    assert {101, 201, 301}.isdisjoint(found.row)
+
+
+def test_the_recipe_chooses_the_clock_and_shifts_it() -> None:
+    log = log_times()
+    header = log - 5 * S
+    header[7] = 0
+    found, _ = settle(a=times(log, header, prefer="log", offset_ns=250_000_000), b=times(log, header, prefer="header"))
+    assert found["a"].source == "log"
+    np.testing.assert_array_equal(found["b"].stamp_ns, np.delete(header, 7))
+    assert found["b"].dropped == {"unset_stamps": 1}
+    # The log-time topic joins the others' clock, 5 s behind, before its own offset is added.
+    np.testing.assert_array_equal(found["a"].stamp_ns, log - 5 * S + 250_000_000)
+
+
+def test_a_header_that_does_not_rule_opens_no_epoch() -> None:
+    log = log_times()
+    rng = np.random.default_rng(1)
+    garbage = log + rng.choice([0, 100 * S, 900 * S], len(log))
+    found, steps = settle(bad=times(log, garbage), good=times(log, log))
+    assert steps == []
+    assert (found["bad"].source, found["good"].source) == ("log", "header")

@@ -1,0 +1,177 @@
+"""Which fields are propulsion, whose sign they have, and when numbers cannot be power."""
+
+import numpy as np
+import pytest
+
+from tcpipe.logs.power_readings import PowerReadings, columns_of, read_power
+from tcpipe.logs.power_sources import BATTERY_STATE, CLEARPATH_POWER, HUSKY_STATUS
+from tcpipe.logs.profiles import ROBOTS
+
+N = 40
+TIMES = {"log_time_ns": np.arange(N) * 50_000_000}
+VOLT = 26.0 + np.sin(np.arange(N))
+AMP = 5.0 + np.cos(np.arange(N))
+
+
+def husky_status() -> dict[str, np.ndarray]:
+    return TIMES | {
+        "battery_voltage": VOLT,
+        "left_driver_voltage": VOLT - 0.5,
+        "right_driver_voltage": VOLT - 0.7,
+        "left_driver_current": AMP,
+        "right_driver_current": AMP + 1.0,
+        "mcu_and_user_port_current": np.full(N, 100.0),
+    }
+
+
+def battery(voltage: np.ndarray, current: np.ndarray, percentage: float = np.nan) -> dict[str, np.ndarray]:
+    return TIMES | {"voltage": voltage, "current": current, "percentage": np.full(N, percentage)}
+
+
+def power_watt(found: PowerReadings) -> np.ndarray:
+    assert found.readings, found.warnings
+    watt = np.zeros(N)
+    for topic, rails in found.rails.items():
+        for rail in rails:
+            voltage, current = (found.readings[topic].columns[name] for name in columns_of(rail))
+            watt += voltage * current
+    return watt
+
+
+def test_a_huskys_propulsion_is_battery_voltage_times_both_drivers() -> None:
+    found = read_power({"/status": (HUSKY_STATUS, husky_status())}, ROBOTS["husky"])
+    np.testing.assert_allclose(power_watt(found), VOLT * (2 * AMP + 1.0), rtol=1e-14)
+    assert not found.averaged
+    assert found.warnings == ()
+
+
+def test_a_huskys_drivers_can_be_taken_each_by_itself() -> None:
+    found = read_power({"/status": (HUSKY_STATUS, husky_status())}, ROBOTS["husky"], husky_power="drivers")
+    expected = (VOLT - 0.5) * AMP + (VOLT - 0.7) * (AMP + 1.0)
+    np.testing.assert_allclose(power_watt(found), expected, rtol=1e-14)
+
+
+def clearpath(voltages: tuple, currents: tuple) -> dict[str, np.ndarray]:
+    return TIMES | {"measured_voltages": np.stack(voltages, -1), "measured_currents": np.stack(currents, -1)}
+
+
+@pytest.mark.parametrize(
+    ("robot", "option", "expected"),
+    [
+        ("husky", "battery", VOLT * (3 * AMP)),
+        ("husky", "drivers", (VOLT - 1) * AMP + (VOLT - 2) * 2 * AMP),
+        ("jackal", "battery", VOLT * 2 * AMP),
+        ("warthog", "battery", VOLT * 9.0),
+    ],
+)
+def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarray) -> None:
+    columns = clearpath((VOLT, VOLT - 1, VOLT - 2), (np.full(N, 9.0) + 0.0 * AMP, AMP, 2 * AMP))
+    columns["measured_currents"][:, 0] += np.where(np.arange(N) == 0, 1e-9, 0)  # a current that moves, if little
+    found = read_power({"/power": (CLEARPATH_POWER, columns)}, ROBOTS[robot], husky_power=option)
+    np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
+    assert found.averaged
+    assert bool(found.warnings) == (robot == "warthog")  # its total current feeds the computers too
+
+
+def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
+    two = clearpath((VOLT,), (AMP, AMP))
+    assert "measured_currents holds 2 values" in read_power({"/p": (CLEARPATH_POWER, two)}, ROBOTS["husky"]).warnings[0]
+    unknown = read_power({"/p": (CLEARPATH_POWER, two)}, ROBOTS["generic"])
+    assert "names its currents by platform (A200, J100, W200)" in unknown.warnings[0]
+    assert unknown.readings == {}
+
+
+@pytest.mark.parametrize(
+    ("type_name", "fields"),
+    [
+        ("jackal_msgs/msg/Status", {"measured_battery": VOLT, "drive_current": AMP, "total_current": 3 * AMP}),
+        ("warthog_msgs/msg/Status", {"measured_battery": VOLT, "current_battery": AMP, "current_computer": AMP}),
+    ],
+)
+def test_older_clearpath_status(type_name: str, fields: dict) -> None:
+    found = read_power({"/status": (type_name, TIMES | fields)}, ROBOTS["generic"])
+    np.testing.assert_allclose(power_watt(found), VOLT * AMP, rtol=1e-14)
+    assert found.averaged
+
+
+@pytest.mark.parametrize(("recorded", "said"), [(AMP, "against the ROS convention"), (-AMP, None)])
+def test_the_sign_of_a_battery_is_told_by_its_mean(recorded: np.ndarray, said: str | None) -> None:
+    found = read_power({"/battery": (BATTERY_STATE, battery(VOLT, recorded))}, ROBOTS["generic"])
+    np.testing.assert_allclose(power_watt(found), VOLT * AMP, rtol=1e-14)
+    assert [said] == [said for warning in found.warnings if str(said) in warning] or (
+        said is None and not found.warnings
+    )
+
+
+def test_the_sign_is_told_by_all_rails_together() -> None:
+    left, right = 3.0 - 0.5 * AMP, 5 * AMP  # one side is driven by the other now and then
+    topics = {"/left": (BATTERY_STATE, battery(VOLT, left)), "/right": (BATTERY_STATE, battery(VOLT, right))}
+    np.testing.assert_allclose(power_watt(read_power(topics, ROBOTS["generic"])), VOLT * (left + right), rtol=1e-12)
+
+
+def test_an_unclear_sign_follows_ros_and_says_so_and_the_recipe_settles_it() -> None:
+    balanced = battery(VOLT, np.cos(np.pi * np.arange(N)) * 4.0)
+    found = read_power({"/b": (BATTERY_STATE, balanced)}, ROBOTS["generic"])
+    assert "unclear" in found.warnings[0]
+    np.testing.assert_allclose(power_watt(found), -VOLT * balanced["current"])
+    settled = read_power({"/b": (BATTERY_STATE, balanced)}, ROBOTS["generic"], current_sign="drawn_positive")
+    np.testing.assert_allclose(power_watt(settled), VOLT * balanced["current"])
+    assert settled.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("columns", "evidence"),
+    [
+        (battery(np.zeros(N), np.zeros(N), 73.0), "voltage and the current are zero on all 40 rows"),
+        (battery(np.zeros(N), AMP), "voltage is zero on all 40 rows"),
+        (battery(VOLT, np.full(N, np.nan)), "carries no current"),
+        (battery(np.full(N, np.nan), AMP), "carries no voltage"),
+        (battery(np.full(N, np.nan), np.full(N, np.nan)), "neither voltage nor current"),
+        (battery(VOLT, np.zeros(N)), "current is 0 A on all 40 rows"),
+        (battery(np.full(N, 73.0), AMP, 0.73), "equals the percentage of charge on all 40 rows (first 73)"),
+        (battery(np.full(N, 73.0), AMP, 73.0), "equals the percentage"),
+        (battery(1000 * VOLT, AMP), "millivolts?"),
+        (battery(VOLT, 1000 * AMP), "milliamperes?"),
+        (battery(np.full(N, 0.8), AMP), "a share of charge"),
+        (TIMES | {"voltage": VOLT}, "no field current"),
+    ],
+)
+def test_numbers_that_cannot_be_power_are_refused_with_evidence(columns: dict, evidence: str) -> None:
+    found = read_power({"/battery": (BATTERY_STATE, columns)}, ROBOTS["generic"])
+    assert found.readings == {}
+    assert evidence in found.warnings[0]
+    assert "/battery" in found.warnings[0]
+
+
+def test_voltage_and_current_on_two_topics_are_one_rail() -> None:
+    voltage = {"log_time_ns": np.arange(N) * 50_000_000, "data": VOLT}
+    current = {"log_time_ns": np.arange(N) * 50_000_000 + 7, "data": -AMP}
+    topics = {"/bus_voltage": ("std_msgs/msg/Float32", voltage), "/motor_current": ("std_msgs/msg/Float64", current)}
+    found = read_power(topics, ROBOTS["generic"])
+    assert found.rails == {"/bus_voltage": ("battery",), "/motor_current": ("battery",)}
+    volt, amp = columns_of("battery")
+    np.testing.assert_array_equal(found.readings["/bus_voltage"].columns[volt], VOLT)
+    assert np.isnan(found.readings["/bus_voltage"].columns[amp]).all()
+    np.testing.assert_array_equal(found.readings["/motor_current"].columns[amp], AMP)
+
+
+@pytest.mark.parametrize("robot", ["warthog", "generic"])
+def test_a_warthogs_negative_currents_come_as_unsigned(robot: str) -> None:
+    current = np.where(np.arange(N) % 8 == 0, -2.0, AMP)
+    topics = {
+        "/left_drive/status/battery_voltage": ("std_msgs/msg/Float64", TIMES | {"data": VOLT}),
+        "/left_drive/status/battery_current": ("std_msgs/msg/Float64", TIMES | {"data": current % 4096}),
+    }
+    found = read_power(topics, ROBOTS[robot])
+    name = columns_of("/left_drive/status/battery")[1]
+    recorded = found.readings["/left_drive/status/battery_current"].columns[name]
+    np.testing.assert_array_equal(recorded, current if robot == "warthog" else current % 4096)
+
+
+def test_rows_that_carry_nothing_are_counted() -> None:
+    columns = battery(VOLT.copy(), AMP.copy())
+    columns["voltage"][3] = columns["current"][3] = np.nan
+    columns["current"][5] = np.nan
+    found = read_power({"/b": (BATTERY_STATE, columns)}, ROBOTS["generic"])
+    assert found.readings["/b"].dropped == {"not_finite": 1}
+    assert len(found.readings["/b"].row) == N - 1

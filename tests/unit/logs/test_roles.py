@@ -1,0 +1,273 @@
+"""Which topic plays which role, from the topic list alone."""
+
+import pytest
+
+from tcpipe.errors import RecipeError
+from tcpipe.logs.roles import Assignment, assign_roles
+from tcpipe.logs.topics import Topic
+
+FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
+ODOMETRY, TWIST, STAMPED = "nav_msgs/msg/Odometry", "geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"
+BATTERY, HUSKY, POWER = (
+    "sensor_msgs/msg/BatteryState",
+    "husky_msgs/msg/HuskyStatus",
+    "clearpath_platform_msgs/msg/Power",
+)
+
+
+def topic(name: str, type_name: str, count: int | None = 101, problem: str | None = None) -> Topic:
+    return Topic(name, type_name, count, 0, 10_000_000_000, "cdr", "", problem)
+
+
+def assign(*topics: tuple[str, str], chosen=None, ignored=(), robot=None) -> Assignment:
+    return assign_roles([topic(name, kind) for name, kind in topics], chosen or {}, ignored, robot)
+
+
+def played(assignment: Assignment) -> dict[str, tuple[str, ...]]:
+    assert assignment.problems == ()
+    return {name: role.topics for name, role in assignment.roles.items()}
+
+
+def test_a_ros1_husky_with_everything() -> None:
+    found = assign(
+        ("/navsat/fix", FIX),
+        ("/navsat/nmea_sentence", "nmea_msgs/msg/Sentence"),
+        ("/imu/data", IMU),
+        ("/imu/data_raw", IMU),
+        ("/zed2/zed_node/imu/data", IMU),
+        ("/husky_velocity_controller/odom", ODOMETRY),
+        ("/odometry/filtered", ODOMETRY),
+        ("/odometry/gps", ODOMETRY),
+        ("/zed2/zed_node/odom", ODOMETRY),
+        ("/status", HUSKY),
+        ("/husky_velocity_controller/cmd_vel", TWIST),
+        ("/joy_teleop/cmd_vel", TWIST),
+        ("/move_base/cmd_vel", TWIST),
+        ("/tf", "tf2_msgs/msg/TFMessage"),
+        ("/tf_static", "tf2_msgs/msg/TFMessage"),
+        ("/rosout", "rosgraph_msgs/msg/Log"),
+    )
+    assert played(found) == {
+        "gnss": ("/navsat/fix",),
+        "imu": ("/imu/data",),
+        "wheel_odometry": ("/husky_velocity_controller/odom",),
+        "visual_odometry": ("/zed2/zed_node/odom",),
+        "power": ("/status",),
+        "command": ("/husky_velocity_controller/cmd_vel",),
+    }
+    assert found.robot.name == "husky"
+    assert found.transforms == ("/tf_static", "/tf")
+    assert found.warnings == ()
+    assert "filtered" in found.left_out["/odometry/filtered"]
+    assert "gps" in found.left_out["/odometry/gps"]
+    assert "/rosout" not in found.left_out
+
+
+def test_a_ros2_husky_prefers_the_platform_over_the_estimators_and_bare_batteries() -> None:
+    found = assign(
+        ("/a200_0000/sensors/gps_0/fix", FIX),
+        ("/a200_0000/sensors/imu_0/data", IMU),
+        ("/a200_0000/platform/odom", ODOMETRY),
+        ("/a200_0000/platform/odom/filtered", ODOMETRY),
+        ("/a200_0000/platform/bms/state", BATTERY),
+        ("/a200_0000/platform/mcu/status/power", POWER),
+        ("/a200_0000/platform/cmd_vel", STAMPED),
+        ("/a200_0000/platform/cmd_vel_unstamped", TWIST),
+        ("/a200_0000/joy_teleop/cmd_vel", STAMPED),
+        ("/a200_0000/tf_static", "tf2_msgs/msg/TFMessage"),
+    )
+    assert played(found) == {
+        "gnss": ("/a200_0000/sensors/gps_0/fix",),
+        "imu": ("/a200_0000/sensors/imu_0/data",),
+        "wheel_odometry": ("/a200_0000/platform/odom",),
+        "power": ("/a200_0000/platform/mcu/status/power",),
+        "command": ("/a200_0000/platform/cmd_vel",),
+    }
+    assert found.robot.name == "husky"
+
+
+def test_both_drives_of_a_warthog_are_summed_and_icp_is_no_sensor() -> None:
+    found = assign(
+        ("/odom", ODOMETRY),
+        ("/icp_odom", ODOMETRY),
+        ("/imu/data", IMU),
+        ("/left_drive/battery", BATTERY),
+        ("/right_drive/battery", BATTERY),
+        ("/gnss/fix", FIX),
+    )
+    assert played(found)["power"] == ("/left_drive/battery", "/right_drive/battery")
+    assert played(found)["wheel_odometry"] == ("/odom",)
+    assert "icp" in found.left_out["/icp_odom"]
+    assert found.robot.name == "generic"
+
+
+FLOAT = "std_msgs/msg/Float64"
+WARTHOG_DRIVES = [
+    f"/lester/{side}_drive/status/battery_{what}" for side in ("left", "right") for what in ("current", "voltage")
+]
+
+
+def test_voltages_and_currents_apart_make_the_rails_of_both_drives() -> None:
+    others = [
+        ("/mcu/status", "warthog_msgs/msg/Status"),
+        ("/computer/voltage", FLOAT),
+        ("/left_drive/status/speed", FLOAT),
+    ]
+    found = assign(("/odom", ODOMETRY), *((name, FLOAT) for name in WARTHOG_DRIVES), *others)
+    assert set(played(found)["power"]) == set(WARTHOG_DRIVES)
+    assert found.roles["power"].why == "2 sides of one robot, summed"
+    assert list(found.left_out) == ["/mcu/status"]  # its total current feeds more than the drives
+    corrected = WARTHOG_DRIVES[0] + "_corrected"
+    found = assign(("/odom", ODOMETRY), *((name, FLOAT) for name in [*WARTHOG_DRIVES, corrected]))
+    assert set(played(found)["power"]) == {corrected, *WARTHOG_DRIVES[1:]}
+    assert "corrected" in found.left_out[WARTHOG_DRIVES[0]]
+
+
+def test_half_a_rail_is_no_power() -> None:
+    found = assign(("/odom", ODOMETRY), ("/battery/voltage", FLOAT), ("/motor/current", FLOAT))
+    assert "power" not in played(found)
+    found = assign(("/odom", ODOMETRY), ("/battery/voltage", FLOAT), ("/battery/current", FLOAT))
+    assert played(found)["power"] == ("/battery/current", "/battery/voltage")
+
+
+@pytest.mark.parametrize(
+    "names",
+    [("/battery_1", "/battery_2"), ("/left/battery", "/right/battery", "/total/battery"), ("/left/a", "/right/b")],
+)
+def test_batteries_that_are_not_sides_are_asked_for(names: tuple[str, ...]) -> None:
+    found = assign(("/odom", ODOMETRY), *((name, BATTERY) for name in names))
+    assert "role power is ambiguous" in found.problems[0]
+    assert all(name in found.problems[0] for name in names)
+    assert "to be summed" in found.problems[-1]
+
+
+def test_every_ambiguous_role_is_asked_for_at_once_with_lines_that_settle_it() -> None:
+    topics = [
+        ("/fix_a", FIX),
+        ("/fix_b", FIX),
+        ("/imu_a", IMU),
+        ("/imu_b", IMU),
+        ("/odom_a", ODOMETRY),
+        ("/odom_b", ODOMETRY),
+    ]
+    found = assign(*topics)
+    text = "\n".join(found.problems)
+    for role in ("gnss", "imu", "wheel_odometry"):
+        assert f"role {role} is ambiguous" in text
+    assert "/fix_a (sensor_msgs/msg/NavSatFix, 101 messages, 10 Hz)" in text
+    assert "[read.topics]" in found.problems
+    chosen = {}
+    for line in found.problems[found.problems.index("[read.topics]") + 1 :]:
+        role, value = line.split("  #")[0].split(" = ")
+        chosen[role] = [value.strip('[]"')]
+    assert played(assign(*topics, chosen=chosen)) == {
+        "gnss": ("/fix_a",),
+        "imu": ("/imu_a",),
+        "wheel_odometry": ("/odom_a",),
+    }
+
+
+def test_the_recipe_rules_over_types_names_and_ambiguity() -> None:
+    topics = (("/odometry/filtered", ODOMETRY), ("/a/imu", IMU), ("/b/imu", IMU), ("/fix", FIX), ("/battery", BATTERY))
+    chosen = {"wheel_odometry": ["/absent", "/odometry/filtered"], "imu": ["/b/imu"], "gnss": []}
+    found = assign(*topics, chosen=chosen, ignored=["/battery"])
+    assert played(found) == {"imu": ("/b/imu",), "wheel_odometry": ("/odometry/filtered",)}
+    assert found.left_out["/battery"] == "the recipe ignores it"
+    assert "recipe" in found.left_out["/fix"]
+    assert len(found.warnings) == 2
+
+
+def test_a_recipe_that_does_not_fit_the_log_is_an_error_with_what_there_is() -> None:
+    topics = (("/fix", FIX), ("/odom", ODOMETRY), ("/left/battery", BATTERY))
+    found = assign(
+        *topics, chosen={"gnss": ["/gps"], "imu": ["/odom"], "power": ["/left/battery", "/right/battery"], "radar": []}
+    )
+    text = "\n".join(found.problems)
+    assert "read.topics.gnss names /gps, which the log does not hold; it holds /fix" in text
+    assert "read.topics.imu: /odom is nav_msgs/msg/Odometry; wanted sensor_msgs/msg/Imu" in text
+    assert "read.topics.power names /right/battery" in text
+    assert "no role 'radar'" in text
+
+
+def test_a_log_without_motion_says_so_in_three_lines_and_how_to_use_what_was_left_out() -> None:
+    found = assign(("/odometry/filtered", ODOMETRY), ("/imu", IMU), ("/chatter", "std_msgs/msg/String"))
+    assert len(found.problems) == 3
+    assert found.problems[0].startswith("nothing in the log tells motion")
+    assert '[read.topics] wheel_odometry = ["/odometry/filtered"]' in found.problems[1]
+    assert "/chatter (std_msgs/msg/String" in found.problems[2]
+    assert len(assign(("/chatter", "std_msgs/msg/String")).problems) == 2
+
+
+def test_empty_and_unreadable_topics_play_nothing() -> None:
+    found = assign_roles(
+        [
+            topic("/odom", ODOMETRY),
+            topic("/b/odom", ODOMETRY, count=0),
+            topic("/c/odom", ODOMETRY, problem="no definition"),
+        ],
+        {},
+    )
+    assert played(found) == {"wheel_odometry": ("/odom",)}
+    assert found.left_out == {"/b/odom": "it has no messages", "/c/odom": "it cannot be read: no definition"}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "role"),
+    [
+        ("/vo", ODOMETRY, "visual_odometry"),
+        ("/rtabmap/odom", ODOMETRY, "visual_odometry"),
+        ("/orb_slam2/odom", ODOMETRY, "visual_odometry"),
+        ("/stereo_odometer/odometry", ODOMETRY, "visual_odometry"),
+        ("/camera/odom/sample", ODOMETRY, "visual_odometry"),
+        ("/wheel_odometry", ODOMETRY, "wheel_odometry"),
+        ("/odom", ODOMETRY, "wheel_odometry"),
+        ("/robot/base_controller/odom", ODOMETRY, "wheel_odometry"),
+        ("/velocity", STAMPED, "wheel_odometry"),
+        ("/wheels/twist", "geometry_msgs/msg/TwistWithCovarianceStamped", "wheel_odometry"),
+        ("/ukf/odom", ODOMETRY, None),
+        ("/zed/odometry/filtered", ODOMETRY, None),
+        ("/ground_truth/state", ODOMETRY, None),
+        ("/lio_sam/mapping/odometry", ODOMETRY, None),
+        ("/gps/fix_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", None),
+        ("/ublox/fix_velocity", STAMPED, None),
+        ("/cmd_vel", STAMPED, "command"),
+        ("/turtle/command/twist", TWIST, "command"),
+        ("/measured_twist", TWIST, None),
+        ("/gps/filtered", FIX, None),
+    ],
+)
+def test_names(name: str, kind: str, role: str | None) -> None:
+    found = assign((name, kind), ("/other/fix", FIX) if kind != FIX else ("/encoder/odom", ODOMETRY))
+    roles = {topics: role for role, topics in played(found).items()}
+    assert roles.get((name,)) == role
+    assert (name in found.left_out) == (role is None)
+
+
+@pytest.mark.parametrize(
+    ("topics", "robot"),
+    [
+        ([("/status", HUSKY)], "husky"),
+        ([("/status", "warthog_msgs/msg/Status")], "warthog"),
+        ([("/status", "jackal_msgs/msg/Status")], "jackal"),
+        ([("/platform/power", POWER)], "husky"),
+        ([("/w200_0042/platform/power", POWER)], "warthog"),
+        ([("/j100/platform/power", POWER)], "jackal"),
+        ([("/warthog_velocity_controller/odom", ODOMETRY)], "warthog"),
+        ([("/husky/odom", ODOMETRY), ("/jackal/odom", ODOMETRY)], "generic"),
+        ([("/huskystone/odom", ODOMETRY)], "generic"),
+        ([("/odom", ODOMETRY)], "generic"),
+    ],
+)
+def test_the_robot_is_found_by_types_then_by_names(topics: list[tuple[str, str]], robot: str) -> None:
+    assert assign(*topics, ("/wheel/odom", ODOMETRY)).robot.name == robot
+
+
+def test_the_robot_given_rules_and_must_exist() -> None:
+    assert assign(("/status", HUSKY), ("/odom", ODOMETRY), robot="warthog").robot.name == "warthog"
+    with pytest.raises(RecipeError, match="there are generic, husky, jackal, warthog"):
+        assign(("/odom", ODOMETRY), robot="spot")
+
+
+def test_the_order_of_the_topics_does_not_matter() -> None:
+    topics = [topic("/b/imu", IMU), topic("/a/imu", IMU), topic("/odom", ODOMETRY), topic("/z/odom", ODOMETRY)]
+    assert assign_roles(topics, {}) == assign_roles(topics[::-1], {})

@@ -1,0 +1,41 @@
+"""Every interval has one reason, and the sum is the odometer."""
+
+import numpy as np
+import pytest
+from made_tracks import stamps
+
+from tcpipe.motion.ledger import by_reason, interval_duration_s, interval_length_m, interval_reason, stretches
+from tcpipe.tables.bits import DropReason
+
+G, S, A = (int(bit) for bit in (DropReason.GAP, DropReason.STANDING, DropReason.ACCELERATING))
+
+
+def test_stretches_are_runs_of_two_kept_rows_inside_a_piece():
+    dropped = np.array([0, 0, S, 0, S, 0, 0, 0], dtype=np.uint32)
+    piece = np.array([0, 0, 0, 0, 0, 0, 0, 1])
+    assert stretches(dropped, piece).tolist() == [[0, 1], [5, 6]]
+
+
+def test_reason_is_the_first_of_both_ends_and_a_hole_is_a_gap():
+    dropped = np.array([0, 0, A, A | S, 0, 0], dtype=np.uint32)
+    piece = np.array([0, 0, 0, 0, 0, 1])
+    assert interval_reason(dropped, piece).tolist() == [0, A, S, S, G]
+
+
+def test_a_hole_counts_as_its_straight_line_and_no_metre_twice():
+    stamp_ns = stamps(6)
+    stamp_ns[3:] += 1_000_000_000
+    x = np.array([0.0, 0.05, 0.10, 3.10, 3.15, 3.20])
+    position = np.column_stack((x, 0 * x, 0 * x))
+    velocity = np.tile([1.0, 0.0, 0.0], (6, 1))
+    piece = np.array([0, 0, 0, 1, 1, 1])
+    length = interval_length_m(stamp_ns, position, velocity, piece)
+    assert length == pytest.approx([0.05, 0.05, 3.0, 0.05, 0.05])
+    sums = by_reason(interval_reason(np.array([0, 0, 0, S, S, 0], dtype=np.uint32), piece), length)
+    assert sums["gap"] == pytest.approx(3.0)
+    assert sums["standing"] == pytest.approx(0.1)
+    assert set(sums) == {str(bit.name).lower() for bit in DropReason}
+
+
+def test_a_clock_step_is_no_time():
+    assert interval_duration_s(stamps(2) - [0, 10**12], np.array([0, 1])).tolist() == [0.0]

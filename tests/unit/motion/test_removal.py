@@ -1,0 +1,47 @@
+"""Shares of removed metres by group, and which of them stand out, by hand."""
+
+import numpy as np
+import pytest
+
+from tcpipe.motion.removal import Group, main_reason, named_groups, tally_m, uneven
+
+REASONS = ("in_samples", "gap", "stuck")
+
+
+def test_metres_are_summed_by_group_and_reason():
+    group, reason = np.array([0, 0, 2, 2, 2]), np.array([0, 1, 0, 2, 2])
+    tally = tally_m(group, reason, np.array([1.0, 2.0, 3.0, 4.0, 5.0]), shape=(3, 3))
+    np.testing.assert_array_equal(tally, [[1, 2, 0], [0, 0, 0], [3, 0, 9]])
+    first, last = named_groups(tally, ("grass", "mud", "paved"), REASONS)
+    assert first == Group("grass", 3.0, 1.0, {"gap": 2.0})
+    assert last == Group("paved", 12.0, 3.0, {"stuck": 9.0})
+    assert last.used_share == 0.25
+    assert main_reason(first) == "gap"
+    assert main_reason(Group("mud", 1.0, 1.0, {})) == ""
+
+
+def test_nothing_driven_gives_no_group():
+    nothing = np.zeros(0, np.int64)
+    assert named_groups(tally_m(nothing, nothing, np.zeros(0), shape=(2, 3)), ("a", "b"), REASONS) == ()
+
+
+def groups(**used_of_driven):
+    return [Group(name, driven, used, {"gap": driven - used}) for name, (used, driven) in used_of_driven.items()]
+
+
+@pytest.mark.parametrize(
+    ("mud", "odd"),
+    [
+        ((30.0, 100.0), ["grass", "mud"]),  # 0.30 against 0.80, where 2.5 standard deviations are 0.29
+        ((68.0, 100.0), []),  # 0.68 against 0.80: nearer than 0.15
+        ((6.0, 15.0), []),  # too short
+        ((12.0, 25.0), []),  # 0.48 against 0.80, but of five stretches
+    ],
+)
+def test_a_share_stands_out_when_it_is_far_off_and_surely_so(mud, odd):
+    found = uneven(groups(grass=(320.0, 400.0), mud=mud))
+    assert [group.name for group in found] == odd
+
+
+def test_one_group_alone_has_nothing_to_differ_from():
+    assert uneven(groups(grass=(10.0, 400.0))) == []

@@ -1,0 +1,196 @@
+"""Adding maps to a store: once, again, otherwise, and with classes that all maps of a store share."""
+
+import hashlib
+import resource
+
+import matplotlib.image
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from map_worlds import World, write_tif
+from rasterio import Affine
+
+from tcpipe.cli import cli
+from tcpipe.errors import MapError, StoreError
+from tcpipe.formats.map_files import open_map
+from tcpipe.pipeline.maps import add_map
+
+WORLD = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=12.0)
+CLASSES = "value,id,name,traversable\n4,1,meadow,yes\n5,2,bog,yes\n6,3,gravel,yes\n7,3,gravel,yes\n"
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    return WORLD.write(tmp_path_factory.mktemp("site"), 0.2)
+
+
+@pytest.fixture
+def store(tmp_path):
+    return tmp_path / "store"
+
+
+def add(store, name, **given):
+    return add_map(name, store=store, **given)
+
+
+def classes_file(tmp_path, text=CLASSES, name="c.csv"):
+    (tmp_path / name).write_text(text)
+    return tmp_path / name
+
+
+def contents(store):
+    return {p: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(store.rglob("*")) if p.is_file()}
+
+
+def refused(store, name, error=MapError, **given):
+    before = contents(store)
+    with pytest.raises(error) as caught:
+        add(store, name, **given)
+    assert contents(store) == before
+    return caught.value.problems
+
+
+def test_a_second_identical_call_does_nothing_and_says_so(site, store):
+    first = add(store, "m", **site)
+    assert first.status == "done"
+    before = contents(store)
+    again = add(store, "m", **site)
+    assert again.status == "unchanged"
+    assert "nothing to do" in str(again)
+    assert (again.map, contents(store)) == (first.map, before)
+
+
+def test_the_same_files_elsewhere_under_other_names_are_the_same_map(site, store, tmp_path):
+    add(store, "m", height=site["height"])
+    (tmp_path / "copy.tif").write_bytes(site["height"].read_bytes())
+    assert add(store, "m", height=tmp_path / "copy.tif").status == "unchanged"
+
+
+def test_what_differs_is_named_and_needs_force(site, store, tmp_path):
+    add(store, "m", **site)
+    line = refused(store, "m", height=site["height"], ortho=site["ortho"], crs="EPSG:32633")[0]
+    assert "--terrain was given then, but is not now" in line
+    assert "--crs is EPSG:32633, was not given" in line
+    assert "--force" in line
+    other = write_tif(
+        tmp_path / "h2.tif", np.ones((1, 60, 60), np.float32), WORLD.crs, Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000)
+    )
+    assert "height has another content (h2.tif)" in refused(store, "m", **{**site, "height": other})[0]
+    assert add(store, "m", height=other, force=True).status == "done"
+    assert open_map(store / "maps/m.zarr").layers == ("height",)
+
+
+def test_what_lies_beside_a_raster_belongs_to_it(site, store, tmp_path):
+    """A mask or an overview beside a raster changes what it says."""
+    height = tmp_path / "h.tif"
+    height.write_bytes(site["height"].read_bytes())
+    add(store, "m", height=height)
+    statistics = "<PAMDataset><PAMRasterBand band='1'><NoDataValue>612</NoDataValue></PAMRasterBand></PAMDataset>"
+    (tmp_path / "h.tif.aux.xml").write_text(statistics)
+    assert "height has another content (h.tif.aux.xml)" in refused(store, "m", height=height)[0]
+
+
+def test_the_first_map_with_classes_sets_the_stores_table(site, store, tmp_path):
+    add(store, "bare", height=site["height"])
+    table = classes_file(tmp_path)
+    add(store, "one", height=site["height"], terrain=site["terrain"], classes=table)
+    add(store, "two", height=site["height"], terrain=site["terrain"])  # takes the store's, with its values
+    one, two = (open_map(store / f"maps/{name}.zarr") for name in ("one", "two"))
+    assert one.classes == two.classes
+    assert [entry.name for entry in two.classes.classes] == ["meadow", "bog", "gravel"]
+    np.testing.assert_array_equal(one.read("terrain", 0, 60, 0, 60), two.read("terrain", 0, 60, 0, 60))
+    other_values = classes_file(tmp_path, CLASSES.replace("\n5,", "\n50,"), "v.csv")
+    add(store, "three", height=site["height"], terrain=site["terrain"], classes=other_values)
+    assert open_map(store / "maps/three.zarr").classes == one.classes
+
+
+def test_classes_that_are_not_the_stores_are_refused_one_line_a_difference(site, store, tmp_path):
+    add(store, "one", **site, classes=classes_file(tmp_path))
+    wrong = classes_file(tmp_path, CLASSES.replace("2,bog,yes", "2,bog,no") + "9,9,water,no\n", "w.csv")
+    problems = refused(store, "two", **site, classes=wrong)
+    assert "not the one of the store's other maps" in problems[0]
+    assert [line.partition(": ")[2] for line in problems[1:]] == [
+        "id 2 is bog (not traversable), but bog (traversable) in the other",
+        "id 9 is water (not traversable), but nothing in the other",
+    ]
+
+
+def test_the_only_map_may_be_replaced_with_other_classes(site, store, tmp_path):
+    add(store, "one", **site)
+    add(store, "one", **site, classes=classes_file(tmp_path), force=True)
+    assert open_map(store / "maps/one.zarr").classes.count == 3
+
+
+def test_a_map_that_cannot_be_read_is_replaced_by_force_and_asked_for_nothing(site, store, caplog):
+    add(store, "old", **site)
+    (store / "maps/old.zarr/zarr.json").write_text("{}")
+    assert "--force" in refused(store, "old", **site)[-1]
+    add(store, "new", **site)
+    assert "old cannot be read" in caplog.text
+    assert add(store, "old", **site, force=True).status == "done"
+
+
+def test_a_disk_that_takes_no_more_leaves_the_store_as_it_was(site, store):
+    """A limit on the size of files stands for a full disk: the write itself fails."""
+    add(store, "m", height=site["height"])
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, limits[1]))
+    try:
+        problems = refused(store, "m", StoreError, **site, force=True)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert problems == (f"{store / 'maps/m.zarr'}: cannot be written (File too large)",)
+
+
+def test_everything_wrong_with_the_files_is_said_at_once(site, store, tmp_path):
+    problems = refused(store, "m", height=tmp_path / "no.tif", terrain=site["terrain"], classes=tmp_path / "no.csv")
+    assert [line.rpartition("/")[2] for line in problems] == [
+        "no.tif: there is no such file",
+        "no.csv: cannot be read (No such file or directory)",
+    ]
+
+
+def test_the_command_prints_a_few_plain_lines(site, store):
+    arguments = ["add-map", "garden", "--store", str(store), "--quiet"]
+    for role, path in site.items():
+        arguments += [f"--{role}", str(path)]
+    result = CliRunner().invoke(cli, arguments, catch_exceptions=False)
+    lines = result.stdout.splitlines()
+    assert result.exit_code == 0
+    assert lines[:2] == [
+        f"{store / 'maps/garden.zarr'} (quick look: garden.png)",
+        "60 x 60 px of 0.2 m (12 x 12 m) in EPSG:32633",
+    ]
+    assert lines[2].startswith("height   100 % covered, from height.tif: 6")
+    assert lines[4].startswith("terrain  100 % covered, from terrain.tif: ")
+    assert len(lines) == 5
+
+
+def test_a_quick_look_shows_classes_over_the_orthophoto_and_gaps_in_white(site, store):
+    add(store, "m", **site)
+    picture = matplotlib.image.imread(store / "maps/m.png")[..., :3]
+    source = open_map(store / "maps/m.zarr")
+    grey, ids = (source.read(layer, 0, 60, 0, 60) for layer in ("ortho", "terrain"))
+    assert picture.shape == (60, 60, 3)
+    for class_id in np.unique(ids):  # within a class, the picture follows the grey
+        of_class = ids == class_id
+        slope = np.polyfit(grey[of_class] / 255.0, picture[of_class].mean(axis=1), 1)[0]
+        assert slope == pytest.approx(0.65, abs=0.02)
+    before = (store / "maps/m.png").read_bytes()
+    (store / "maps/m.png").unlink()
+    assert add(store, "m", **site).status == "unchanged"
+    assert (store / "maps/m.png").read_bytes() == before
+
+
+def test_a_quick_look_without_photo_is_a_relief_lit_from_the_north_west_and_small(store, tmp_path):
+    """Light falls along (-1/2, 1/2, 1/√2) east, north, up; a bank of 45° facing west has the normal (-1, 0, 1)/√2."""
+    height = np.zeros((1, 2000, 900), np.float32)
+    height[0, :200] = np.nan
+    height[0, 1000:] = np.arange(900) * 0.2
+    path = write_tif(tmp_path / "h.tif", height, WORLD.crs, Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000))
+    add(store, "m", height=path)
+    picture = matplotlib.image.imread(store / "maps/m.png")[..., 0]
+    assert picture.shape == (500, 225)
+    assert (picture[:49] == 1.0).all()
+    assert picture[150, 50] == pytest.approx(np.sqrt(0.5), abs=0.005)
+    assert picture[400, 50] == pytest.approx((0.5 + np.sqrt(0.5)) / np.sqrt(2.0), abs=0.005)

@@ -1,0 +1,119 @@
+"""A dataset from several maps: every sample lies on exactly one of them, and shows the ground that is there."""
+
+import json
+
+import numpy as np
+import pyproj
+import pytest
+from click.testing import CliRunner
+from map_worlds import write_tif
+from rasterio import Affine
+from synthetic_store import WORLD, add_run, lanes, segments
+
+from tcpipe.cli import cli
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import DatasetError, MapError
+from tcpipe.formats.dataset_files import read_card, read_samples
+from tcpipe.formats.map_building import build_map
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+
+
+def put_map(store, directory, name, first_m, last_m, *, layers=("height", "ortho", "terrain"), crs=None):
+    """A map of the world between two eastings [m from its middle]."""
+    directory = directory / name
+    directory.mkdir()
+    x, y = WORLD.centres(0.1)
+    columns = slice(round((first_m + 20.0) / 0.1), round((last_m + 20.0) / 0.1))
+    x, y = x[:, columns], y[:, columns]
+    affine = Affine(0.1, 0.0, WORLD.x_m + first_m, 0.0, -0.1, WORLD.y_m + 20.0)
+    values = {
+        "height": WORLD.height(x, y).astype(np.float32),
+        "ortho": np.rint(WORLD.grey(x, y)).astype(np.uint8),
+        "terrain": WORLD.terrain(x, y).astype(np.uint8),
+    }
+    paths = {layer: write_tif(directory / f"{layer}.tif", values[layer][None], WORLD.crs, affine) for layer in layers}
+    build_map(store.map_path(name), name=name, crs=crs, **paths)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """Lanes across two overlapping maps, the eastern one in a national CRS on another datum."""
+    directory = tmp_path_factory.mktemp("maps")
+    store = Store(directory / "store")
+    store.root.mkdir()
+    put_map(store, directory, "west", -20.0, 4.0)
+    put_map(store, directory, "east", -4.0, 20.0, crs="EPSG:31256")
+    put_map(store, directory, "bare", -20.0, 20.0, layers=("height",))
+    start, end = lanes(np.arange(-14.0, 14.0, 1.3), -15.0, 15.0)
+    add_run(store, "a", segments("a", start, end))
+    return store
+
+
+def build(store, out, names, **keywords):
+    return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
+
+
+@pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])
+def test_every_sample_lies_on_the_first_map_that_has_it_and_shows_the_world(store, tmp_path, order):
+    result = build(store, tmp_path / "out", order)
+    assert result.samples > 600
+    samples = read_samples(tmp_path / "out")
+    names, ids = np.array(samples["map"].to_pylist()), samples["sample_id"].to_pylist()
+    assert len(set(ids)) == len(ids)
+    to_map = pyproj.Transformer.from_crs(4326, WORLD.crs, always_xy=True)
+    ends = [to_map.transform(samples[f"{e}_lon_deg"], samples[f"{e}_lat_deg"]) for e in ("start", "end")]
+    (x0, y0), (x1, y1) = (np.array(end) for end in ends)
+    middle = (x0 + x1) / 2.0 - WORLD.x_m
+    assert (names[middle < -5.0] == "west").all()
+    assert (names[middle > 5.0] == "east").all()
+    assert (names[np.abs(middle) < 3.0] == order[0]).all()
+
+    split = {name: open_dataset(tmp_path / "out")[name] for name in ("train", "test")}
+    along, left = np.meshgrid((np.arange(40) + 0.5) / 40, 0.5 - (np.arange(40) + 0.5) / 40)
+    for name, part in split.items():
+        chosen = np.array(samples["split"].to_pylist()) == name
+        dx, dy = (x1 - x0)[chosen, None, None], (y1 - y0)[chosen, None, None]
+        x = x0[chosen, None, None] + along * dx - left * dy
+        y = y0[chosen, None, None] + along * dy + left * dx
+        height = WORLD.height(x, y)
+        wanted = np.clip(height - height.min(axis=(1, 2), keepdims=True), 0.0, 1.0)
+        assert np.abs(part.patches[..., 2] - wanted).max() < 0.003 + 4.0 * WORLD.bilinear_bound_m(0.1)
+        assert np.abs(part.patches[..., 0] - WORLD.grey(x, y) / 255.0).max() < 0.01
+    counts = {name: int((names == name).sum()) for name in order}
+    assert min(counts.values()) > 200
+
+
+def test_the_card_names_the_maps_in_their_order_and_a_second_call_does_nothing(store, tmp_path):
+    build(store, tmp_path / "out", ["east", "west"])
+    card = read_card(tmp_path / "out")
+    assert [entry["name"] for entry in card["maps"]] == ["east", "west"]
+    assert [entry["crs"] for entry in card["maps"]] == ["EPSG:31256", "EPSG:32633"]
+    assert build(store, tmp_path / "out", ["east", "west"]).status == "unchanged"
+    assert build(store, tmp_path / "out", ["west", "east"]).status == "done"
+
+
+def test_the_same_bytes_however_the_segments_are_cut_into_batches(store, tmp_path, monkeypatch):
+    monkeypatch.setattr("tcpipe.pipeline.dataset_sampling._BATCH_ROWS", 97)
+    build(store, tmp_path / "cut", ("west", "east"))
+    monkeypatch.undo()
+    build(store, tmp_path / "whole", ("west", "east"))
+    assert read_card(tmp_path / "cut")["checksums"] == read_card(tmp_path / "whole")["checksums"]
+
+
+def test_what_cannot_be_built_from_is_said_in_one_line(store, tmp_path):
+    with pytest.raises(MapError, match="map bare: has height, but map west has height, ortho, terrain"):
+        build(store, tmp_path / "out", ("west", "bare"))
+    with pytest.raises(DatasetError, match="no map 'moon' in the store; there are bare, east, west"):
+        build(store, tmp_path / "out", ("west", "moon"))
+    with pytest.raises(DatasetError, match=r"3 maps in the store .*name one with --map, or several"):
+        build(store, tmp_path / "out", None)
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_option_may_be_repeated(store, tmp_path):
+    arguments = ["build-dataset", str(tmp_path / "out"), "--store", str(store.root), "--map", "west", "--map", "east"]
+    result = CliRunner().invoke(cli, [*arguments, "--quiet", "--json"], catch_exceptions=False)
+    assert result.exit_code == 0
+    assert json.loads(result.stdout)["samples"] > 600

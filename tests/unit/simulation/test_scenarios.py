@@ -1,0 +1,72 @@
+"""Scenarios and the page that describes them."""
+
+import re
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tcpipe.simulation import Faults, scenario, simulated_drive, tiny, true_cost
+from tcpipe.simulation.scenarios import SCENARIOS, paper_world
+
+PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "simulation.md").read_text(encoding="utf-8")
+
+
+def test_the_reference_names_every_scenario_and_fault():
+    rows = set(re.findall(r"^\| `(\w+)`", PAGE, flags=re.MULTILINE))
+    assert rows == set(SCENARIOS) | {field.name for field in fields(Faults)}
+
+
+def test_the_references_example_runs():
+    code = re.search(r"```python\n(.*?)```", PAGE, flags=re.DOTALL)[1]
+    found = {}
+    exec(code, found)  # noqa: S102 - the page's own example
+    assert np.isfinite(found["cost"].energy_joule).any()
+
+
+@pytest.mark.parametrize("name", sorted(SCENARIOS))
+def test_every_scenario_starts_on_free_ground_inside_its_site(name):
+    made = scenario(name)
+    for drive in made.drives:
+        x, y = (
+            np.array([offset + at])
+            for offset, at in zip((made.world.site.west_m, made.world.site.south_m), drive.start_m, strict=True)
+        )
+        assert made.world.terrain_class(x, y)[0] >= 4
+        assert 0 < drive.start_m[0] < made.world.site.width_m
+        assert 0 < drive.start_m[1] < made.world.site.height_m
+
+
+def test_the_papers_site_is_as_high_and_large_as_the_papers():
+    world = paper_world()
+    x = world.site.west_m + np.arange(0.5, 596.0)
+    y = world.site.south_m + np.arange(0.5, 305.0)
+    heights = world.height_m(x[None, :], y[:, None])
+    assert (heights.min(), heights.max()) == pytest.approx((574.8, 661.3), abs=1e-6)
+    assert heights.shape == (305, 596)
+
+
+def test_hills12_is_twelve_hilly_minutes():
+    truth, _ = simulated_drive(scenario("hills12"))
+    assert (truth.stamp_ns[-1] - truth.stamp_ns[0]) * 1e-9 == pytest.approx(720, abs=40)
+    fast = truth.forward_velocity_mps > 0.5
+    slopes = np.degrees(truth.slope_rad[fast])
+    assert slopes.min() < -18
+    assert slopes.max() > 18
+    assert truth.power_watt[fast].mean() == pytest.approx(155, abs=15)  # the paper's 150 to 165 W
+    assert (truth.power_watt < 0).sum() > 1000
+
+
+def test_a_metre_costs_what_the_paper_found():
+    truth, _ = simulated_drive(scenario("hills12"))
+    steady = truth.stamp_ns[(truth.command_velocity_mps > 0.99) & (truth.forward_velocity_mps > 0.6)][::200]
+    cost = true_cost(truth, steady)
+    assert np.nanmedian(cost.duration_s) == pytest.approx(1.2, abs=0.1)
+    assert np.nanmean(cost.energy_joule) == pytest.approx(200, abs=30)
+
+
+def test_tiny_drives_last_about_as_long_as_asked():
+    for seconds in (20.0, 40.0, 60.0):
+        truth, _ = simulated_drive(tiny(seconds=seconds))
+        assert (truth.stamp_ns[-1] - truth.stamp_ns[0]) * 1e-9 == pytest.approx(seconds, abs=9.0)

@@ -1,0 +1,261 @@
+"""Readings against the truth they were made from: exact without faults, and each fault as strong as it says."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tcpipe.simulation import scenario, simulated_drive
+from tcpipe.simulation.faults import Faults
+from tcpipe.simulation.robot import GRAVITY_MPS2
+from tcpipe.simulation.scenarios import small_world
+from tcpipe.simulation.sensors import CLOCK_STEP_NS, Noise, Power, Sensors, Visual, record
+
+SITE = small_world().site
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return simulated_drive(scenario("manoeuvres"))[0]
+
+
+@pytest.fixture(scope="module")
+def long_truth():
+    return simulated_drive(scenario("hills12"))[0]
+
+
+def readings(truth, *names, sensors=None, seed=1):
+    faults = Faults.only(*names)
+    return record(truth, SITE, (sensors or Sensors()).mounted(faults), faults, Noise(seed, 0))
+
+
+def local(reading):
+    return SITE.enu_m(*(reading.values[name] for name in ("lon_deg", "lat_deg", "alt_m")))
+
+
+def test_without_faults_every_sensor_tells_the_truth(truth):
+    said = readings(truth)
+    for reading in said.values():
+        np.testing.assert_array_equal(reading.stamp_ns, reading.log_time_ns)
+    gnss = said["gnss"]
+    np.testing.assert_allclose(local(gnss), truth.at(gnss.stamp_ns).enu_m, atol=1e-6)
+    wheels = said["wheels"]
+    np.testing.assert_allclose(
+        wheels.values["velocity_mps"], truth.at(wheels.stamp_ns).forward_velocity_mps, atol=1e-12
+    )
+    at = truth.at(said["power"].stamp_ns)
+    np.testing.assert_allclose(said["power"].values["voltage_volt"], at.voltage_volt, atol=1e-12)
+    drawn = said["power"].values["left_amp"] + said["power"].values["right_amp"]
+    np.testing.assert_allclose(drawn, at.current_amp, atol=1e-9)
+    command = said["command"].values["velocity_mps"]
+    assert set(np.unique(np.round(command, 12))) == {-1.0, 0.0, 0.5, 1.0}
+
+
+def test_rates_are_as_given(truth):
+    said = readings(truth)
+    rates = {name: 1e9 / np.median(np.diff(reading.stamp_ns)) for name, reading in said.items()}
+    assert rates == pytest.approx(
+        {"gnss": 10, "imu": 100, "wheels": 50, "visual": 30, "power": 20, "command": 20}, rel=1e-6
+    )
+
+
+def test_imu_at_rest_feels_gravity_through_its_attitude(truth):
+    imu = readings(truth)["imu"]
+    at = truth.at(imu.stamp_ns)
+    still = imu.stamp_ns < truth.stamp_ns[0] + 2_500_000_000
+    felt = Rotation.from_quat(at.quat_xyzw[still]).apply(imu.values["specific_force_mps2"][still])
+    np.testing.assert_allclose(felt, np.broadcast_to([0.0, 0.0, GRAVITY_MPS2], felt.shape), atol=1e-5)
+    np.testing.assert_allclose(imu.values["angular_velocity_radps"][still], 0.0, atol=1e-9)
+
+
+def test_imu_integrates_to_the_motion(truth):
+    """Strapdown by the plainest sums over 20 s, from the true start: what is left is the sampling's."""
+    imu = readings(truth, sensors=replace(Sensors(), imu=replace(Sensors().imu, rate_hz=200.0)))["imu"]
+    first = int(np.searchsorted(imu.stamp_ns, truth.stamp_ns[0] + 2_500_000_000))
+    at = truth.at(imu.stamp_ns)
+    pose, velocity, place = Rotation.from_quat(at.quat_xyzw[first]), at.velocity_enu_mps[first], at.enu_m[first]
+    for i in range(first, first + 4000):
+        acceleration = pose.apply(imu.values["specific_force_mps2"][i]) - [0.0, 0.0, GRAVITY_MPS2]
+        place = place + velocity * 0.005 + 0.5 * acceleration * 0.005**2
+        velocity = velocity + acceleration * 0.005
+        pose = pose * Rotation.from_rotvec(imu.values["angular_velocity_radps"][i] * 0.005)
+    assert np.linalg.norm(at.enu_m[first + 4000] - at.enu_m[first]) > 5.0
+    assert np.linalg.norm(velocity - at.velocity_enu_mps[first + 4000]) < 0.05
+    assert np.linalg.norm(place - at.enu_m[first + 4000]) < 0.5
+
+
+def test_lever_arm_and_mounting_turn_with_the_robot(truth):
+    gnss = readings(truth, "gnss_lever_arm")["gnss"]
+    at = truth.at(gnss.stamp_ns)
+    np.testing.assert_allclose(
+        local(gnss) - at.enu_m, Rotation.from_quat(at.quat_xyzw).apply([0.1, 0.0, 0.9]), atol=1e-6
+    )
+    imu = readings(truth, "imu_mounting")["imu"]
+    at = truth.at(imu.stamp_ns)
+    base_from_unit = Rotation.from_euler("xyz", [np.pi, 0.0, np.pi / 2])
+    np.testing.assert_allclose(
+        base_from_unit.apply(imu.values["angular_velocity_radps"]), at.angular_velocity_radps, atol=1e-9
+    )
+    wanted = Rotation.from_quat(at.quat_xyzw) * base_from_unit
+    off = (wanted.inv() * Rotation.from_quat(imu.values["orientation_xyzw"])).magnitude()
+    assert off.max() < 1e-6
+    still = imu.stamp_ns < truth.stamp_ns[0] + 2_500_000_000
+    felt = wanted[still].apply(imu.values["specific_force_mps2"][still])
+    np.testing.assert_allclose(felt[:, 2], GRAVITY_MPS2, atol=1e-5)
+
+
+def test_camera_twist_is_the_motion_of_its_own_place(truth):
+    visual = readings(truth)["visual"]
+    before, after = truth.at(visual.stamp_ns - 5_000_000), truth.at(visual.stamp_ns + 5_000_000)
+    lever = np.array(Visual().mounting.xyz_m)
+    moved = (after.enu_m + Rotation.from_quat(after.quat_xyzw).apply(lever)) - (
+        before.enu_m + Rotation.from_quat(before.quat_xyzw).apply(lever)
+    )
+    enu_from_camera = Rotation.from_quat(truth.at(visual.stamp_ns).quat_xyzw) * Rotation.from_euler(
+        "xyz", Visual().mounting.rpy_rad
+    )
+    inner = slice(5, -5)
+    np.testing.assert_allclose(
+        visual.values["linear_mps"][inner], enu_from_camera.inv().apply(moved / 0.01)[inner], atol=0.01
+    )
+
+
+def test_camera_pose_repeats_the_true_increments(truth):
+    visual = readings(truth)["visual"]
+    at = truth.at(visual.stamp_ns)
+    camera = Rotation.from_quat(at.quat_xyzw) * Rotation.from_euler("xyz", Visual().mounting.rpy_rad)
+    place = at.enu_m + Rotation.from_quat(at.quat_xyzw).apply(np.array(Visual().mounting.xyz_m))
+    relative = camera[0].inv().apply(place - place[0])
+    np.testing.assert_allclose(visual.values["position_m"], relative, atol=1e-6)
+    left = ((camera[0].inv() * camera).inv() * Rotation.from_quat(visual.values["orientation_xyzw"])).magnitude()
+    assert left.max() < 1e-6
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Faults)])
+def test_each_fault_changes_its_sensor_alone(truth, name):
+    plain, faulty = readings(truth), readings(truth, name)
+    changed = {sensor for sensor in plain if not same(plain[sensor], faulty[sensor])}
+    everyone = set(plain)
+    wanted = {"transport_delay": everyone, "duplicates": everyone, "clock_step": everyone}
+    assert changed == wanted.get(name, {name.split("_")[0].replace("wheel", "wheels")})
+
+
+@pytest.mark.parametrize("sensor", ["gnss", "wheels", "imu", "visual", "power"])
+def test_a_clock_offset_moves_header_stamps_by_its_constant(truth, sensor):
+    plain, late = (
+        readings(truth)[sensor],
+        readings(truth, f"{sensor.rstrip('s') if sensor == 'wheels' else sensor}_clock_offset")[sensor],
+    )
+    assert set(late.stamp_ns - plain.stamp_ns) == {round(1e9 * getattr(Sensors(), sensor).clock_offset_s)}
+
+
+def same(one, other):
+    return (
+        np.array_equal(one.stamp_ns, other.stamp_ns)
+        and np.array_equal(one.log_time_ns, other.log_time_ns)
+        and all(np.array_equal(one.values[key], other.values[key], equal_nan=True) for key in one.values)
+    )
+
+
+def test_a_fault_leaves_the_noise_of_others_as_it_was(truth):
+    alone = readings(truth, "gnss_noise")["gnss"]
+    both = readings(truth, "gnss_noise", "gnss_stamp_jitter", "imu_noise", "transport_delay")["gnss"]
+    np.testing.assert_array_equal(alone.values["lon_deg"], both.values["lon_deg"])
+
+
+def test_noise_is_as_strong_as_said(long_truth):
+    every = {"gnss_noise", "wheel_noise", "imu_noise", "visual_noise", "power_noise", "gnss_stamp_jitter"}
+    plain, noisy = readings(long_truth), readings(long_truth, *every)
+    sensors = Sensors()
+    error = local(noisy["gnss"]) - local(plain["gnss"])
+    np.testing.assert_allclose(error.std(axis=0), [0.015, 0.015, 0.025], rtol=0.05)
+    assert np.abs(error.mean(axis=0)).max() < 0.001
+    moving = np.abs(plain["wheels"].values["velocity_mps"]) > 0.3
+    wheel = (noisy["wheels"].values["velocity_mps"] - plain["wheels"].values["velocity_mps"])[moving]
+    assert wheel.std() == pytest.approx(sensors.wheels.std_mps, rel=0.05)
+    gyro = noisy["imu"].values["angular_velocity_radps"] - plain["imu"].values["angular_velocity_radps"]
+    assert gyro.std() == pytest.approx(sensors.imu.gyro_std_radps, rel=0.02)
+    force = noisy["imu"].values["specific_force_mps2"] - plain["imu"].values["specific_force_mps2"]
+    assert force.std() == pytest.approx(sensors.imu.accelerometer_std_mps2, rel=0.02)
+    visual = noisy["visual"].values["linear_mps"] - plain["visual"].values["linear_mps"]
+    assert visual.std() == pytest.approx(sensors.visual.std_mps, rel=0.03)
+    current = noisy["power"].values["left_amp"] - plain["power"].values["left_amp"]
+    assert current.std() == pytest.approx(np.hypot(0.08, 0.05 / np.sqrt(12)), rel=0.05)
+    steps = noisy["power"].values["left_amp"] / sensors.power.current_step_amp
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+    jitter = (noisy["gnss"].stamp_ns - plain["gnss"].stamp_ns) * 1e-9
+    assert jitter.std() == pytest.approx(0.002, rel=0.1)
+
+
+def test_outliers_outages_and_gaps(long_truth):
+    said = readings(long_truth, "gnss_outliers", "gnss_outage", "visual_dropouts", "visual_outliers", "power_gap")
+    plain = readings(long_truth)
+    gnss = said["gnss"]
+    blind = gnss.values["status"] < 0
+    assert blind.sum() == pytest.approx(50, abs=1)
+    assert np.isnan(gnss.values["lat_deg"][blind]).all()
+    assert np.diff(gnss.stamp_ns).max() == pytest.approx(5.1e9, abs=0.15e9)
+    at = long_truth.at(gnss.stamp_ns[~blind]).enu_m
+    far = np.linalg.norm(local(gnss)[~blind] - at, axis=1) > 0.2
+    assert 0.004 < far.mean() < 0.016
+    assert np.diff(said["visual"].stamp_ns).max() == pytest.approx(3.0e9, abs=0.1e9)
+    assert np.diff(said["power"].stamp_ns).max() == pytest.approx(1.5e9, abs=0.1e9)
+    common = np.isin(plain["visual"].stamp_ns, said["visual"].stamp_ns)
+    off = (
+        np.linalg.norm(said["visual"].values["linear_mps"] - plain["visual"].values["linear_mps"][common], axis=1) > 0.5
+    )
+    assert 0.001 < off.mean() < 0.008
+
+
+def test_slip_is_what_the_wheels_hide(long_truth):
+    wheels = readings(long_truth, "wheel_slip")["wheels"]
+    at = long_truth.at(wheels.stamp_ns)
+    moving = np.abs(at.forward_velocity_mps) > 0.3
+    slip = 1.0 - at.forward_velocity_mps[moving] / wheels.values["velocity_mps"][moving]
+    assert 0.08 < slip.max() < 0.13
+    assert slip.min() < 0.0
+
+
+def test_scale_and_bias(long_truth):
+    scaled = readings(long_truth, "wheel_scale", "visual_scale", "imu_bias", "imu_yaw_offset")
+    plain = readings(long_truth)
+    moving = np.abs(plain["wheels"].values["velocity_mps"]) > 0.3
+    ratio = scaled["wheels"].values["velocity_mps"][moving] / plain["wheels"].values["velocity_mps"][moving]
+    np.testing.assert_allclose(ratio, Sensors().wheels.scale, rtol=1e-12)
+    bias = (scaled["imu"].values["angular_velocity_radps"] - plain["imu"].values["angular_velocity_radps"]).mean(axis=0)
+    assert (np.abs(bias) > 0.001).all()
+    assert (np.abs(bias) < 0.01).all()
+    turned = Rotation.from_quat(plain["imu"].values["orientation_xyzw"]).inv() * Rotation.from_quat(
+        scaled["imu"].values["orientation_xyzw"]
+    )
+    np.testing.assert_allclose(turned.magnitude(), 0.14, atol=1e-6)
+
+
+def test_averaged_power_sums_to_the_energy(long_truth):
+    averaged = readings(long_truth, sensors=replace(Sensors(), power=Power(averaged=True)))["power"]
+    current = averaged.values["left_amp"] + averaged.values["right_amp"]
+    energy = np.sum(averaged.values["voltage_volt"][1:] * current[1:]) / 20.0
+    span = long_truth.at(averaged.stamp_ns[[0, -1]]).energy_joule
+    assert energy == pytest.approx(span[1] - span[0], rel=2e-4)
+
+
+def test_clock_step_moves_headers_only(truth):
+    stepped, plain = readings(truth, "clock_step")["imu"], readings(truth)["imu"]
+    moved = stepped.stamp_ns - plain.stamp_ns
+    assert set(np.unique(moved)) == {0, CLOCK_STEP_NS}
+    assert (np.diff(moved) >= 0).all()
+    np.testing.assert_array_equal(stepped.log_time_ns, plain.log_time_ns)
+
+
+def test_delay_is_late_and_never_early(truth):
+    for name, reading in readings(truth, "transport_delay").items():
+        late = (reading.log_time_ns - reading.stamp_ns) * 1e-9
+        assert late.min() > 0, name
+        assert late.mean() == pytest.approx(getattr(Sensors(), name).delay_s, rel=0.1), name
+
+
+def test_seeds_differ_and_repeat(truth):
+    first, again, other = (readings(truth, "gnss_noise", seed=seed)["gnss"] for seed in (1, 1, 2))
+    assert same(first, again)
+    assert not same(first, other)

@@ -1,0 +1,251 @@
+"""The files of a simulated site, read back by rasterio, rosbags, mcap and json, never by our own readers."""
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from shapely.geometry import Point, shape
+
+from tcpipe.errors import UsageError
+from tcpipe.simulation import Faults, read_truth, scenario, simulate, simulated_drive, tiny
+from tcpipe.simulation.messages import Recorder
+from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, small_world
+from tcpipe.terrain.classes import PAPER_CLASSES
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    return simulate(tmp_path_factory.mktemp("site"), scenario=tiny(Faults.every(), seconds=20.0), seed=3)
+
+
+def ros1_in_mcap(path: Path):
+    store = get_typestore(Stores.ROS1_NOETIC)
+    found = {}
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert (schema.encoding, channel.message_encoding) == ("ros1msg", "ros1")
+            name = schema.name.replace("/", "/msg/")
+            if name not in store.types:
+                store.register(get_types_from_msg(schema.data.decode(), name))
+            row = message.log_time, store.deserialize_ros1(message.data, name)
+            found.setdefault(channel.topic, []).append(row)
+    return found
+
+
+def messages(path: Path):
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        found = {}
+        for connection, log_time, raw in reader.messages():
+            found.setdefault(connection.topic, []).append((log_time, reader.deserialize(raw, connection.msgtype)))
+    return found
+
+
+def stamps(rows):
+    return np.array([row.header.stamp.sec * 1_000_000_000 + row.header.stamp.nanosec for _, row in rows])
+
+
+def test_rasters_equal_the_world_at_their_pixel_centres(site):
+    world = small_world()
+    for name in ("height", "ortho", "terrain"):
+        with rasterio.open(site.rasters[name]) as raster:
+            assert raster.crs.to_epsg() == 32633
+            rng = np.random.default_rng(0)
+            rows, cols = rng.integers(0, raster.height, 4000), rng.integers(0, raster.width, 4000)
+            x, y = (np.array(values) for values in raster.xy(rows, cols))
+            mapped = world.mapped(x, y)
+            assert 0 < (~mapped).sum() < 1000
+            values = raster.read()[:, rows, cols]
+            if name == "height":
+                assert raster.dtypes == ("float32",)
+                np.testing.assert_allclose(values[0][mapped], world.height_m(x, y)[mapped], atol=1e-4)
+                assert (values[0][~mapped] == raster.nodata).all()
+            elif name == "ortho":
+                np.testing.assert_allclose(values[:3].T[mapped], np.clip(world.ortho(x, y)[mapped], 0, 255), atol=0.51)
+                np.testing.assert_array_equal(values[3], np.where(mapped, 255, 0))
+            else:
+                np.testing.assert_array_equal(values[0][mapped], 10 * world.terrain_class(x, y)[mapped])
+                assert (values[0][~mapped] == raster.nodata).all()
+                assert raster.colormap(1)[40] == (150, 200, 90, 255)
+
+
+def test_the_three_rasters_share_no_grid(site):
+    transforms = []
+    for name in ("height", "ortho", "terrain"):
+        with rasterio.open(site.rasters[name]) as raster:
+            transforms.append((raster.transform, raster.shape))
+    assert len(set(transforms)) == 3
+
+
+def test_class_table_names_the_papers_classes(site):
+    lines = site.rasters["classes"].read_text().splitlines()
+    assert lines[0] == "value,id,name,traversable"
+    assert [line.split(",") for line in lines[1:]] == [
+        [str(10 * c.id), str(c.id), c.name, str(c.traversable).lower()] for c in PAPER_CLASSES.classes
+    ]
+
+
+def test_region_is_geojson_in_wgs84_and_covers_a_part(site):
+    region = json.loads(site.region.read_text())
+    polygon = shape(region["features"][0]["geometry"])
+    truth = read_truth(site.truths[0])
+    assert polygon.contains(Point(truth.lon_deg[0], truth.lat_deg[0]))
+    assert not polygon.contains(
+        Point(*(value[0] for value in small_world().site.lonlat_deg(np.array([697715.0]), np.array([5208440.0]))))
+    )
+
+
+def test_truth_file_gives_the_truth_back(site):
+    kept = read_truth(site.truths[0])
+    truth, _ = simulated_drive(tiny(Faults.every(), seconds=20.0), seed=3)
+    for name in ("stamp_ns", "lon_deg", "quat_xyzw", "energy_joule", "terrain_class", "velocity_enu_mps"):
+        np.testing.assert_array_equal(getattr(kept, name), getattr(truth, name))
+
+
+def test_world_file_tells_every_parameter(site):
+    world = json.loads(site.world.read_text())
+    assert world["seed"] == 3
+    assert world["scenario"]["world"]["hills"][0]["height_m"] == 6.1
+    assert world["scenario"]["drives"][0]["faults"]["gnss_outliers"] is True
+
+
+def test_mcap_holds_the_readings(site):
+    _, readings = simulated_drive(tiny(Faults.every(), seconds=20.0), seed=3)
+    found = messages(site.logs[0])
+    imu = found["/a200_0000/sensors/imu_0/data"]
+    order = np.argsort(readings["imu"].log_time_ns, kind="stable")
+    np.testing.assert_array_equal(stamps(imu), readings["imu"].stamp_ns[order])
+    np.testing.assert_array_equal([t for t, _ in imu], readings["imu"].log_time_ns[order])
+    said = np.array([[m.linear_acceleration.x, m.linear_acceleration.y, m.linear_acceleration.z] for _, m in imu])
+    np.testing.assert_array_equal(said, readings["imu"].values["specific_force_mps2"][order])
+    quat = np.array([[m.orientation.x, m.orientation.y, m.orientation.z, m.orientation.w] for _, m in imu])
+    np.testing.assert_array_equal(quat, readings["imu"].values["orientation_xyzw"][order])
+    power = found["/a200_0000/platform/mcu/status/power"]
+    order = np.argsort(readings["power"].log_time_ns, kind="stable")
+    drawn = np.array([m.measured_currents for _, m in power])
+    np.testing.assert_array_equal(drawn[:, 1], readings["power"].values["left_amp"][order].astype(np.float32))
+    frames = {t.child_frame_id: t.transform.translation for _, m in found["/a200_0000/tf_static"] for t in m.transforms}
+    assert (frames["gps_link"].x, frames["gps_link"].z) == (0.1, 0.9)
+    assert all(m.header.frame_id == "gps_link" for _, m in found["/a200_0000/sensors/gps_0/fix"])
+
+
+def test_mcap_is_indexed_and_its_checksums_hold(site):
+    with site.logs[0].open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        assert {c.compression for c in summary.chunk_indexes} == {"zstd"}
+        assert sum(1 for _ in reader.iter_messages()) == summary.statistics.message_count > 3000
+
+
+@pytest.mark.parametrize(
+    ("container", "dialect"), [("bag", "ros1"), ("mcap", "ros1"), ("rosbag2", "ros2"), ("rosbag2_mcap", "ros2")]
+)
+def test_other_containers_hold_the_same_numbers(site, tmp_path, container, dialect):
+    recorder = replace(HUSKY_ROS1, dialect=dialect)
+    drive = tiny(Faults.every(), container=container, recorder=recorder, seconds=20.0)
+    other = simulate(tmp_path, scenario=drive, seed=3)
+    found = (ros1_in_mcap if (container, dialect) == ("mcap", "ros1") else messages)(other.logs[0])
+    plain = messages(site.logs[0])
+    topic = "/husky_velocity_controller/odom" if dialect == "ros1" else "/a200_0000/platform/odom"
+    wheels = plain["/a200_0000/platform/odom"]
+    np.testing.assert_array_equal(stamps(found[topic]), stamps(wheels))
+    assert [m.twist.twist.linear.x for _, m in found[topic]] == [m.twist.twist.linear.x for _, m in wheels]
+    status = found["/status" if dialect == "ros1" else "/a200_0000/platform/mcu/status/power"]
+    assert status[0][1].__msgtype__ == "husky_msgs/msg/HuskyStatus"
+    assert 24.0 < status[5][1].battery_voltage < 28.0
+    said = simulated_drive(drive, seed=3)[1]["power"].values["left_amp"]
+    np.testing.assert_allclose([m.left_driver_current for _, m in status], said, rtol=1e-6)
+
+
+def test_power_is_averaged_where_the_message_says_so(tmp_path):
+    """clearpath's Power: the mean over the period that ends at the stamp, by its definition."""
+    for recorder, averaged in ((HUSKY_ROS1, False), (HUSKY_ROS2, True)):
+        truth, readings = simulated_drive(tiny(recorder=recorder, seconds=40.0), seed=3)
+        power = readings["power"]
+        watt = power.values["voltage_volt"] * (power.values["left_amp"] + power.values["right_amp"])
+        energy = np.interp(power.stamp_ns, truth.stamp_ns, truth.energy_joule)
+        mean = np.diff(energy) / np.diff(power.stamp_ns) * 1e9
+        now = np.interp(power.stamp_ns[1:], truth.stamp_ns, truth.power_watt)
+        changing = np.abs(now - mean) > 8.0
+        nearer_mean = np.abs(watt[1:] - mean)[changing].mean() < np.abs(watt[1:] - now)[changing].mean()
+        assert changing.sum() > 10
+        assert nearer_mean == averaged
+
+
+def test_gga_sentences_tell_the_fixes(tmp_path):
+    recorder = Recorder("ros1", "battery_state", gnss="nmea")
+    drive = tiny(container="bag", recorder=recorder, seconds=18.0)
+    found = messages(simulate(tmp_path, scenario=drive, seed=3).logs[0])
+    _, readings = simulated_drive(drive, seed=3)
+    fixes = readings["gnss"].values
+    for i, (_, message) in enumerate(found["/nmea_sentence"]):
+        body, checksum = message.sentence[1:].split("*")
+        assert np.bitwise_xor.reduce(np.frombuffer(body.encode(), np.uint8)) == int(checksum, 16)
+        parts = body.split(",")
+        lat = int(parts[2][:2]) + float(parts[2][2:]) / 60
+        lon = int(parts[4][:3]) + float(parts[4][3:]) / 60
+        assert lat == pytest.approx(fixes["lat_deg"][i], abs=2e-9)
+        assert lon == pytest.approx(fixes["lon_deg"][i], abs=2e-9)
+        assert float(parts[9]) + float(parts[11]) == pytest.approx(fixes["alt_m"][i], abs=1e-4)
+    assert (np.array([m.current for _, m in found["/battery_state"]]) < 0).mean() > 0.9
+
+
+def test_the_same_seed_gives_the_same_bytes(tmp_path):
+    def digests(directory):
+        return {
+            path.relative_to(directory): hashlib.sha256(path.read_bytes()).hexdigest()
+            for path in sorted(directory.rglob("*"))
+            if path.is_file()
+        }
+
+    def bag(container):
+        return tiny(
+            Faults.every(),
+            container=container,
+            recorder=HUSKY_ROS1 if container == "bag" else Recorder("ros2", "battery_states"),
+            seconds=17.0,
+        )
+
+    for container in ("mcap", "bag", "rosbag2"):
+        simulate(tmp_path / "a" / container, scenario=bag(container), seed=5)
+        simulate(tmp_path / "b" / container, scenario=bag(container), seed=5)
+    assert digests(tmp_path / "a") == digests(tmp_path / "b")
+    simulate(tmp_path / "c", scenario=bag("mcap"), seed=6)
+    assert digests(tmp_path / "c")[Path("logs/tiny.mcap")] != digests(tmp_path / "a" / "mcap")[Path("logs/tiny.mcap")]
+
+
+def test_a_second_call_does_nothing_and_what_is_something_else_stays(tmp_path):
+    out = tmp_path / "site"
+    assert not simulate(out, scenario=tiny(seconds=17.0)).unchanged
+    before = {path: path.stat().st_mtime_ns for path in out.rglob("*")}
+    assert simulate(out, scenario=tiny(seconds=17.0)).unchanged
+    with pytest.raises(UsageError, match="is not this simulated site"):
+        simulate(out, scenario=tiny(seconds=17.0), seed=2)
+    with pytest.raises(UsageError, match="is not this simulated site"):
+        simulate(tmp_path, scenario=tiny(seconds=17.0))
+    assert {path: path.stat().st_mtime_ns for path in out.rglob("*")} == before
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_demo_drives_every_traversable_class_and_slope():
+    classes, slopes = set(), []
+    for index in range(2):
+        truth, _ = simulated_drive(scenario("demo"), index)
+        fast = truth.forward_velocity_mps > 0.5
+        classes |= set(np.unique(truth.terrain_class[fast]).tolist())
+        slopes += [np.degrees(truth.slope_rad[fast]).min(), np.degrees(truth.slope_rad[fast]).max()]
+        assert 180 < (truth.stamp_ns[-1] - truth.stamp_ns[0]) * 1e-9 < 330
+    assert classes == {4, 5, 6, 7}
+    assert min(slopes) < -15 < 15 < max(slopes)
+
+
+def test_an_unknown_scenario_lists_those_there_are(tmp_path):
+    with pytest.raises(UsageError, match="demo, hills12"):
+        simulate(tmp_path, scenario="moon")
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,99 @@
+"""The analytic world against finite differences and hand-computed points."""
+
+import numpy as np
+import pytest
+from pyproj import Proj
+
+from tcpipe.simulation.scenarios import small_world
+from tcpipe.simulation.site import Site
+from tcpipe.simulation.world import GRASS, MUD, PAVED, Band, Ellipse, Hill, World
+
+SITE = Site()
+
+
+def places(count=400, seed=0):
+    rng = np.random.default_rng(seed)
+    return (
+        SITE.west_m + rng.uniform(0, SITE.width_m, count),
+        SITE.south_m + rng.uniform(0, SITE.height_m, count),
+    )
+
+
+def test_gradient_is_the_slope_of_the_height():
+    world = small_world()
+    x, y = places()
+    step = 1e-4
+    gx, gy = world.gradient(x, y)
+    np.testing.assert_allclose(gx, (world.height_m(x + step, y) - world.height_m(x - step, y)) / (2 * step), atol=2e-6)
+    np.testing.assert_allclose(gy, (world.height_m(x, y + step) - world.height_m(x, y - step)) / (2 * step), atol=2e-6)
+
+
+def test_one_hill_by_hand():
+    world = World(SITE, 600.0, hills=(Hill(50.0, 30.0, 5.0, 8.0, 10.0),))
+    height = world.height_m(np.array(SITE.west_m + 58.0), np.array(SITE.south_m + 20.0))
+    assert height == pytest.approx(600.0 + 5.0 * np.exp(-1.0), abs=1e-9)
+
+
+def test_rows_and_columns_give_the_same_as_points():
+    world = small_world()
+    x, y = SITE.west_m + np.arange(0.5, 120.0, 7.0), SITE.south_m + np.arange(0.5, 80.0, 7.0)
+    flat_x, flat_y = (values.ravel() for values in np.meshgrid(x, y))
+    for function in (world.height_m, world.terrain_class, world.mapped, world.resistance_factor):
+        grid = function(x[None, :], y[:, None])
+        np.testing.assert_allclose(grid.ravel(), function(flat_x, flat_y), atol=1e-9)
+    np.testing.assert_allclose(
+        world.ortho(x[None, :], y[:, None]).reshape(-1, 3), world.ortho(flat_x, flat_y), atol=1e-9
+    )
+
+
+def test_classes_by_hand_and_later_regions_win():
+    road = Band(PAVED, 0.0, 40.0, 0.0, 4.0)
+    mud = Ellipse(MUD, 60.0, 40.0, 6.0, 3.0, np.pi / 2)
+    world = World(SITE, 600.0, regions=(road, mud))
+    u = np.array([10.0, 10.0, 10.0, 60.0, 60.0, 64.0])
+    v = np.array([41.9, 42.1, 38.1, 45.9, 46.1, 40.0])
+    classes = world.terrain_class(SITE.west_m + u, SITE.south_m + v)
+    assert classes.tolist() == [PAVED, GRASS, PAVED, MUD, GRASS, PAVED]
+
+
+def test_a_block_sees_every_region_that_touches_it():
+    world = small_world()
+    x, y = places(4000, seed=3)
+    whole = world.terrain_class(x, y)
+    alone = np.array([int(world.terrain_class(x[i : i + 1], y[i : i + 1])[0]) for i in range(0, 4000, 10)])
+    np.testing.assert_array_equal(whole[::10], alone)
+    assert set(np.unique(whole)) == {1, 2, 3, 4, 5, 6, 7}
+
+
+def test_slopes_reach_the_papers_and_not_much_more():
+    world = small_world()
+    x = SITE.west_m + np.arange(0.25, 120.0, 0.5)[None, :]
+    y = SITE.south_m + np.arange(0.25, 80.0, 0.5)[:, None]
+    steepest = np.degrees(np.arctan(np.hypot(*world.gradient(x, y)))).max()
+    assert 22.5 < steepest < 28.0
+
+
+def test_grid_north_and_scale_are_the_projections():
+    x, y = np.array([SITE.west_m + 60.0]), np.array([SITE.south_m + 40.0])
+    scale, rotation = SITE.ground_from_map(x, y, np.zeros(1))
+    lon, lat = SITE.lonlat_deg(x, y)
+    factors = Proj(f"EPSG:{SITE.epsg}").get_factors(lon[0], lat[0])
+    assert 1.5 < factors.meridian_convergence < 2.2
+    assert np.degrees(rotation[0]) == pytest.approx(-factors.meridian_convergence, abs=1e-4)
+    assert scale[0] == pytest.approx(1.0 / factors.meridional_scale, abs=1e-8)
+    higher, _ = SITE.ground_from_map(x, y, np.array([6371.0]))
+    assert higher[0] / scale[0] == pytest.approx(1.001, abs=5e-6)
+
+
+def test_local_plane_is_metric_and_returns():
+    lon, lat = SITE.lonlat_deg(np.array([SITE.west_m, SITE.west_m + 100.0]), np.array([SITE.south_m, SITE.south_m]))
+    enu = SITE.enu_m(lon, lat, np.full(2, SITE.datum[2]))
+    scale, rotation = SITE.ground_from_map(
+        np.array([SITE.west_m + 50.0]), np.array([SITE.south_m]), np.full(1, SITE.datum[2])
+    )
+    along = enu[1] - enu[0]
+    assert np.hypot(along[0], along[1]) == pytest.approx(100.0 * scale[0], abs=1e-4)
+    assert np.arctan2(along[1], along[0]) == pytest.approx(rotation[0], abs=2e-5)
+    back = SITE.lonlatalt(enu)
+    np.testing.assert_allclose(back[0], lon, atol=1e-12)
+    np.testing.assert_allclose(back[2], SITE.datum[2], atol=1e-7)

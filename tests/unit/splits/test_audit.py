@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+from splits_squares import squares
+
+from tcpipe.splits.audit import audit_leakage, audit_lines
+
+
+def audit(split, centres, run=None, start=None, **keywords):
+    n = len(split)
+    run = np.unique(run or ["r"] * n, return_inverse=True)[1]
+    start = np.arange(n) if start is None else np.array(start)
+    return audit_leakage(np.array(split), run, start, squares(centres, **keywords), chord_m=1.0)
+
+
+def test_neighbours_on_one_track_share_no_ground_but_are_named():
+    test, unseen = audit(["train", "test", "train"], [(0, 0), (1, 0), (2, 0)])
+    assert (test.samples, test.overlapping_pairs, test.same_track_pairs) == (1, 0, 2)
+    assert test.nearest_train_min_m == pytest.approx(0.0, abs=1e-12)
+    assert unseen.samples == 0
+    assert unseen.nearest_train_min_m is None
+
+
+def test_a_place_driven_twice_is_shared_ground():
+    test, _ = audit(["train", "test", "test"], [(0, 0), (0.5, 0.5), (10, 0)], run=["a", "b", "b"])
+    assert (test.overlapping_samples, test.overlapping_pairs, test.repeated_place_samples) == (1, 1, 1)
+    assert test.same_track_pairs == 0
+    assert test.nearest_train_median_m == pytest.approx((0 + 9) / 2)
+
+
+def test_distances_are_between_footprints_not_centres():
+    test, _ = audit(["train", "test"], [(0, 0), (5, 0)], course_rad=np.pi / 4)
+    assert test.nearest_train_min_m == pytest.approx(5 - np.sqrt(2))
+
+
+def test_unseen_is_held_against_train_only():
+    _, unseen = audit(["test", "unseen", "train"], [(0, 0), (0, 0), (7, 0)])
+    assert unseen.overlapping_pairs == 0
+    assert unseen.nearest_train_min_m == pytest.approx(6)
+
+
+def test_a_gap_on_the_track_parts_neighbours():
+    test, _ = audit(["train", "test"], [(0, 0), (1.6, 0)])
+    assert test.same_track_pairs == 0
+
+
+def test_nothing_trains_is_said():
+    lines = list(audit_lines(audit(["test", "test"], [(0, 0), (1, 0)])))
+    assert lines == ["test: 2 samples; nothing trains"]
+
+
+def test_lines_name_each_held_out_split():
+    lines = list(audit_lines(audit(["train", "test", "unseen"], [(0, 0), (1, 0), (9, 0)])))
+    assert lines[0].startswith("test: 1 samples, 0 share ground with train")
+    assert "nearest train footprint 8.00 m" in lines[1]

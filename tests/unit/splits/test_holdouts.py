@@ -1,0 +1,134 @@
+import hashlib
+
+import numpy as np
+import pytest
+
+from tcpipe.splits.holdouts import UNDECIDED, Groups, blocks, draw_folds, draw_groups, draw_samples
+from tcpipe.splits.ranking import hash_ranks, order_ranks
+
+IDS = [f"run-{i:05d}" for i in range(1000)]
+
+
+def test_a_rank_is_the_hash_of_seed_and_name_and_nothing_else():
+    expected = hashlib.blake2b(b"7:run-00003", digest_size=8, person=b"test").digest()
+    assert int(hash_ranks(IDS, seed=7, purpose="test")[3]) == int.from_bytes(expected, "big")
+
+
+def ranks(names, seed=0):
+    return hash_ranks(names, seed=seed, purpose="test")
+
+
+@pytest.mark.parametrize(("n", "tests"), [(6428, 1286), (5, 1), (6, 2), (35, 7), (1, 1), (0, 0)])
+def test_test_is_the_ceiling_of_its_share(n, tests):  # 6428 is the paper's area A, 1286 its test set
+    assert draw_samples(ranks([str(i) for i in range(n)]), test_fraction=0.2).sum() == tests
+
+
+def test_test_holds_the_lowest_ranks():
+    found = ranks(IDS, seed=3)
+    test = draw_samples(found, test_fraction=0.2)
+    assert found[test].max() < found[~test].min()
+
+
+def test_samples_that_are_kept_stay_and_the_rest_fills_up():
+    kept = np.full(1000, UNDECIDED)
+    kept[:150], kept[150:300] = 1, 0
+    test = draw_samples(ranks(IDS), test_fraction=0.2, kept=kept)
+    assert test[:150].all()
+    assert not test[150:300].any()
+    assert test.sum() == 200
+
+
+def test_row_order_says_nothing_of_the_holdout():
+    order = np.argsort(order_ranks(IDS, seed=0))
+    test = draw_samples(ranks(IDS), test_fraction=0.5)[order]
+    first = test[:500].sum()
+    assert 190 < first < 310  # 250 ± 4 sigma; equal salts would give 0 or 500
+    assert sorted(order.tolist()) == list(range(1000))
+
+
+def grouped(sizes):
+    """Groups of so many samples each."""
+    return Groups(np.repeat(np.arange(len(sizes)), sizes), tuple(f"g{i}" for i in range(len(sizes))))
+
+
+def drawn(groups, arrival=None, **keywords):
+    """Whether each sample tests."""
+    arrival = np.zeros(len(groups.member), int) if arrival is None else arrival
+    return draw_groups(groups, arrival, **{"test_fraction": 0.2, "seed": 0, **keywords})[groups.member]
+
+
+def test_blocks_are_square_cells_of_the_plane():
+    found = blocks(np.array([[9.9, 0.1], [10.1, 0.1], [-0.1, 25.0], [3.0, 9.9]]), block_m=10.0)
+    assert [found.names[member] for member in found.member] == ["10:0:0", "10:1:0", "10:-1:2", "10:0:0"]
+
+
+def test_groups_stay_whole_and_come_near_to_the_share():
+    groups = grouped([1 + i % 14 for i in range(150)])
+    test = drawn(groups)
+    assert not set(groups.member[test]) & set(groups.member[~test])
+    assert abs(test.mean() - 0.2) <= 0.5 / len(test) + 1e-12  # single-sample groups allow the nearest count
+
+
+def test_a_group_that_would_overshoot_is_passed_over():
+    for seed in range(20):
+        assert drawn(grouped([60, 20, 20]), seed=seed).sum() == 20
+
+
+def test_two_groups_leave_one_to_test_and_one_to_train():
+    for seed in range(5):
+        assert drawn(grouped([50, 40]), seed=seed).sum() == 40
+
+
+def test_one_group_trains():
+    assert not drawn(grouped([9])).any()
+
+
+def test_nothing_tests_where_nothing_is_wanted():
+    assert not drawn(grouped([5] * 10), test_fraction=0.0).any()
+
+
+def test_what_came_later_takes_nothing_out_of_test():
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        member = rng.integers(0, 40, 600)
+        arrival = np.sort(rng.integers(0, 6, 600))
+        names = tuple(f"g{i}" for i in range(40))
+        before = np.zeros(40, bool)
+        for runs in range(1, 7):
+            here = arrival < runs
+            used, number = np.unique(member[here], return_inverse=True)
+            groups = Groups(number, tuple(names[i] for i in used))
+            test = np.zeros(40, bool)
+            test[used] = draw_groups(groups, arrival[here], test_fraction=0.2, seed=1)
+            assert not (before & ~test).any()
+            before = test
+        assert 0.15 < test[member].mean() < 0.3
+
+
+def test_kept_groups_stay_as_they_are():
+    groups = grouped([10] * 20)
+    kept = np.full(20, UNDECIDED)
+    kept[:3], kept[3:] = 1, 0
+    assert drawn(groups, kept=kept).sum() == 30
+
+
+def test_the_majority_decides_for_a_group():
+    groups = grouped([3, 2, 2])
+    assert groups.decided(np.array([1, 0, 1, UNDECIDED, 0, UNDECIDED, UNDECIDED])).tolist() == [1, 0, UNDECIDED]
+
+
+def test_folds_are_whole_groups_of_nearly_equal_size():
+    rng = np.random.default_rng(0)
+    groups = grouped(rng.integers(5, 60, 100))
+    fold = draw_folds(groups, np.zeros(len(groups.member), int), folds=5, seed=0)
+    sizes = np.bincount(fold[groups.member])
+    assert len(sizes) == 5
+    assert sizes.max() - sizes.min() <= 60
+
+
+def test_a_fold_once_given_stays():
+    groups = grouped([7] * 30)
+    arrival = groups.member // 10
+    early = arrival == 0
+    first = draw_folds(Groups(groups.member[early], groups.names[:10]), arrival[early], folds=3, seed=0)
+    assert draw_folds(groups, arrival, folds=3, seed=0)[:10].tolist() == first.tolist()

@@ -1,0 +1,73 @@
+"""The clock doctor on simulated drives with every fault on: offsets found as they were put in, none where there are none."""
+
+import tomllib
+from dataclasses import replace
+
+import pytest
+from simulated_streams import log_of, streams_of
+
+from tcpipe.recipe import FuseConfig, ReadConfig
+from tcpipe.simulation import scenario
+from tcpipe.stages.clock_doctor import clock_findings
+from tcpipe.stages.fuse_inputs import prepare_inputs
+
+LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
+WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020, "power": 0.050}
+FAULTS = {role: f"{role.split('_')[0]}_clock_offset" for role in LATE_S}
+
+
+def drive_log(tmp_path, index, seed, *late):
+    demo = scenario("demo")
+    drive = demo.drives[index]
+    faults = replace(drive.faults, **{FAULTS[role]: True for role in late})
+    return log_of(demo, replace(drive, faults=faults), tmp_path, seed=seed)
+
+
+def doctor(log, config=None):
+    streams = streams_of(log, config)
+    return clock_findings(streams, prepare_inputs(streams, FuseConfig()))
+
+
+@pytest.mark.parametrize("seed", [31, 32, 33, 34])
+@pytest.mark.parametrize("index", [0, 1])
+def test_clean_drives_give_no_warning(tmp_path, index, seed):
+    found = doctor(drive_log(tmp_path, index, seed))
+    assert found.warnings == ()
+    assert {"imu", "wheel_odometry", "visual_odometry"} <= {found.facts["reference"], *found.facts["offsets"]}
+
+
+@pytest.mark.parametrize(("role", "index"), [(role, k % 2) for k, role in enumerate(LATE_S)])
+def test_the_sensor_that_is_late_is_found_and_by_how_much(tmp_path, role, index):
+    found = doctor(drive_log(tmp_path, index, 41, role))
+    noted = {name: offset for name, offset in found.facts["offsets"].items() if offset["noted"]}
+    assert set(noted) == {role}
+    assert noted[role]["offset_s"] == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
+    (warning,) = found.warnings
+    assert warning.startswith(f"{role}: ")
+    assert "[read.time_offset_s]" in warning
+
+
+def test_the_recipe_line_corrects_it(tmp_path):
+    log = drive_log(tmp_path, 1, 42, "gnss", "power")
+    before = doctor(log)
+    assert {warning.split(":")[0] for warning in before.warnings} == {"gnss", "power"}
+    lines: dict[str, float] = {}
+    for role in ("gnss", "power"):
+        lines |= tomllib.loads(before.facts["offsets"][role]["recipe"])["read"]["time_offset_s"]
+    after = doctor(log, ReadConfig(time_offset_s=lines))
+    assert after.warnings == ()
+    # What is said of a corrected log holds for the log as it is: the offset in the recipe is counted in.
+    again = tomllib.loads(after.facts["offsets"]["gnss"]["recipe"])["read"]["time_offset_s"]["gnss"]
+    assert again == pytest.approx(lines["gnss"], abs=0.011)
+
+
+def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
+    """One start and one stop in half a minute, fixes of a metre: their clock is not spoken of, the gyroscope's is."""
+    tiny = scenario("tiny")
+    drive = tiny.drives[0]
+    sensors = replace(drive.sensors, gnss=replace(drive.sensors.gnss, std_m=1.0, rate_hz=1.0))
+    faults = replace(drive.faults, gnss_noise=True, wheel_noise=True, imu_noise=True)
+    found = doctor(log_of(tiny, replace(drive, sensors=sensors, faults=faults), tmp_path))
+    assert "gnss" not in found.facts["offsets"]
+    assert found.warnings == ()
+    assert not any(pair["determined"] for pair in found.facts["pairs"] if pair["late"] == "gnss")

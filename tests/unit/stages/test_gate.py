@@ -1,0 +1,114 @@
+"""What the gate drops of drives written down by formula, and what it must keep."""
+
+import numpy as np
+import pytest
+from made_tracks import make_track, stamps, straight_track
+
+from tcpipe.recipe import GateConfig
+from tcpipe.stages.gate import gate_track
+from tcpipe.tables.bits import DropReason
+
+T = np.arange(0, 60, 0.05)
+
+
+def gate(track, *, config=None, limit_mps=1.0):
+    return gate_track(track, config or GateConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
+
+
+def rows_of(gated, reason):
+    return (gated.table["dropped_by"].to_numpy() & np.uint32(reason)) != 0
+
+
+def start_and_stop(top=0.9, rate=1.0):
+    return np.clip(np.minimum(rate * (T - 5), rate * (50 - T)), 0, top)
+
+
+def test_a_terrain_slowdown_under_a_constant_command_is_kept():
+    speed = 0.9 - 0.6 * np.exp(-(((T - 30) / 1.0) ** 2))  # |dv/dt| up to 0.5 m/s²
+    gated = gate(straight_track(speed, commanded_mps=np.ones(len(T))))
+    assert (gated.table["dropped_by"].to_numpy() == 0).all()
+    without = gate(straight_track(speed))
+    assert rows_of(without, DropReason.ACCELERATING)[(T > 29) & (T < 31)].any()
+
+
+def test_start_and_stop_with_commands():
+    commanded = np.where((T >= 5) & (T < 49.1), 1.0, 0.0)
+    gated = gate(straight_track(start_and_stop(), commanded_mps=commanded))
+    accelerating = rows_of(gated, DropReason.ACCELERATING)
+    kept = gated.table["dropped_by"].to_numpy() == 0
+    assert T[accelerating & (T < 20)].max() == pytest.approx(7.0)
+    assert kept[(T > 7.05) & (T < 49.0)].all()
+    assert not kept[(T < 7) | (T > 49.1)].any()
+    assert rows_of(gated, DropReason.STANDING)[(T < 5) | (T > 50.1)].all()
+
+
+def test_start_and_stop_without_commands():
+    gated = gate(straight_track(start_and_stop()))
+    kept = gated.table["dropped_by"].to_numpy() == 0
+    assert kept[(T > 6.5) & (T < 48.5)].all()
+    assert not kept[(T < 5.9) | (T > 49.2)].any()
+    assert "no command topic" in gated.info.findings.warnings[0]
+
+
+def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
+    gated = gate(straight_track(start_and_stop(rate=0.4), commanded_mps=np.ones(len(T))))
+    kept = gated.table["dropped_by"].to_numpy() == 0
+    assert not kept[(T < 7) | (T > 48)].any()
+    assert kept[(T > 7.6) & (T < 47.4)].all()
+
+
+def test_below_the_limit_unless_it_is_unknown_or_allowed():
+    speed, commanded = np.full(len(T), 0.6), np.full(len(T), 0.7)
+    track = straight_track(speed, commanded_mps=commanded)
+    assert rows_of(gate(track), DropReason.BELOW_LIMIT).all()
+    assert not rows_of(gate(track, config=GateConfig(require_full_speed=False)), DropReason.BELOW_LIMIT).any()
+    unknown = gate(track, limit_mps=None)
+    assert not rows_of(unknown, DropReason.BELOW_LIMIT).any()
+    assert "gate.max_velocity_mps" in unknown.info.findings.warnings[0]
+    assert not rows_of(gate(track, config=GateConfig(max_velocity_mps=0.7)), DropReason.BELOW_LIMIT).any()
+    assert "100% of the moving track" in gate(track).info.findings.warnings[0]
+
+
+def test_stuck_has_its_own_reason():
+    gated = gate(straight_track(np.full(len(T), 0.01), wheel_mps=np.where(T < 30, 0.0, 0.7)))
+    assert rows_of(gated, DropReason.STANDING).tolist() == (T < 30).tolist()
+    assert rows_of(gated, DropReason.STUCK).tolist() == (T >= 30).tolist()
+
+
+def test_reversing_is_dropped_unless_kept():
+    position = np.column_stack((-0.5 * T, 0 * T, 0 * T))
+    velocity = np.tile([-0.5, 0.0, 0.0], (len(T), 1))
+    track = make_track(position, velocity, forward_mps=np.full(len(T), -0.5))
+    assert rows_of(gate(track), DropReason.REVERSING).all()
+    assert (gate(track, config=GateConfig(keep_reversing=True)).table["dropped_by"].to_numpy() == 0).all()
+
+
+def test_a_power_gap_is_a_gap_and_a_run_without_power_is_none():
+    power = np.where((T > 20) & (T < 22), np.nan, 150.0)
+    assert rows_of(gate(straight_track(np.full(len(T), 0.9), power_watt=power)), DropReason.GAP).tolist() == (
+        np.isnan(power).tolist()
+    )
+    assert not rows_of(gate(straight_track(np.full(len(T), 0.9))), DropReason.GAP).any()
+
+
+def test_relative_not_absolute_position_error_makes_a_gap():
+    speed = np.full(len(T), 0.9)
+    far_off = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.005))
+    assert not rows_of(far_off, DropReason.GAP).any()
+    unsure = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.12))
+    assert rows_of(unsure, DropReason.GAP).all()
+
+
+def test_rows_and_reasons_are_counted():
+    gated = gate(straight_track(start_and_stop(), commanded_mps=np.where((T >= 5) & (T < 49.1), 1.0, 0.0)))
+    facts = gated.info.findings.facts["gate"]
+    dropped_by = gated.table["dropped_by"].to_numpy()
+    assert facts["rows"] == len(T)
+    assert facts["rows_kept"] == (dropped_by == 0).sum()
+    assert facts["rows_dropped"]["standing"] == rows_of(gated, DropReason.STANDING).sum()
+
+
+def test_an_empty_track_and_one_row():
+    for count in (0, 1):
+        nothing = np.zeros((count, 3))
+        assert gate(make_track(nothing, nothing, stamp_ns=stamps(count))).table.num_rows == count

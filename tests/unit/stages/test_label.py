@@ -1,0 +1,260 @@
+"""Labels of segments whose cost is known in closed form, and the bits that they carry."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_tracks import make_track, power_streams, stamps, straight_track
+
+from tcpipe.cost.budget import CAUSES, in_words
+from tcpipe.recipe import GateConfig, LabelConfig, SegmentConfig
+from tcpipe.stages.gate import gate_track
+from tcpipe.stages.label import label_segments
+from tcpipe.stages.segment import segment_track
+from tcpipe.tables.bits import Quality
+from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.levels import Findings, Sensor, Streams
+
+T = np.arange(0, 60, 0.05)
+ZERO = stamps(1)[0]
+SPEED = np.full(len(T), 0.8)
+
+
+def label(track, streams, *, config=None, voltage_range_volt=(20.0, 30.0)):
+    gated = gate_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    return label_gated(gated, streams, config=config, voltage_range_volt=voltage_range_volt)
+
+
+def label_gated(gated, streams, *, config=None, voltage_range_volt=(20.0, 30.0)):
+    segments = segment_track(gated, SegmentConfig())
+    return label_segments(
+        segments,
+        gated,
+        streams,
+        config or LabelConfig(),
+        flag_arc_to_chord=1.01,
+        max_position_std_m=0.10,
+        voltage_range_volt=voltage_range_volt,
+    )
+
+
+def record(period_s=0.05, *, volt=lambda t: 24 + 0 * t, amp=lambda t: 6 + 0 * t, delay_s=0.0131):
+    t = np.arange(-1, 61, period_s) + delay_s
+    return ZERO + np.round(t * 1e9).astype(np.int64), volt(t), amp(t)
+
+
+def flagged(labelled, bit):
+    return (labelled.table["quality"].to_numpy() & np.uint32(bit)) != 0
+
+
+def test_constant_power_on_a_straight_line():
+    labelled = label(straight_track(SPEED), power_streams({"drive": record()}))
+    table = labelled.table
+    assert floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
+    assert floats(table, "velocity_mps") == pytest.approx(0.8, abs=1e-8)
+    assert floats(table, "power_watt") == pytest.approx(144.0)
+    assert floats(table, "energy_joule") == pytest.approx(180.0)
+    assert set(integers(table, "power_samples")) == {25}
+    assert (table["quality"].to_numpy() == int(Quality.NO_COMMAND)).all()
+    assert floats(table, "power_watt") * floats(table, "duration_s") == pytest.approx(floats(table, "energy_joule"))
+
+
+def test_whole_run_energy_and_where_it_went():
+    speed = np.clip(np.minimum(T - 5, 50 - T), 0, 0.8)
+    labelled = label(straight_track(speed), power_streams({"drive": record()}))
+    facts = labelled.info.findings.facts["label"]
+    stamp_ns, _, _ = record()
+    assert facts["energy_joule"] == pytest.approx(144.0 * (stamp_ns[-1] - stamp_ns[0]) * 1e-9)
+    entries = facts["energy_by_entry_joule"]
+    assert sum(entries.values()) == pytest.approx(facts["energy_joule"])
+    assert entries["standing"] == pytest.approx(144 * 15, rel=0.02)
+    seconds = labelled.info.findings.facts["segment"]["ledger_s"]
+    for name in ("standing", "accelerating"):
+        assert entries[name] == pytest.approx(144 * seconds[name], rel=1e-9)
+    assert entries["steady"] == pytest.approx(144 * sum(seconds[n] for n in ("kept", "curved", "leftover")), rel=1e-9)
+    assert facts["distance_m"] == pytest.approx(sum(labelled.ledger_m.values()))
+
+
+def test_two_rails_with_voltage_and_current_from_different_topics():
+    stamp_v, stamp_i = record(0.5)[0], record(0.04)[0]
+    nothing = lambda stamp: np.full(len(stamp), np.nan)  # noqa: E731
+
+    def rail(volt, amp):
+        stamp = np.concatenate((stamp_v, stamp_i))
+        return (
+            stamp,
+            np.concatenate((np.full(len(stamp_v), volt), nothing(stamp_i))),
+            np.concatenate((nothing(stamp_v), np.full(len(stamp_i), amp))),
+        )
+
+    labelled = label(straight_track(SPEED), power_streams({"left": rail(24.0, 3.0), "right": rail(25.0, 2.0)}))
+    assert floats(labelled.table, "power_watt") == pytest.approx(122.0)
+
+
+def test_a_current_that_changes_is_integrated_exactly_between_the_ends():
+    labelled = label(straight_track(SPEED), power_streams({"drive": record(amp=lambda t: 6 + 2 * t)}))
+    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    wanted = 24 * ((6 * end + end**2) - (6 * start + start**2))
+    assert floats(labelled.table, "energy_joule") == pytest.approx(wanted, rel=1e-9)
+
+
+def test_the_papers_sum_is_late_by_half_a_period():
+    labelled = label(
+        straight_track(SPEED),
+        power_streams({"drive": record(0.1, amp=lambda t: 6 + 2 * t)}),
+        config=LabelConfig(integration="right_endpoint"),
+    )
+    exact = label(straight_track(SPEED), power_streams({"drive": record(0.1, amp=lambda t: 6 + 2 * t)}))
+    more = floats(labelled.table, "power_watt") - floats(exact.table, "power_watt")
+    assert more.mean() == pytest.approx(24 * 2 * 0.05, rel=0.05)
+
+
+def test_averaged_sources_are_right_endpoint_rectangles():
+    stamp_ns, volt, _ = record(0.5)
+    t = (stamp_ns - ZERO) * 1e-9
+    mean_of_last_period = 6 + 2 * (t - 0.25)
+    streams = power_streams({"drive": (stamp_ns, volt, mean_of_last_period)}, averaged=True)
+    labelled = label(straight_track(SPEED), streams)
+    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    wanted = 24 * ((6 * end + end**2) - (6 * start + start**2))
+    assert floats(labelled.table, "energy_joule") == pytest.approx(wanted, abs=24 * 2 * 0.5**2 / 4 + 1e-6)
+    assert labelled.info.findings.facts["label"]["integration"] == "averaged"
+    assert not flagged(labelled, Quality.LOW_POWER_RATE).any()
+
+
+def test_a_run_without_power_has_null_labels():
+    labelled = label(straight_track(SPEED), Streams({}, {}, "husky"))
+    table = labelled.table
+    assert table["energy_joule"].null_count == table["power_std_watt"].null_count == table.num_rows > 0
+    assert floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
+    assert labelled.info.findings.facts["label"]["energy_joule"] is None
+
+
+def test_segments_beyond_the_record_have_null_labels_and_a_warning():
+    stamp_ns, volt, amp = record()
+    short = stamp_ns < ZERO + 30_000_000_000
+    labelled = label(straight_track(SPEED), power_streams({"drive": (stamp_ns[short], volt[short], amp[short])}))
+    unknown = np.isnan(floats(labelled.table, "energy_joule"))
+    assert unknown.tolist() == (integers(labelled.table, "end_ns") > stamp_ns[short][-1]).tolist()
+    assert any("have no label" in text for text in labelled.info.findings.warnings)
+
+
+@pytest.mark.parametrize(
+    ("period_s", "averaged", "low"), [(0.1, False, False), (0.12, False, True), (0.5, True, False), (0.6, True, True)]
+)
+def test_low_power_rate(period_s, averaged, low):
+    labelled = label(straight_track(SPEED), power_streams({"drive": record(period_s)}, averaged=averaged))
+    assert flagged(labelled, Quality.LOW_POWER_RATE).all() == low
+    assert any("power comes at" in text for text in labelled.info.findings.warnings) == low
+
+
+def test_voltage_out_of_range_where_it_is():
+    volt = lambda t: np.where((t > 20) & (t < 21), 19.0, 24.0)  # noqa: E731
+    labelled = label(straight_track(SPEED), power_streams({"drive": record(volt=volt)}))
+    found = flagged(labelled, Quality.VOLTAGE_OUT_OF_RANGE)
+    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    assert found[(start < 20) & (end > 21)].all() or found[(start < 21) & (end > 20.1)].all()
+    assert not found[(end < 19.9) | (start > 21.1)].any()
+    none = label(straight_track(SPEED), power_streams({"drive": record(volt=volt)}), voltage_range_volt=None)
+    assert not flagged(none, Quality.VOLTAGE_OUT_OF_RANGE).any()
+
+
+def test_near_a_gap_within_a_chord():
+    power = np.where((T > 30) & (T < 32), np.nan, 144.0)
+    labelled = label(straight_track(SPEED, power_watt=power), power_streams({"drive": record()}))
+    start, end = (floats(labelled.table, f"{e}_x_m") for e in ("start", "end"))
+    gap = 0.8 * T[np.isnan(power)][[0, -1]]
+    near = (end > gap[0] - 1) & (start < gap[1] + 1)
+    assert flagged(labelled, Quality.NEAR_GAP).tolist() == near.tolist()
+    assert near.any()
+
+
+def test_slip_weak_position_curve_and_command():
+    slipping = straight_track(SPEED, wheel_mps=np.where(T < 30, 0.85, 1.2), commanded_mps=np.ones(len(T)))
+    labelled = label(slipping, power_streams({"drive": record()}))
+    late = integers(labelled.table, "start_ns") > ZERO + 30_000_000_000
+    assert flagged(labelled, Quality.HIGH_SLIP)[late].all()
+    assert not flagged(labelled, Quality.HIGH_SLIP)[~late][:-1].any()
+    assert not flagged(labelled, Quality.NO_COMMAND).any()
+
+    weak = label(straight_track(SPEED, std_m=0.2), power_streams({"drive": record()}))
+    assert flagged(weak, Quality.WEAK_GNSS).all()
+
+    angle = 0.8 * T / 1.8  # radius 1.8 m: arc/chord 1.013
+    circle = 1.8 * np.column_stack((np.cos(angle), np.sin(angle), 0 * angle))
+    velocity = 0.8 * np.column_stack((-np.sin(angle), np.cos(angle), 0 * angle))
+    curved = label(make_track(circle, velocity), power_streams({"drive": record()}))
+    assert flagged(curved, Quality.CURVED).all()
+
+
+def test_not_at_the_limit_where_slower_than_full_speed_was_kept():
+    commanded = np.where(T < 30, 1.0, 0.7)
+    gate = GateConfig(require_full_speed=False)
+    gated = gate_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=1.0, chord_m=1.0)
+    labelled = label_gated(gated, power_streams({"drive": record()}))
+    start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
+    slow = flagged(labelled, Quality.NOT_AT_LIMIT)
+    assert slow[start > 30].all()
+    assert slow.any()
+    assert not slow[end < 30].any()
+    no_limit = gate_track(straight_track(SPEED, commanded_mps=commanded), gate, max_velocity_mps=None, chord_m=1.0)
+    assert not flagged(label_gated(no_limit, power_streams({"drive": record()})), Quality.NOT_AT_LIMIT).any()
+
+
+def test_error_budget_adds_up_to_the_deviations():
+    rough = lambda t: 6 + np.random.default_rng(0).normal(0, 1, len(t))  # noqa: E731
+    labelled = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(0.2, amp=rough)}))
+    budget = labelled.info.findings.facts["label"]["energy_budget"]
+    energy, std = floats(labelled.table, "energy_joule"), floats(labelled.table, "energy_std_joule")
+    assert budget["total"] == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
+    assert budget["total"] ** 2 == pytest.approx(sum(budget[cause] ** 2 for cause in CAUSES))
+    assert budget["position"] == pytest.approx(144 * 0.004 * 1.25 / 0.8 / 180, rel=0.05)
+    assert budget["position"] < budget["at_20_hz"] < 0.7 * budget["total"]
+    assert "20 Hz" in in_words(budget)
+
+
+def test_means_differ_when_samples_are_uneven():
+    stamp_ns, volt, _ = record(0.02)
+    keep = ((stamp_ns // 20_000_000) % 25 < 12) | ((stamp_ns // 20_000_000) % 5 == 0)
+    t = (stamp_ns - ZERO) * 1e-9
+    amp = 6 + 4 * np.sin(2 * np.pi * t / 0.5)
+    labelled = label(straight_track(SPEED), power_streams({"drive": (stamp_ns[keep], volt[keep], amp[keep])}))
+    assert flagged(labelled, Quality.MEAN_POWER_DIFFERS).any()
+    even = label(straight_track(SPEED), power_streams({"drive": (stamp_ns, volt, amp)}))
+    assert not flagged(even, Quality.MEAN_POWER_DIFFERS).any()
+
+
+@pytest.mark.parametrize(("role", "doubtful"), [("power", True), ("command", False)])
+def test_clock_doubtful_when_the_recorder_stamped_what_counts(role, doubtful):
+    sensors = {role: Sensor("/t", "x/msg/Y", "f", "why", time_source="log")}
+    streams = power_streams({"drive": record()}, sensors=sensors)
+    assert flagged(label(straight_track(SPEED), streams), Quality.CLOCK_DOUBTFUL).all() == doubtful
+    stepped = replace(streams, sensors={}, findings=Findings((), {"epochs": 2}))
+    assert flagged(label(straight_track(SPEED), stepped), Quality.CLOCK_DOUBTFUL).all()
+
+
+def test_epochs_with_overlapping_stamps_keep_their_own_power():
+    stamp_ns = np.concatenate((stamps(600), stamps(600)))
+    epoch = np.repeat(np.array([0, 1], dtype=np.int16), 600)
+    track = straight_track(SPEED, stamp_ns=stamp_ns, epoch=epoch)
+    first, second = (
+        power_streams({"drive": record(amp=a)}, epoch=e)
+        for e, a in ((0, lambda t: 5 + 0 * t), (1, lambda t: 9 + 0 * t))
+    )
+    import pyarrow as pa
+
+    both = Streams({"power": pa.concat_tables([first.tables["power"], second.tables["power"]])}, {}, "husky")
+    table = label(track, both).table
+    assert floats(table, "power_watt") == pytest.approx(np.where(integers(table, "epoch") == 0, 120.0, 216.0))
+
+
+def test_deviations_grow_with_their_causes():
+    rough = lambda t: 6 + np.random.default_rng(0).normal(0, 1, len(t))  # noqa: E731
+    smooth = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record()})).table
+    noisy = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(amp=rough)})).table
+    unsure = label(straight_track(SPEED, velocity_std_mps=0.02, std_m=1.0), power_streams({"drive": record()})).table
+    assert floats(smooth, "duration_std_s") == pytest.approx(0.004 * 1.25 / 0.8, rel=1e-3)
+    assert floats(smooth, "energy_std_joule") == pytest.approx(144 * 0.004 * 1.25 / 0.8, rel=1e-3)
+    assert floats(noisy, "energy_std_joule").mean() == pytest.approx(np.hypot(0.9, 24 * np.sqrt(25) * 0.05), rel=0.15)
+    assert floats(unsure, "duration_std_s") == pytest.approx(0.02 * 1.25 / 0.8, rel=1e-3)
+    assert floats(unsure, "velocity_std_mps") == pytest.approx(0.8 * 0.02 / 0.8, rel=1e-3)

@@ -1,0 +1,71 @@
+"""The physics column of a simulated drive: the robot that drove it, an odd metre that shows, and no fit where there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from simulated_streams import log_of, streams_of
+
+from tcpipe.pipeline.ingest import run_stages
+from tcpipe.recipe import Recipe
+from tcpipe.simulation import Faults, scenario
+from tcpipe.simulation.robot import GRAVITY_MPS2, Robot
+from tcpipe.simulation.route import Wander
+from tcpipe.stages.label_physics import with_physics
+from tcpipe.tables.bits import Quality
+from tcpipe.tables.columns import floats
+
+
+@pytest.fixture(scope="module")
+def stages(tmp_path_factory):
+    """400 m over hills and all classes, without sensor faults."""
+    hills = scenario("hills12")
+    drive = replace(hills.drives[0], plan=Wander(400.0, (14.0, 34.0), climbing=0.5), faults=Faults())
+    streams = streams_of(log_of(hills, drive, tmp_path_factory.mktemp("hills"), seed=3))
+    return run_stages(streams, Recipe(), run_id="run", name="run")
+
+
+def test_the_fit_is_the_robot(stages):
+    robot, facts = Robot(), stages[2].info.findings.facts["label"]["physics"]
+    assert facts["standing_watt"] == pytest.approx(robot.idle_watt, abs=1.0)
+    # Wheels without the slip fault still run faster than the ground by up to 12 %; the work is the wheels'.
+    wheel = robot.mass_kg * GRAVITY_MPS2 / robot.drive_efficiency
+    assert wheel * 0.97 < facts["weight_over_efficiency_newton"] < wheel * 1.12
+    assert 0.115 < facts["rolling_resistance"] < 0.22
+    assert facts["recovered_downhill"] == pytest.approx(
+        robot.drive_efficiency * robot.regeneration_efficiency, abs=0.15
+    )
+
+
+def test_the_prediction_stands_beside_the_label(stages):
+    table = stages[2].table
+    power, predicted = floats(table, "power_watt"), floats(table, "physics_power_watt")
+    assert np.isfinite(predicted).all()
+    assert 1 - np.var(power - predicted) / np.var(power) > 0.9  # the rest is terrain
+
+
+def test_an_odd_metre_is_flagged_and_changes_nothing_for_the_others(stages):
+    _, gated, labelled = stages
+    power = floats(labelled.table, "power_watt").copy()
+    power[7] += 300.0
+    odd = labelled.table.set_column(
+        labelled.table.schema.get_field_index("power_watt"), labelled.table.schema.field("power_watt"), [power]
+    )
+    table, facts = with_physics(odd, gated.table)
+    flagged = np.flatnonzero(table["quality"].to_numpy() & np.uint32(Quality.PHYSICS_OUTLIER))
+    assert 7 in flagged
+    assert facts["outliers"] == flagged.size <= 3
+    others = np.delete(np.arange(table.num_rows), 7)
+    before = floats(labelled.table, "physics_power_watt")
+    assert np.abs(floats(table, "physics_power_watt") - before)[others].max() < 2.0
+
+
+def test_without_power_there_is_no_fit(stages):
+    _, gated, labelled = stages
+    field = labelled.table.schema.field("power_watt")
+    dark = labelled.table.set_column(
+        labelled.table.schema.get_field_index("power_watt"), field, [np.full(labelled.table.num_rows, np.nan)]
+    )
+    table, facts = with_physics(dark, gated.table)
+    assert facts["fitted"] is False
+    assert table is dark

@@ -1,0 +1,347 @@
+"""Logs made by hand become streams: every role, one clock, placed sensors, and everything that is missing said."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tcpipe.errors import RoleError
+from tcpipe.logs.topics import Topic
+from tcpipe.recipe import Placement, ReadConfig
+from tcpipe.stages.read import read_run
+from tcpipe.tables.levels import Streams
+
+S = 1_000_000_000
+START = 1_700_000_000 * S
+
+
+class MemoryLog:
+    """A log of tables made by hand; it remembers what was read."""
+
+    def __init__(self, topics: Mapping[str, tuple[str, pa.Table]], undecodable: Iterable[str] = ()) -> None:
+        self._tables = {name: table for name, (_, table) in topics.items() if name not in undecodable}
+        self.read: list[str] = []
+        self.topics = {
+            name: Topic(name, kind, table.num_rows, START, START + 10 * S, "cdr", "")
+            for name, (kind, table) in topics.items()
+        }
+
+    def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+        wanted = list(topics)
+        self.read += wanted
+        return {name: self._tables[name] for name in wanted if name in self._tables}
+
+
+def message_table(
+    rows: int, rate_hz: float, *, frame: str | None = "base_link", delay_ns: int = 2_000_000, **columns
+) -> pa.Table:
+    stamps = START + np.round(np.arange(rows) / rate_hz * S).astype(np.int64)
+    fields = {"log_time_ns": stamps + delay_ns, "publish_time_ns": stamps + delay_ns}
+    if frame is not None:
+        fields |= {
+            "header.stamp.sec": pa.array(stamps // S, pa.int32()),
+            "header.stamp.nanosec": pa.array(stamps % S, pa.uint32()),
+            "header.frame_id": [frame] * rows,
+        }
+    return pa.table(fields | columns)
+
+
+def full(rows: int, value: float) -> np.ndarray:
+    return np.full(rows, value)
+
+
+def cov(rows: int, size: int, value: float) -> pa.Array:
+    return pa.FixedSizeListArray.from_arrays(pa.array((np.eye(size) * value).ravel().tolist() * rows), size * size)
+
+
+def xyz(prefix: str, rows: int, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> dict[str, np.ndarray]:
+    return {f"{prefix}.{axis}": full(rows, value) for axis, value in zip("xyz", (x, y, z), strict=True)}
+
+
+def fix(rows: int = 50, frame: str = "gps") -> tuple[str, pa.Table]:
+    columns = {
+        "status.status": pa.array(full(rows, 2), pa.int8()),
+        "latitude": 47.0 + np.arange(rows) * 1e-6,
+        "longitude": full(rows, 15.0),
+        "altitude": full(rows, 400.0),
+        "position_covariance": cov(rows, 3, 0.0004),
+        "position_covariance_type": pa.array(full(rows, 2), pa.uint8()),
+    }
+    return "sensor_msgs/msg/NavSatFix", message_table(rows, 5.0, frame=frame, **columns)
+
+
+def imu(rows: int = 500, frame: str = "imu_link") -> tuple[str, pa.Table]:
+    rng = np.random.default_rng(3)
+    quat = Rotation.from_rotvec(rng.normal(size=(rows, 3)) * 0.01).as_quat()
+    columns = {
+        **{f"orientation.{c}": quat[:, i] for i, c in enumerate("xyzw")},
+        **xyz("angular_velocity", rows, z=0.1),
+        **xyz("linear_acceleration", rows, z=9.8),
+        **{
+            f"{name}_covariance": cov(rows, 3, 0.01)
+            for name in ("orientation", "angular_velocity", "linear_acceleration")
+        },
+    }
+    return "sensor_msgs/msg/Imu", message_table(rows, 50.0, frame=frame, **columns)
+
+
+def odometry(rows: int = 500, speed_mps: float = 0.5, child: str = "base_link") -> tuple[str, pa.Table]:
+    columns = {
+        "child_frame_id": [child] * rows,
+        **xyz("pose.pose.position", rows),
+        "pose.pose.position.x": np.arange(rows) * 0.01,
+        **xyz("pose.pose.orientation", rows),
+        "pose.pose.orientation.w": full(rows, 1.0),
+        "pose.covariance": cov(rows, 6, 0.0),
+        **xyz("twist.twist.linear", rows, x=speed_mps),
+        **xyz("twist.twist.angular", rows),
+        "twist.covariance": cov(rows, 6, 0.01),
+    }
+    return "nav_msgs/msg/Odometry", message_table(rows, 50.0, frame="odom", **columns)
+
+
+def battery(amp: float, rows: int = 200) -> tuple[str, pa.Table]:
+    current = pa.array(amp + 0.1 * np.sin(np.arange(rows)), pa.float32())
+    columns = {
+        "voltage": pa.array(full(rows, 48.0), pa.float32()),
+        "current": current,
+        "percentage": full(rows, np.nan),
+    }
+    return "sensor_msgs/msg/BatteryState", message_table(
+        rows, 20.0, **columns, cell_voltage=pa.array([[]] * rows, pa.list_(pa.float32()))
+    )
+
+
+def twist(rows: int = 100) -> tuple[str, pa.Table]:
+    table = message_table(rows, 10.0, frame=None, **xyz("linear", rows, x=1.0), **xyz("angular", rows))
+    return "geometry_msgs/msg/Twist", table
+
+
+def transforms(*edges: tuple[str, str, tuple[float, float, float], Rotation]) -> tuple[str, pa.Table]:
+    values = [
+        {
+            "header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": parent},
+            "child_frame_id": child,
+            "transform": {
+                "translation": dict(zip("xyz", position, strict=True)),
+                "rotation": dict(zip("xyzw", rotation.as_quat().tolist(), strict=True)),
+            },
+        }
+        for parent, child, position, rotation in edges
+    ]
+    table = pa.table({"log_time_ns": [START], "publish_time_ns": [START], "transforms": [values]})
+    return "tf2_msgs/msg/TFMessage", table
+
+
+def husky(**more: tuple[str, pa.Table]) -> dict[str, tuple[str, pa.Table]]:
+    return {
+        "/fix": fix(),
+        "/imu/data": imu(),
+        "/husky_velocity_controller/odom": odometry(),
+        "/left/battery": battery(3.0),
+        "/right/battery": battery(4.0),
+        "/husky_velocity_controller/cmd_vel": twist(),
+        "/tf_static": transforms(
+            ("base_link", "gps", (0.1, 0.0, 0.9), Rotation.identity()),
+            ("base_link", "plate", (0.0, 0.0, 0.3), Rotation.identity()),
+            ("plate", "imu_link", (0.2, -0.3, 0.0), Rotation.from_euler("xz", [np.pi / 2, -np.pi / 2])),
+        ),
+        **more,
+    }
+
+
+def read(topics: Mapping[str, tuple[str, pa.Table]], robot: str | None = None, **config) -> Streams:
+    return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot)
+
+
+def test_a_whole_husky() -> None:
+    found = read(husky())
+    assert found.robot == "husky"
+    assert {role: table.num_rows for role, table in found.tables.items()} == {
+        "gnss": 50,
+        "imu": 500,
+        "wheel_odometry": 500,
+        "power": 400,
+        "command": 100,
+    }
+    assert set(found.sensors) == set(found.tables)
+    gnss, sensor = found.tables["gnss"], found.sensors["imu"]
+    assert gnss["stamp_ns"].to_pylist()[:2] == [START, START + S // 5]
+    assert gnss["log_time_ns"][0].as_py() == START + 2_000_000
+    assert gnss["east_var_m2"][0].as_py() == 0.0004
+    assert found.sensors["gnss"].xyz_m == (0.1, 0.0, 0.9)
+    assert found.sensors["gnss"].placed_by == "tf_static"
+    assert sensor.xyz_m == (0.2, -0.3, 0.3)
+    np.testing.assert_allclose(
+        Rotation.from_quat(sensor.quat_xyzw).as_matrix(),
+        Rotation.from_euler("xz", [np.pi / 2, -np.pi / 2]).as_matrix(),
+        atol=1e-12,
+    )
+    assert found.sensors["wheel_odometry"].placed_by == "same frame"
+    assert found.sensors["command"].time_source == "log"
+    assert found.tables["wheel_odometry"]["velocity_var_x_m2ps2"][0].as_py() == 0.01
+    assert len(found.findings.warnings) == 1  # the current's sign
+    facts = found.findings.facts
+    assert facts["epochs"] == 1
+    assert facts["roles"]["imu"]["topics"]["/imu/data"]["rows"] == 500
+    assert abs(facts["roles"]["imu"]["topics"]["/imu/data"]["rate_hz"] - 50.0) < 1e-6
+    assert facts["roles"]["gnss"]["topics"]["/fix"]["time"]["offset_s"] == -0.002
+
+
+def test_the_rails_keep_their_names_and_their_sum_is_the_robots_current() -> None:
+    power = read(husky()).tables["power"]
+    assert set(power["rail"].to_pylist()) == {"/left/battery", "/right/battery"}
+    first = power.slice(0, 2).to_pydict()
+    assert first["stamp_ns"] == [START, START]
+    np.testing.assert_allclose(sum(first["current_amp"]), 7.0, atol=1e-6)
+
+
+def test_the_same_log_gives_the_same_bytes() -> None:
+    one, two = read(husky()), read(husky())
+    assert all(one.tables[role].equals(two.tables[role], check_metadata=True) for role in one.tables)
+    assert one.findings == two.findings
+    assert one.sensors == two.sensors
+
+
+def test_only_the_topics_of_roles_are_read_and_tf_only_where_it_is_needed() -> None:
+    moving = transforms(("odom", "base_link", (1.0, 0.0, 0.0), Rotation.identity()))
+    log = MemoryLog(husky(**{"/tf": moving, "/image": ("sensor_msgs/msg/Image", message_table(1, 1.0))}))
+    read_run(log, ReadConfig(), robot=None)
+    assert "/image" not in log.read
+    assert "/tf" not in log.read
+    assert len(log.read) == len(set(log.read))
+
+
+def test_a_latched_tf_places_what_tf_static_does_not() -> None:
+    topics = husky(**{"/tf": transforms(("base_link", "gps", (0.0, 0.0, 2.0), Rotation.identity()))})
+    del topics["/tf_static"]
+    found = read(topics)
+    assert found.sensors["gnss"].xyz_m == (0.0, 0.0, 2.0)
+    assert found.sensors["imu"].placed_by == "assumed"
+    warning = next(text for text in found.findings.warnings if "imu_link" in text)
+    assert "[read.placement]: imu = { xyz_m" in warning
+
+
+def test_the_recipe_places_over_tf() -> None:
+    found = read(husky(), placement={"gnss": Placement((1.0, 2.0, 3.0), (0.0, 0.0, np.pi / 2))})
+    assert found.sensors["gnss"].xyz_m == (1.0, 2.0, 3.0)
+    assert found.sensors["gnss"].placed_by == "recipe"
+    np.testing.assert_allclose(found.sensors["gnss"].quat_xyzw, [0, 0, np.sqrt(0.5), np.sqrt(0.5)], atol=1e-12)
+
+
+def test_missing_gnss_and_power_are_warnings() -> None:
+    found = read({"/odom": odometry()})
+    assert set(found.tables) == {"wheel_odometry"}
+    assert ["gnss" in found.findings.warnings[0], "power" in found.findings.warnings[1]] == [True, True]
+
+
+def test_power_that_cannot_be_believed_is_a_warning_too() -> None:
+    rows = 60
+    dead = ("sensor_msgs/msg/BatteryState", message_table(rows, 1.0, voltage=full(rows, 0.0), current=full(rows, 0.0)))
+    found = read({"/odom": odometry(), "/battery": dead})
+    assert "power" not in found.tables
+    assert any("zero on all 60 rows" in text for text in found.findings.warnings)
+
+
+def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell() -> None:
+    log = MemoryLog(
+        {name: (kind, table.slice(0, 0)) for name, (kind, table) in husky().items()} | {"/odom": odometry()}
+    )
+    log.topics = {name: replace(topic, message_count=None) for name, topic in log.topics.items()}
+    recipe = ReadConfig(topics={"wheel_odometry": ["/odom"]})
+    assert set(read_run(log, recipe, robot=None).tables) == {"wheel_odometry"}
+
+
+def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
+    stamps = START + np.arange(20) * S
+    text = [datetime.fromtimestamp(stamp // S, UTC).strftime("%H%M%S") for stamp in stamps.tolist()]
+    sentences = [f"$GPGGA,{time},4700.{i:04d},N,01500.0000,E,4,20,0.6,355.0,M,45.0,M,," for i, time in enumerate(text)]
+    others = [f"$GPGSV,{i}" for i in range(20)]
+    table = message_table(
+        40,
+        2.0,
+        delay_ns=60_000_000,
+        frame="gps",
+        sentence=[s for pair in zip(sentences, others, strict=True) for s in pair],
+    )
+    found = read({"/nmea_sentence": ("nmea_msgs/msg/Sentence", table), "/odom": odometry()})
+    gnss = found.tables["gnss"]
+    assert gnss["stamp_ns"].to_pylist() == stamps.tolist()
+    assert set(gnss["alt_m"].to_pylist()) == {400.0}
+    assert found.findings.facts["roles"]["gnss"]["topics"]["/nmea_sentence"]["dropped"] == {"not_gga": 20}
+    assert not any("not used" in text for text in found.findings.warnings)
+
+
+def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
+    found = read_run(MemoryLog(husky(), undecodable=["/fix", "/left/battery"]), ReadConfig(), robot=None)
+    assert "gnss" not in found.tables
+    assert "power" not in found.tables  # one side alone is not the robot's power
+    text = "\n".join(found.findings.warnings)
+    assert "/fix cannot be decoded" in text
+    assert "power refused" in text
+
+
+def test_a_log_whose_only_motion_is_unusable_fails_and_says_why() -> None:
+    kind, table = fix()
+    lost = table.set_column(table.column_names.index("status.status"), "status.status", pa.array([-1] * 50, pa.int8()))
+    with pytest.raises(RoleError) as error:
+        read({"/fix": (kind, lost), "/imu/data": imu()})
+    assert error.value.problems[0].startswith("nothing in the log tells motion")
+    assert "no_fix 50" in str(error.value)
+
+
+def test_ambiguity_is_one_error() -> None:
+    with pytest.raises(RoleError, match="role imu is ambiguous") as error:
+        read(husky(**{"/other/imu": imu(), "/other/fix": fix()}))
+    assert "role gnss is ambiguous" in str(error.value)
+
+
+def test_visual_odometry_without_twist_keeps_its_pose() -> None:
+    found = read(husky(**{"/zed/zed_node/odom": odometry(speed_mps=0.0, child="zed_camera")}))
+    table = found.tables["visual_odometry"]
+    assert table["velocity_x_mps"].null_count == table.num_rows == 500
+    assert table["x_m"].null_count == 0
+    assert found.sensors["visual_odometry"].frame_id == "zed_camera"
+    assert any("only its pose is used" in text for text in found.findings.warnings)
+
+
+def test_settings_of_the_recipe_reach_their_role() -> None:
+    found = read(
+        husky(),
+        time={"imu": "log"},
+        time_offset_s={"gnss": 0.25},
+        current_sign="drawn_negative",
+        power_averaged="yes",
+        gnss_crs="EPSG:7844",
+    )
+    assert found.sensors["imu"].time_source == "log"
+    assert found.tables["imu"]["stamp_ns"][0].as_py() == START + 2_000_000
+    assert found.tables["gnss"]["stamp_ns"][0].as_py() == START + S // 4
+    assert found.tables["power"]["current_amp"][0].as_py() < 0
+    assert found.power_averaged
+    assert found.gnss_crs == "EPSG:7844"
+
+
+def with_step(table: pa.Table) -> pa.Table:
+    """Return the table with header stamps that leap by 7 s after 5 s."""
+    if "header.stamp.sec" not in table.column_names:
+        return table
+    seconds = table["header.stamp.sec"].to_numpy().copy()
+    seconds[seconds >= START // S + 5] += 7
+    return table.set_column(
+        table.column_names.index("header.stamp.sec"), "header.stamp.sec", pa.array(seconds, pa.int32())
+    )
+
+
+def test_a_step_of_all_clocks_divides_every_table() -> None:
+    topics = {name: (kind, with_step(table)) for name, (kind, table) in husky().items()}
+    found = read(topics)
+    assert found.findings.facts["epochs"] == 2
+    for role, table in found.tables.items():
+        epoch = table["epoch"].to_numpy()
+        np.testing.assert_array_equal(epoch == 1, table["log_time_ns"].to_numpy() >= START + 5 * S, err_msg=role)
+    assert any("steps by +7.000 s" in text for text in found.findings.warnings)

@@ -1,0 +1,168 @@
+"""Segments of drives written down by formula, and where every metre went."""
+
+import numpy as np
+import pyproj
+import pytest
+from made_tracks import GRAZ, make_track, stamps, straight_track
+
+from tcpipe.recipe import GateConfig, SegmentConfig
+from tcpipe.stages.gate import gate_track
+from tcpipe.stages.segment import segment_track
+from tcpipe.tables.columns import floats, integers
+
+T = np.arange(0, 60, 0.05)
+
+
+def cut(track, *, gate=None, limit_mps=1.0):
+    gated = gate_track(track, gate or GateConfig(), max_velocity_mps=limit_mps, chord_m=1.0)
+    return segment_track(gated, SegmentConfig())
+
+
+def chord_error_m(table):
+    step = [floats(table, f"end_{axis}_m") - floats(table, f"start_{axis}_m") for axis in "xy"]
+    return np.abs(np.hypot(*step) - 1.0)
+
+
+def test_a_hill_is_cut_by_its_horizontal_chord():
+    slope, course = np.radians(22.5), np.radians(120)
+    segments = cut(straight_track(np.full(len(T), 0.9), course_rad=course, slope_rad=slope))
+    table = segments.table
+    horizontal = 0.9 * np.cos(slope)
+    assert table.num_rows == int(horizontal * T[-1])
+    assert chord_error_m(table).max() < 1e-6
+    assert floats(table, "chord_m") == pytest.approx(1.0, abs=1e-6)
+    assert floats(table, "arc_length_m") == pytest.approx(1.0, abs=1e-6)
+    assert floats(table, "course_rad") == pytest.approx(course, abs=1e-9)
+    duration = (integers(table, "end_ns") - integers(table, "start_ns")) * 1e-9
+    assert duration == pytest.approx(1 / horizontal, abs=1e-8)
+    assert floats(table, "fused_velocity_mps") == pytest.approx(0.9)
+    rise = floats(table, "end_z_m") - floats(table, "start_z_m")
+    assert rise == pytest.approx(np.tan(slope), abs=1e-6)
+
+
+def test_the_next_segment_starts_at_the_end_of_the_last():
+    table = cut(straight_track(np.full(len(T), 0.83))).table
+    assert (integers(table, "start_ns")[1:] == integers(table, "end_ns")[:-1]).all()
+    for axis in "xyz":
+        assert (floats(table, f"start_{axis}_m")[1:] == floats(table, f"end_{axis}_m")[:-1]).all()
+    assert table["segment_id"][0].as_py() == f"run-0123abcd-{table['start_ns'][0].as_py()}"
+
+
+def test_longitude_and_latitude_are_those_of_the_enu_position():
+    datum = GRAZ
+    table = cut(straight_track(np.full(len(T), 0.9), course_rad=0.4, slope_rad=0.1, datum=datum)).table
+    chain = (
+        f"+proj=pipeline +step +inv +proj=topocentric +ellps=WGS84 +lon_0={datum.lon_deg} +lat_0={datum.lat_deg} "
+        f"+h_0={datum.alt_m} +step +inv +proj=cart +ellps=WGS84"
+    )
+    to_geodetic = pyproj.Transformer.from_pipeline(chain)
+    geod = pyproj.Geod(ellps="WGS84")
+    for end in ("start", "end"):
+        lon, lat, _ = to_geodetic.transform(*(floats(table, f"{end}_{axis}_m") for axis in "xyz"))
+        got = floats(table, f"{end}_lon_deg"), floats(table, f"{end}_lat_deg")
+        _, _, apart = geod.inv(lon, lat, *got)
+        assert np.max(apart) < 1e-6
+
+
+def test_a_local_frame_has_no_longitude():
+    table = cut(straight_track(np.full(len(T), 0.9))).table
+    assert table["start_lon_deg"].null_count == table.num_rows
+
+
+def wandering(seed):
+    """Return a track with stands, in-place turns, curves, a reverse, a hole in the stamps, a power gap and a clock epoch."""
+    rng = np.random.default_rng(seed)
+    count = 2400
+    t = np.arange(count) * 0.05
+    speed = np.clip(np.interp(t, np.arange(0, 121, 4), rng.choice([0.0, 0.9, 0.9, 0.9, -0.4], 31)), -0.5, 0.9)
+    yaw_rate = np.interp(t, np.arange(0, 121, 3), rng.choice([0.0, 0.0, 0.0, 0.5, -1.0], 41))
+    yaw = np.cumsum(yaw_rate) * 0.05
+    velocity = speed[:, None] * np.column_stack((np.cos(yaw), np.sin(yaw), 0 * yaw))
+    position = np.cumsum(velocity, axis=0) * 0.05 + rng.normal(0, 0.002, (count, 3))
+    stamp_ns = stamps(count)
+    stamp_ns[900:] += 2_000_000_000
+    epoch = np.zeros(count, dtype=np.int16)
+    stamp_ns[1700:] -= 30_000_000_000  # the clock goes back: stamps of both epochs overlap
+    epoch[1700:] = 1
+    power = np.where((t > 60) & (t < 63), np.nan, 150.0)
+    return make_track(
+        position, velocity, stamp_ns=stamp_ns, epoch=epoch, forward_mps=speed, yaw_rate_radps=yaw_rate, power_watt=power
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_ledger_accounts_for_every_metre_once(seed):
+    track = wandering(seed)
+    segments = cut(track)
+    ledger = segments.ledger_m
+    assert list(ledger) == [
+        *("kept", "gap", "standing", "stuck", "turning_in_place", "reversing", "accelerating", "below_limit"),
+        *("curved", "leftover"),
+    ]
+    assert ledger["kept"] == pytest.approx(floats(segments.table, "arc_length_m").sum(), rel=1e-12)
+    # Independent odometer: a fine polygon through every row's Hermite cubic, straight lines where stamps or epochs break.
+    assert sum(ledger.values()) == pytest.approx(odometer_m(track.table), rel=1e-4)
+    assert sum(ledger.values()) == pytest.approx(segments.info.findings.facts["segment"]["odometer_m"], rel=1e-12)
+    seconds = segments.info.findings.facts["segment"]["ledger_s"]
+    assert sum(seconds.values()) == pytest.approx(2398 * 0.05 + 2.0, rel=1e-9)  # all but the interval of the clock step
+
+
+def odometer_m(table):
+    stamp_ns, epoch = integers(table, "stamp_ns"), integers(table, "epoch")
+    xy = np.column_stack([floats(table, f"{axis}_m") for axis in "xy"])
+    velocity = np.column_stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north")])
+    regular = (np.diff(stamp_ns) == 50_000_000) & (np.diff(epoch) == 0)
+    u = np.linspace(0, 1, 51)[:, None, None]
+    p0, p1, v0, v1 = xy[:-1], xy[1:], velocity[:-1] * 0.05, velocity[1:] * 0.05
+    points = (
+        (2 * u**3 - 3 * u**2 + 1) * p0 + (u**3 - 2 * u**2 + u) * v0 + (3 * u**2 - 2 * u**3) * p1 + (u**3 - u**2) * v1
+    )
+    fine = np.linalg.norm(np.diff(points, axis=0), axis=2).sum(axis=0)
+    return np.where(regular, fine, np.linalg.norm(p1 - p0, axis=1)).sum()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_segment_holds_a_dropped_row_a_hole_or_a_step_of_the_clock(seed):
+    track = wandering(seed)
+    gated = gate_track(track, GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
+    table = segment_track(gated, SegmentConfig()).table
+    assert chord_error_m(table).max() < 1e-6
+    stamp_ns, epoch = integers(gated.table, "stamp_ns"), integers(gated.table, "epoch")
+    dropped = gated.table["dropped_by"].to_numpy() != 0
+    for start, end, its_epoch in zip(
+        integers(table, "start_ns"), integers(table, "end_ns"), integers(table, "epoch"), strict=True
+    ):
+        mine = epoch == its_epoch
+        inside = mine & (stamp_ns > start - 50_000_000) & (stamp_ns < end + 50_000_000)
+        assert not dropped[inside].any()
+        assert (np.diff(stamp_ns[inside]) == 50_000_000).all()
+
+
+def test_kept_backward_stretches_never_share_a_segment_with_forward_ones():
+    speed = np.where(T < 30, 0.8, -0.8)
+    track = straight_track(speed, forward_mps=speed)
+    segments = cut(track, gate=GateConfig(keep_reversing=True, max_acceleration_mps2=50.0, ramp_acceleration_mps2=50.0))
+    fused = floats(segments.table, "fused_velocity_mps")
+    assert set(np.round(fused, 9)) == {0.8, -0.8}
+
+
+def test_mean_command_of_a_segment():
+    commanded = np.where(T < 30, 1.0, np.nan)
+    table = cut(straight_track(np.full(len(T), 0.9), commanded_mps=commanded)).table
+    mean = floats(table, "commanded_velocity_mps")
+    assert np.nanmax(np.abs(mean - 1)) < 1e-9
+    assert np.isnan(mean[integers(table, "end_ns") > integers(table, "start_ns")[0] + 31_000_000_000]).all()
+
+
+def test_a_run_that_never_moves_says_so():
+    segments = cut(straight_track(np.zeros(len(T))))
+    assert segments.table.num_rows == 0
+    assert any("the robot never moved" in text for text in segments.info.findings.warnings)
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_tiny_tracks_have_no_segments(count):
+    nothing = np.zeros((count, 3))
+    segments = cut(make_track(nothing, nothing, stamp_ns=stamps(count)))
+    assert segments.table.num_rows == 0
+    assert sum(segments.ledger_m.values()) == 0

@@ -1,0 +1,122 @@
+"""Whether a map lies where it was driven: shifts put in are found, and none is found where the ground cannot tell."""
+
+import numpy as np
+import pytest
+from map_worlds import ArrayMap
+
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.overviews import coarser_levels, overview_grid
+from tcpipe.terrain.registration import register_track
+
+SIDE, PITCH_M = 1000, 0.1
+
+
+def rolling(x, y):
+    return 0.03 * x + 0.4 * np.sin(x / 4.0) * np.cos(y / 5.0) + 0.15 * np.sin(x / 1.7 + y / 2.3)
+
+
+def site(ground=rolling, noise_m=0.01, factors=(1,), seed=0):
+    grid = MapGrid("EPSG:32633", 0.0, 100.0, PITCH_M, SIDE, SIDE)
+    j, i = np.meshgrid(np.arange(SIDE, dtype=float), np.arange(SIDE, dtype=float))
+    x, y = np.moveaxis(grid.xy_from_px(np.stack([j, i], -1)), -1, 0)
+    height = ground(x, y) + np.random.default_rng(seed).normal(0.0, noise_m, x.shape)
+    return Levels(grid, {"height": height.astype(np.float32)}, tile_px=256, height_reference_m=600.0, factors=factors)
+
+
+class Levels(ArrayMap):
+    def at(self, factor):
+        arrays = {"height": dict(coarser_levels("height", self.arrays["height"], self.factors))[factor]}
+        return ArrayMap(overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
+
+
+def drive(count=6000, seed=1):
+    """A winding drive of 240 m at 20 Hz."""
+    s = np.linspace(0.0, 1.0, count)
+    return np.stack([50.0 + 38.0 * np.sin(2 * np.pi * s), 50.0 + 36.0 * np.sin(4 * np.pi * s + 0.3)], 1)
+
+
+def drift(count, std_m, over, seed):
+    """Noise that is alike over ``over`` samples, as a GNSS height's is."""
+    rng = np.random.default_rng(seed)
+    smooth = np.convolve(rng.normal(0.0, 1.0, count + over), np.ones(over) / np.sqrt(over), "valid")[:count]
+    return std_m * smooth
+
+
+@pytest.mark.parametrize("shift_m", [(0.0, 0.0), (1.37, -0.81), (-2.4, 2.2), (0.0, 0.6)])
+def test_a_shift_is_found_to_a_few_centimetres_whatever_the_datum(shift_m):
+    source, xy = site(factors=(1, 2)), drive()
+    height = 600.0 + rolling(*(xy + shift_m).T) + 46.2 + drift(len(xy), 0.02, 100, 5)
+    found = register_track(source, xy, height)
+    assert np.hypot(*np.subtract(found.shift_xy_m, shift_m)) < 0.05
+    assert found.shift_std_m < 0.1
+    assert found.height_offset_m == pytest.approx(46.2, abs=0.02)
+    assert found.significant == (found.shift_m > 0.1)
+    assert found.shifted_misfit_m < 0.05
+    assert not found.at_reach
+
+
+def test_the_stated_deviation_is_about_the_real_one():
+    """Sixteen drives with errors alike over metres: the shift's errors over their stated deviations are near one."""
+    source, xy, scaled = site(), drive(), []
+    for seed in range(16):
+        height = 600.0 + rolling(*xy.T) + drift(len(xy), 0.05, 200, seed)
+        found = register_track(source, np.add(xy, (0.4, 0.3)), height)
+        scaled.append(np.hypot(found.shift_xy_m[0] + 0.4, found.shift_xy_m[1] + 0.3) / found.shift_std_m)
+    assert 0.4 < np.sqrt(np.mean(np.square(scaled)) / 2.0) < 1.5
+
+
+def test_a_shift_beyond_the_window_is_said_to_be_at_its_edge():
+    source, xy = site(ground=lambda x, y: 5.0 * np.sin(x / 15.0) * np.cos(y / 13.0)), drive()
+    height = 600.0 + 5.0 * np.sin((xy[:, 0] + 5.0) / 15.0) * np.cos(xy[:, 1] / 13.0)
+    found = register_track(source, xy, height)
+    assert found.at_reach
+    assert found.significant
+    assert found.shift_xy_m[0] > 2.5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_even_ground_tells_nothing(seed):
+    for ground in (lambda x, y: 0.0 * x * y, lambda x, y: 0.12 * x - 0.05 * y):
+        source, xy = site(ground, noise_m=0.02, seed=seed), drive()
+        height = 600.0 + ground(*xy.T) + drift(len(xy), 0.05, 300, seed)
+        found = register_track(source, xy, height)
+        assert not found.significant
+        short = register_track(source, xy[:1000], height[:1000])
+        assert short is None or not short.significant
+
+
+def test_along_a_furrow_only_the_shift_across_it_is_told():
+    def furrows(x, y):
+        return 0.3 * np.sin((x + y) / 3.0)
+
+    source, xy = site(furrows, noise_m=0.0), drive()
+    height = 600.0 + furrows(*np.add(xy, (1.0, 0.2)).T) + drift(len(xy), 0.02, 100, 2)
+    found = register_track(source, xy, height)
+    assert found.shift_xy_m == pytest.approx((0.6, 0.6), abs=0.03)
+    assert found.significant
+
+
+def test_heights_that_are_not_the_grounds_do_not_matter():
+    """A tenth of the drive goes over a bridge that the map does not show, and under a tree that it does."""
+    source, xy = site(), drive()
+    height = 600.0 + rolling(*np.add(xy, (1.2, 0.5)).T)
+    height[1000:1600] += 4.0
+    source.arrays["height"][200:280, 100:900] += 6.0
+    found = register_track(source, xy, height)
+    assert found.shift_xy_m == pytest.approx((1.2, 0.5), abs=0.06)
+    assert found.significant
+
+
+def test_holes_edges_and_short_or_missing_tracks():
+    source, xy = site(), drive()
+    height = 600.0 + rolling(*np.add(xy, (1.0, -1.0)).T)
+    whole = register_track(source, xy, height)
+    source.arrays["height"][:300] = np.nan
+    height[::7] = np.nan
+    found = register_track(source, xy, height)
+    assert found.shift_xy_m == pytest.approx((1.0, -1.0), abs=0.05)
+    assert found.points < 0.95 * whole.points
+    assert register_track(source, xy[:300], height[:300]) is None
+    assert register_track(source, xy + 500.0, height) is None
+    assert register_track(source, xy[:0], height[:0]) is None
+    assert register_track(source, np.full_like(xy, np.nan), height) is None

@@ -1,0 +1,231 @@
+"""The sampling kernel against scipy, symmetry, missing data, tiles."""
+
+import numpy as np
+import pytest
+from map_worlds import ArrayMap, random_map
+from scipy.ndimage import map_coordinates
+
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.patches import map_px_from_patch, patch_frames
+from tcpipe.terrain.sampling import sample_patches
+from tcpipe.terrain.tiles import CACHED_TILES, TilePool, groups_by_tile, read_window
+
+
+def frames_at(grid, count, seed=1, margin_m=1.5, chord_m=1.0):
+    rng = np.random.default_rng(seed)
+    x_min, y_min, x_max, y_max = grid.bounds_m
+    middle = rng.uniform((x_min + margin_m, y_min + margin_m), (x_max - margin_m, y_max - margin_m), (count, 2))
+    angle = rng.uniform(-np.pi, np.pi, count)
+    half = 0.5 * chord_m * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return patch_frames(middle - half, middle + half, np.full(count, chord_m))
+
+
+def sample(source, frames, chord_m=1.0, patch_m=1.0, patch_px=40):
+    chords = np.full(len(frames.centre_xy_m), chord_m)
+    return sample_patches(source, frames, chords, patch_m=patch_m, patch_px=patch_px)
+
+
+def positions(frames, grid, patch_m, patch_px):
+    px = map_px_from_patch(frames, grid, patch_m=patch_m, patch_px=patch_px)
+    c, r = np.meshgrid(np.arange(patch_px), np.arange(patch_px))
+    x = px[:, 0, None, None] + px[:, 2, None, None] * c + px[:, 4, None, None] * r
+    y = px[:, 1, None, None] + px[:, 3, None, None] * c + px[:, 5, None, None] * r
+    return np.stack([y, x])
+
+
+@pytest.mark.parametrize(("patch_m", "patch_px"), [(1.0, 40), (1.5, 40), (0.8, 31)])
+def test_equals_map_coordinates(patch_m, patch_px):
+    source = random_map()
+    frames = frames_at(source.grid, 200)
+    got = sample(source, frames, patch_m=patch_m, patch_px=patch_px)
+    at = positions(frames, source.grid, patch_m, patch_px)
+    height = map_coordinates(source.arrays["height"].astype(float), at, order=1)
+    lowest = height.min(axis=(1, 2))
+    np.testing.assert_allclose(got.height_min_m, lowest, atol=2e-5)
+    np.testing.assert_allclose(got.height * 0.0005, height - lowest[:, None, None], atol=0.00025 + 5e-5)
+    ortho = map_coordinates(source.arrays["ortho"].astype(float), at, order=1)
+    np.testing.assert_allclose(got.ortho, ortho, atol=0.51)
+    nearest = source.arrays["terrain"][tuple(np.floor(at + 0.5).astype(int))]
+    assert (got.terrain == nearest).mean() > 0.9999
+
+
+def test_slopes_are_those_of_the_least_squares_plane():
+    source = random_map()
+    frames = frames_at(source.grid, 50)
+    got = sample(source, frames)
+    offset = (np.arange(40) - 19.5) * 0.025
+    along, right = np.meshgrid(offset, offset)
+    design = np.stack([along.ravel(), -right.ravel(), np.ones(1600)], 1)
+    height = map_coordinates(source.arrays["height"].astype(float), positions(frames, source.grid, 1.0, 40), order=1)
+    plane = np.linalg.lstsq(design, height.reshape(50, -1).T, rcond=None)[0]
+    np.testing.assert_allclose(got.slope_rad, np.arctan(plane[0]), atol=1e-6)
+    np.testing.assert_allclose(got.cross_slope_rad, np.arctan(plane[1]), atol=1e-6)
+
+
+def test_a_height_of_a_mountain_keeps_a_tenth_of_a_millimetre():
+    grid = MapGrid("EPSG:32633", 0.0, 10.0, 0.05, 200, 200)
+    x, y = np.meshgrid(np.arange(200) * 0.05, np.arange(200) * 0.05)
+    plane = (0.3 * x - 0.2 * y).astype(np.float32)
+    low = ArrayMap(grid, {"height": plane})
+    high = ArrayMap(grid, {"height": plane + np.float32(512.0)}, height_reference_m=2_500.0)
+    frames = frames_at(grid, 40)
+    a, b = sample(low, frames), sample(high, frames)
+    np.testing.assert_allclose(b.height_min_m, a.height_min_m + 3_012.0, atol=1e-4)
+    assert np.abs(a.height.astype(int) - b.height).max() <= 1
+    np.testing.assert_allclose(a.slope_rad, b.slope_rad, atol=1e-4)
+
+
+def test_quarter_turn_of_world_and_course_gives_the_same_patch():
+    source = random_map(rows=260, cols=260)
+    turned = ArrayMap(source.grid, {name: np.rot90(layer) for name, layer in source.arrays.items()})
+    frames = frames_at(source.grid, 100)
+    x_min, y_min, x_max, y_max = source.grid.bounds_m
+    middle = np.array([(x_min + x_max) / 2.0, (y_min + y_max) / 2.0])
+
+    def turn(xy):
+        return np.stack([-xy[:, 1], xy[:, 0]], 1)
+
+    centre = middle + turn(frames.centre_xy_m - middle)
+    half = turn(frames.along_xy) / 2.0
+    got, want = sample(turned, patch_frames(centre - half, centre + half, np.ones(100))), sample(source, frames)
+    assert np.abs(got.height.astype(int) - want.height).max() <= 1
+    assert (got.terrain == want.terrain).mean() > 0.9999
+    assert np.abs(got.ortho.astype(int) - want.ortho).max() <= 1
+    np.testing.assert_allclose(got.slope_rad, want.slope_rad, atol=1e-6)
+    np.testing.assert_allclose(got.terrain_purity, want.terrain_purity, atol=0.026)
+
+
+@pytest.mark.parametrize("layer", ["height", "ortho", "terrain"])
+def test_a_missing_map_pixel_is_missing_in_every_patch_that_touches_it(layer):
+    source = random_map()
+    source.arrays[layer][150, 130] = np.nan if layer == "height" else 0
+    frames = frames_at(source.grid, 300, margin_m=5.0)
+    got = sample(source, frames)
+    y, x = positions(frames, source.grid, 1.0, 40)
+    reach = 0.5 if layer == "terrain" else 1.0
+    touched = (np.abs(y - 150) < reach) & (np.abs(x - 130) < reach)
+    assert touched.any(axis=(1, 2)).sum() > 5
+    np.testing.assert_allclose(got.valid_fraction, 1.0 - touched.mean(axis=(1, 2)), atol=1e-9)
+    assert (got.height[touched] == 65535).all()
+    assert (got.terrain[touched] == 0).all()
+    assert (got.height[~touched] < 65535).all()
+    assert np.isfinite(got.height_min_m).all()
+
+
+def test_a_plane_with_holes_keeps_its_slope():
+    grid = MapGrid("EPSG:32633", 0.0, 10.0, 0.05, 200, 200)
+    x, y = np.meshgrid((np.arange(200) + 0.5) * 0.05, 10.0 - (np.arange(200) + 0.5) * 0.05)
+    height = (0.25 * x + 0.1 * y).astype(np.float32)
+    height[np.random.default_rng(0).random(height.shape) < 0.02] = np.nan
+    start = np.array([(4.0, 5.0)])
+    got = sample(ArrayMap(grid, {"height": height}), patch_frames(start, start + np.array([1.0, 0.0]), np.ones(1)))
+    assert 0.5 < got.valid_fraction[0] < 1.0
+    np.testing.assert_allclose(np.tan([got.slope_rad[0], got.cross_slope_rad[0]]), [0.25, 0.1], atol=1e-4)
+
+
+def test_patches_beyond_the_map_have_no_data_there():
+    source = random_map()
+    start = np.array([(500_000.0 - 0.5, 5_199_995.0), (500_000.0 - 2.0, 5_199_995.0)])
+    got = sample(source, patch_frames(start, start + np.array([1.0, 0.0]), np.ones(2)))
+    assert 0.45 < got.valid_fraction[0] < 0.5
+    assert got.valid_fraction[1] == 0.0
+    assert (got.height[1] == 65535).all()
+
+
+def test_layers_that_a_map_lacks_are_absent():
+    source = random_map()
+    only = ArrayMap(source.grid, {"height": source.arrays["height"]})
+    got = sample(only, frames_at(source.grid, 5))
+    assert got.ortho is None
+    assert got.terrain is None
+    assert got.terrain_class.tolist() == [0] * 5
+
+
+def test_rows_come_back_in_the_order_asked_for_and_do_not_depend_on_tiles():
+    small, large = random_map(tile_px=32), random_map(tile_px=512)
+    frames = frames_at(small.grid, 300)
+    a, b = sample(small, frames), sample(large, frames)
+    for name in ("height", "ortho", "terrain", "height_min_m", "slope_rad"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+@pytest.mark.parametrize("tile_px", [16, 64, 512])
+def test_patches_in_the_maps_corners_are_those_of_a_larger_map(tile_px):
+    """The last pixel of the last tile is the end of the memory that may be read."""
+    large = random_map(rows=200, cols=200)
+    small = ArrayMap(
+        MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.05, 71, 83),
+        {name: np.ascontiguousarray(layer[:71, :83]) for name, layer in large.arrays.items()},
+        tile_px,
+    )
+    frames = frames_at(small.grid, 400, margin_m=0.52)
+    got, wanted = sample(small, frames), sample(large, frames)
+    whole = got.valid_fraction == 1.0
+    assert 20 < whole.sum() < 380
+    for name in ("height", "ortho", "terrain", "height_min_m", "slope_rad", "terrain_class", "terrain_purity"):
+        np.testing.assert_array_equal(getattr(got, name)[whole], getattr(wanted, name)[whole])
+    inside = got.height < 65535
+    assert not inside[~whole].all()
+    assert (got.ortho[inside] == wanted.ortho[inside]).all()
+
+
+@pytest.mark.parametrize(("rows", "cols", "most"), [(512, 512, 1.0), (3200, 320, 1.0), (320, 2560, 1.1)])
+def test_each_tile_is_read_once_though_samples_come_in_any_order(rows, cols, most):
+    """64 tiles fit the pool; 250 do not, and each is read once all the same; 40 in a row are two strips, whose borders are read twice."""
+
+    class Counting(ArrayMap):
+        def read(self, layer, row0, row1, col0, col1):
+            seen.append((layer, row0, col0))
+            return super().read(layer, row0, row1, col0, col1)
+
+    seen = []
+    plain = random_map(rows=rows, cols=cols)
+    source = Counting(plain.grid, plain.arrays, tile_px=64)
+    frames = frames_at(plain.grid, 12_000, margin_m=0.8)
+    got = sample(source, frames)
+    assert len(set(seen)) == 3 * (rows // 64) * (cols // 64)
+    assert len(seen) <= most * len(set(seen))
+    np.testing.assert_array_equal(got.height, sample(plain, frames).height)
+
+
+def test_the_tile_pool_is_bounded_and_reads_again_what_it_let_go():
+    source = random_map(rows=600, cols=600, tile_px=16)
+    pool = TilePool(source)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        row, col = rng.integers(-20, 600, 2)
+        pool.hold(np.array([(row, col, row + 30, col + 40)]))
+        assert (pool.slots >= 0).sum() <= CACHED_TILES
+        for i, j in np.add(rng.integers(0, (30, 40), (20, 2)), (row, col)):
+            if 0 <= i < 600 and 0 <= j < 600:
+                slot = pool.slots[i // 16, j // 16]
+                at = (slot * 16 + i % 16) * 16 + j % 16
+                assert [layer[at] for layer in pool.layers] == [layer[i, j] for layer in source.arrays.values()]
+    assert max(pool.decoded.values()) > 1
+    pool.hold(np.array([(0, 0, 600, 600)]))  # more than it keeps: it grows for once
+    assert (pool.slots >= 0).all()
+
+
+def test_positions_are_grouped_by_tile_once_each():
+    source = random_map(rows=200, cols=900, tile_px=16)
+    px = np.random.default_rng(0).uniform(-5.0, 905.0, (5000, 2))
+    groups = list(groups_by_tile(px, source))
+    assert sorted(np.concatenate(groups).tolist()) == list(range(5000))
+    cells = np.clip(px, 0, (899, 199)).astype(int) // 16
+    assert all(len(np.unique(cells[group], axis=0)) == 1 for group in groups)
+    assert len(groups) == len(np.unique(cells, axis=0))
+
+
+def test_windows_beyond_the_map_have_no_data_there():
+    source = random_map(rows=60, cols=50)
+    whole = read_window(source, "ortho", -5, 65, -7, 53)
+    np.testing.assert_array_equal(whole[5:-5, 7:-3], source.arrays["ortho"])
+    assert not whole[:5].any()
+    assert np.isnan(read_window(source, "height", 70, 75, 0, 5)).all()
+
+
+def test_no_frames_give_no_patches():
+    source = random_map()
+    got = sample(source, frames_at(source.grid, 0))
+    assert got.height.shape == (0, 40, 40)
+    assert got.ortho.shape == (0, 40, 40)

@@ -1,0 +1,163 @@
+"""The documentation holds: links lead somewhere, commands and options exist, snippets run."""
+
+import contextlib
+import os
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import click
+import pytest
+from synthetic_store import box, region_file, small_store
+
+from tcpipe.cli import cli
+from tcpipe.formats.recipe_toml import parse_recipe
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.recipe import Recipe
+
+ROOT = Path(__file__).parents[2]
+PAGES = sorted(
+    page
+    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"))
+    if not any(part.startswith(".") for part in page.relative_to(ROOT).parts)
+)
+SNIPPETS = (ROOT / "README.md", ROOT / "docs/how-to/train.md")
+_FENCE = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+
+
+def _fences(page: Path, *kinds: str) -> list[str]:
+    return [body for kind, body in _FENCE.findall(page.read_text(encoding="utf-8")) if kind in kinds]
+
+
+def _anchor(heading: str) -> str:
+    """Return the anchor that a renderer makes of a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(_FENCE, "", page.read_text(encoding="utf-8"))
+    lost = []
+    for target in re.findall(r"(?:\]\(|src=\")([^)\"\s]+)[)\"]", text):
+        if re.match(r"[a-z]+:", target):
+            continue
+        path, _, anchor = target.partition("#")
+        there = (page.parent / path).resolve() if path else page
+        if not there.exists():
+            lost.append(target)
+        elif anchor and there.suffix == ".md":
+            headings = re.findall(r"^#+ (.*)$", there.read_text(encoding="utf-8"), re.MULTILINE)
+            if anchor not in map(_anchor, headings):
+                lost.append(target)
+    assert not lost
+
+
+def _command_lines(page: Path) -> Iterator[str]:
+    """Yield every ``tcpipe …`` command in the page's plain and console blocks, and in its inline code."""
+    text = page.read_text(encoding="utf-8").replace("\\\n", " ")
+    for kind, body in _FENCE.findall(text):
+        if kind in ("", "console", "bash", "sh"):
+            for line in body.splitlines():
+                for part in re.split(r"\||&&|;|\(|\$\(", line.partition(" # ")[0]):
+                    found = re.match(r"\s*(?:\$ )?(?:do |\d+ \d+ \* \* \*.*?bin/)?(tcpipe .*)", part)
+                    if found:
+                        yield found[1]
+    inline = re.sub(_FENCE, "", text)
+    yield from re.findall(r"`(tcpipe [a-z-]+ [^`]*--[^`]*)`", inline)
+
+
+def _problem(line: str) -> str | None:
+    """Return why a command line could not be meant: the command or one of its options does not exist."""
+    words = shlex.split(re.split(r" (?:2>|>|<)", line)[0])[1:]
+    if words[0].startswith("-") or words[0].isupper():
+        return None
+    if words[0] not in cli.commands:
+        return f"{line}: there is no command {words[0]}"
+    command = cli.commands[words[0]]
+    known = {option for parameter in command.params for option in (*parameter.opts, *parameter.secondary_opts)}
+    given = [word.partition("=")[0] for word in words[1:] if re.match(r"--?[a-z]", word)]
+    unknown = [option for option in given if option not in known | {"--help"}]
+    if unknown:
+        return f"{line}: {words[0]} has no option {', '.join(unknown)}"
+    with click.Context(command, info_name=words[0]) as context, contextlib.suppress(click.exceptions.Exit):
+        try:
+            command.make_parser(context).parse_args(list(words[1:]))
+        except click.UsageError as error:
+            return f"{line}: {error.format_message()}"
+    return None
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_commands_and_options_exist(page: Path) -> None:
+    if page.name == "cli.md":
+        pytest.skip("generated from the commands themselves")
+    assert not [problem for line in _command_lines(page) if (problem := _problem(line))]
+
+
+def test_the_pages_hold_commands_to_check() -> None:
+    lines = [line for page in PAGES for line in _command_lines(page)]
+    assert len(lines) > 40
+    assert _problem("tcpipe ingest run.bag --jbos 2") == "tcpipe ingest run.bag --jbos 2: ingest has no option --jbos"
+    assert _problem("tcpipe injest run.bag") == "tcpipe injest run.bag: there is no command injest"
+
+
+def _recipes() -> list[tuple[str, str]]:
+    return [
+        (f"{page.relative_to(ROOT)}:{number}", body)
+        for page in (ROOT / "docs/how-to").glob("*.md")
+        for number, body in enumerate(_fences(page, "toml"))
+        if "[[class]]" not in body
+    ]
+
+
+@pytest.mark.parametrize(("where", "body"), _recipes(), ids=lambda value: value if ":" in value[:60] else "")
+def test_recipe_lines_are_recipes(where: str, body: str) -> None:
+    import tomllib
+
+    assert parse_recipe(tomllib.loads(body), where=where) != Recipe()
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory with a small dataset in both formats."""
+    here = tmp_path_factory.mktemp("docs")
+    store = small_store(here)
+    region = region_file(here / "region.geojson", box(-18, -18, 6, 18))
+    for name, file_format in (("dataset", "zarr"), ("dataset-parquet", "parquet")):
+        build_dataset(here / name, store=store.root, split=region, recipe=Recipe(), file_format=file_format)
+    return here
+
+
+@pytest.mark.parametrize(
+    "snippet",
+    [
+        pytest.param(body, id=f"{page.name}:{number}")
+        for page in SNIPPETS
+        for number, body in enumerate(_fences(page, "python"))
+    ],
+)
+@pytest.mark.filterwarnings("default")  # of other libraries
+def test_snippets_run(snippet: str, datasets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in re.findall(r"^(?:import|from) (\w+)", snippet, re.MULTILINE):
+        pytest.importorskip(name)
+    monkeypatch.chdir(datasets)
+    monkeypatch.setitem(os.environ, "HF_HUB_OFFLINE", "1")
+    monkeypatch.setitem(os.environ, "HF_HOME", str(datasets / "cache"))
+    names: dict[str, object] = {}
+    if "train" in snippet and "open_dataset" not in snippet and "polars" not in snippet:
+        exec('import tcpipe; train = tcpipe.open_dataset("dataset")["train"]', names)  # noqa: S102  ours
+    exec(compile(snippet, "snippet", "exec"), names)  # noqa: S102  ours
+    if "patches" in names and "labels" in names:
+        assert names["patches"].shape[1:] == (40, 40, 3)
+        assert names["labels"].shape[1:] == (2,)
+
+
+def test_nothing_of_one_machine_is_in_the_pages() -> None:
+    """No absolute path of where the pages were written."""
+    found = [
+        f"{page.name}: {hit}"
+        for page in PAGES
+        for hit in re.findall(r"/(?:work|root|tmp|mnt)/\S*", page.read_text(encoding="utf-8"))
+    ]
+    assert not found
