@@ -1,0 +1,7 @@
+"""Random tests draw the same examples on every machine; ``pytest --hypothesis-profile explore`` draws new ones."""
+
+from hypothesis import settings
+
+settings.register_profile("fixed", derandomize=True, deadline=None)
+settings.register_profile("explore", deadline=None, max_examples=500)
+settings.load_profile("fixed")
