@@ -12,6 +12,8 @@
     ├── RegionError            exit 1   a split region cannot be used
     ├── StoreError             exit 1   the store cannot be read or written
     ├── DatasetError           exit 1   a dataset cannot be built or read
+    ├── ModelError             exit 1   a trained model cannot be read, or does not fit what it is asked about
+    ├── PathError              exit 1   a path cannot be used, or there is none
     └── TableError             exit 1   a table breaks its contract (tcpipe.tables)
 
 Each carries one or more *problems*: plain lines that say what, where, got, wanted and what to do.
@@ -76,6 +78,14 @@ class StoreError(TcpipeError):
 
 class DatasetError(TcpipeError):
     """A dataset cannot be built or read."""
+
+
+class ModelError(TcpipeError):
+    """A trained model cannot be read, or does not fit what it is asked about."""
+
+
+class PathError(TcpipeError):
+    """A path cannot be used, or there is none."""
 
 
 class TableError(TcpipeError):
