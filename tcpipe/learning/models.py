@@ -1,0 +1,184 @@
+"""Trained models: folders that appear whole or not at all.
+
+::
+
+    model.json         what it takes, gives, and has seen; how it was trained; checksums of the rest
+    weights.npz        every weight by its path in the network
+    residuals.parquet  labels and predictions of the fold that training was stopped by
+    history.csv        losses of every epoch
+    MODEL.md           the same for people
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import ModelError, StoreError
+from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.dataset_files import checksums_to_json, file_checksum
+from tcpipe.formats.json_files import digest, read_json, write_json
+from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.weights import read_arrays, write_arrays
+from tcpipe.learning.model_card import ModelCard, card_from_json, card_to_json
+from tcpipe.learning.network import named_weights, resnet18
+from tcpipe.terrain.classes import ClassTable
+
+Floats = NDArray[np.float32]
+
+CARD, WEIGHTS, RESIDUALS, HISTORY, README = "model.json", "weights.npz", "residuals.parquet", "history.csv", "MODEL.md"
+
+LEAST_VELOCITY_MPS = 0.05
+"""A predicted velocity is never below it, so that T = d / v stays finite: slower is standing."""
+
+_PREDICTED_TOGETHER = 256
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained network with its card; ``name`` is the folder as it was given."""
+
+    name: str
+    card: ModelCard
+    network: Any
+    """The Keras model: patches (N, px, px, depth) to outputs over ``card.scale``."""
+    checksum: str
+    """Of card and weights: what rules its predictions."""
+    residuals: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
+
+    @property
+    def classes(self) -> ClassTable:
+        """The class table that the terrain channel is scaled by."""
+        return self.card.classes
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels of a patch, in order."""
+        return self.card.channels
+
+    @property
+    def patch_m(self) -> float:
+        """Side of a patch [m]."""
+        return self.card.patch_m
+
+    @property
+    def patch_px(self) -> int:
+        """Side of a patch in pixels."""
+        return self.card.architecture.patch_px
+
+    @property
+    def chord_m(self) -> float:
+        """Length of ground that a patch's cost is of [m]."""
+        return self.card.chord_m
+
+    @property
+    def robot(self) -> str:
+        """Whose cost it predicts."""
+        return self.card.robot
+
+    @property
+    def class_counts(self) -> Mapping[int, int]:
+        """Training samples by terrain class."""
+        return self.card.seen.class_counts
+
+    @property
+    def pixel_classes(self) -> tuple[int, ...]:
+        """Classes of which any pixel occurs in training."""
+        return self.card.seen.pixel_classes
+
+    @property
+    def seen(self) -> Mapping[str, tuple[float, float]]:
+        """Smallest and largest slope_rad, cross_slope_rad, relief_m in training."""
+        return self.card.seen.ranges
+
+    def predict(self, patches: Floats) -> Floats:
+        """Return power [W] and velocity [m/s], shape (N, 2), of patches in [0, 1], shape (N, px, px, depth)."""
+        wanted = (self.patch_px, self.patch_px, self.card.architecture.depth)
+        if patches.shape[1:] != wanted:
+            raise ModelError(
+                f"{self.name}: patches of shape {patches.shape[1:]}, wanted {wanted}: {', '.join(self.channels)}"
+            )
+        out = self.outputs(patches)
+        if "velocity_mps" in self._short_outputs:
+            column = self._short_outputs.index("velocity_mps")
+            out[:, column] = np.maximum(out[:, column], np.float32(LEAST_VELOCITY_MPS))
+        return out
+
+    def outputs(self, patches: Floats) -> Floats:
+        """Return what the network gives, in the units of its outputs, shape (N, outputs)."""
+        out = np.empty((len(patches), len(self.card.scale)), np.float32)
+        for first in range(0, len(patches), _PREDICTED_TOGETHER):
+            part = slice(first, first + _PREDICTED_TOGETHER)
+            out[part] = self.network.predict_on_batch(np.ascontiguousarray(patches[part], np.float32))
+        return out * np.array(self.card.scale, np.float32)
+
+    @cached_property
+    def _short_outputs(self) -> list[str]:
+        return [name.removeprefix("fused_") for name in self.card.outputs]
+
+
+def write_model(place: Path, *, card: ModelCard, network: Any, residuals: pa.Table, history: str, readme: str) -> None:
+    """Write the folder, whole or not at all."""
+    with atomic_directory(place) as directory:
+        write_arrays(directory / WEIGHTS, named_weights(network))
+        write_table(residuals, directory / RESIDUALS)
+        write_text(directory / HISTORY, history)
+        write_text(directory / README, readme)
+        write_json(directory / CARD, {**card_to_json(card), "checksums": checksums_to_json(directory)})
+
+
+def load_model(path: str | Path) -> Model:
+    """Open a model that ``tcpipe train`` wrote.
+
+    Parameters
+    ----------
+    path
+        Its folder.
+
+    Raises
+    ------
+    ModelError
+        There is no model, its training has not finished, a file is damaged or cut short, or it is of another schema.
+
+    """
+    place = Path(path)
+    found = read_model_card(place)
+    card = card_from_json(found, str(place / CARD))
+    for name, entry in found.get("checksums", {}).items():
+        if not (place / name).is_file() or file_checksum(place / name)[1] != entry["sha256"]:
+            raise ModelError(
+                f"{place / name}: gone, cut short or damaged (its checksum is not the card's); train the model again"
+            )
+    network = resnet18(card.architecture, seed=0, start=[0.0] * card.architecture.outputs)
+    set_weights(network, read_arrays(place / WEIGHTS), str(place / WEIGHTS))
+    table = read_table(place / RESIDUALS)
+    residuals = {name: table.column(name).to_numpy() for name in table.column_names}
+    return Model(str(path), card, network, digest(found), residuals)
+
+
+def read_model_card(place: Path) -> dict[str, Any]:
+    """Return model.json of a folder; `ModelError` says what the folder is otherwise."""
+    if not place.is_dir():
+        raise ModelError(f"{place}: there is no such model; run 'tcpipe train' first")
+    if not (place / CARD).is_file():
+        raise ModelError(f"{place}: not a model: it has no {CARD}")
+    try:
+        return read_json(place / CARD)
+    except StoreError as error:
+        raise ModelError(*error.problems) from None
+
+
+def set_weights(network: Any, arrays: Mapping[str, NDArray[Any]], where: str) -> None:
+    """Put weights into a network; `ModelError` if they are another network's."""
+    shapes = {name: value.shape for name, value in named_weights(network).items()}
+    if {name: value.shape for name, value in arrays.items()} != shapes:
+        raise ModelError(f"{where}: holds the weights of another network; train the model again")
+    network.set_weights([arrays[name] for name in shapes])

@@ -1,0 +1,52 @@
+"""A model folder without training: a narrow network with random weights, and residuals that were drawn."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from tcpipe.learning.model_card import ModelCard, Seen
+from tcpipe.learning.models import write_model
+from tcpipe.learning.network import Architecture, resnet18
+from tcpipe.terrain.classes import PAPER_CLASSES
+
+CARD = ModelCard(
+    architecture=Architecture(patch_px=40, depth=3, outputs=2, width=4),
+    channels=("ortho", "terrain", "height"),
+    outputs=("power_watt", "velocity_mps"),
+    scale=(400.0, 1.0),
+    patch_m=1.0,
+    chord_m=1.0,
+    label_velocity="ground",
+    robot="husky",
+    classes=PAPER_CLASSES,
+    seen=Seen(
+        {4: 60, 6: 25, 7: 15},
+        (4, 6, 7),
+        {"slope_rad": (-0.3, 0.3), "cross_slope_rad": (-0.25, 0.25), "relief_m": (0.0, 0.5)},
+    ),
+    dataset={"name": "made", "sha256": "0" * 64, "data_model_version": 1, "samples": {"train": 100}},
+    training={"loss": "nrmse", "seed": 0},
+)
+
+
+def made_model(directory: Path, *, seed: int = 0, rows: int = 60, **changes) -> Path:
+    """Write a model folder; ``changes`` replace fields of its card."""
+    card = replace(CARD, **changes)
+    network = resnet18(card.architecture, seed=seed, start=(0.4, 0.85)[: card.architecture.outputs])
+    rng = np.random.default_rng(seed)
+    power, velocity = rng.uniform(100.0, 250.0, rows), rng.uniform(0.7, 0.95, rows)
+    residuals = pa.table(
+        {
+            "run_id": ["one"] * (rows // 2) + ["two"] * (rows - rows // 2),
+            "start_ns": np.arange(rows) * 1_200_000_000,
+            "terrain_class": rng.choice([4, 6, 7], rows).astype(np.uint8),
+            "power_watt": power,
+            "velocity_mps": velocity,
+            "power_predicted_watt": power + rng.normal(0.0, 8.0, rows),
+            "velocity_predicted_mps": velocity + rng.normal(0.0, 0.02, rows),
+        }
+    )
+    write_model(directory, card=card, network=network, residuals=residuals, history="epoch,loss\n", readme="made\n")
+    return directory
