@@ -6,7 +6,7 @@
       sources.json                             sha256 of every log seen, by path, size and modification time
       maps/<name>.zarr
       runs/<run_id>/run.json                   source, robot, tags, topics, damage
-      runs/<run_id>/streams/<role>.parquet     L1
+      runs/<run_id>/streams/<role>.parquet     L1, and checksums.json
       runs/<run_id>/<recipe_id>/               manifest.json, track.parquet, segments.parquet, rejections.parquet
 
 A recipe directory appears by one rename, manifest inside: if it is there, it is complete.
@@ -27,8 +27,9 @@ import pyarrow as pa
 from tcpipe.errors import StoreError, TableError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, exclusive
 from tcpipe.formats.dataset_files import checksums_to_json
-from tcpipe.formats.json_files import read_json, write_json
+from tcpipe.formats.json_files import read_json
 from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.seals import write_checksums, write_sealed
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     Findings,
@@ -153,7 +154,7 @@ class Store:
             *(run.path / "manifest.json" for run in self.recipes_of(run_id)),
         ):
             if path.exists():
-                write_json(path, {**read_json(path), "tags": dict(tags)})
+                write_sealed(path, {**read_json(path), "tags": dict(tags)})
 
     def run_json(self, run_id: str) -> dict[str, Any] | None:
         """Return what is known of a run's log, or None."""
@@ -162,7 +163,7 @@ class Store:
 
     def write_run_json(self, run_id: str, values: Mapping[str, Any]) -> None:
         """Write what is known of a run's log."""
-        write_json(self.runs_path / run_id / "run.json", values)
+        write_sealed(self.runs_path / run_id / "run.json", values)
 
     def sources(self) -> dict[str, Any]:
         """Return the logs seen so far: path → size, modification time, sha256."""
@@ -174,7 +175,7 @@ class Store:
         with exclusive(self.root):
             known = self.sources()
             if known.get(key) != source:
-                write_json(self.root / "sources.json", {**known, key: source})
+                write_sealed(self.root / "sources.json", {**known, key: source})
 
     def write_streams(self, run_id: str, streams: Streams, *, key: str) -> None:
         """Write L1 whole or not at all; ``key`` names the read settings they were made with."""
@@ -189,6 +190,7 @@ class Store:
             for role, table in streams.tables.items():
                 sensor = asdict(streams.sensors[role])
                 write_table(with_metadata(table, {**shared, "sensor": sensor}), directory / f"{role}.parquet")
+            write_checksums(directory)
 
     def read_streams(self, run_id: str, *, key: str) -> Streams | None:
         """Return L1 if it is there, whole, of this data model and made with these read settings; else None."""
@@ -238,7 +240,7 @@ class Store:
                 datum = {"run_id": run_id, "recipe_id": recipe_id, "datum": info["datum"], "robot": info["robot"]}
                 write_table(with_metadata(table, datum), directory / f"{name}.parquet")
             written = {"info": info, "ledger_m": dict(labelled.ledger_m), "checksums": checksums_to_json(directory)}
-            write_json(directory / "manifest.json", {**manifest, **written})
+            write_sealed(directory / "manifest.json", {**manifest, **written})
         return path
 
 

@@ -12,7 +12,7 @@ import fcntl
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -152,14 +152,26 @@ def _locked_directory(parent: Path, prefix: str) -> tuple[Path, int]:
             os.close(lock)
 
 
+def is_abandoned(holder: Path) -> bool:
+    """Return whether nobody writes into a temporary any more; it may be removed then."""
+    return _claimed(holder, lambda: None)
+
+
 def _remove_if_abandoned(holder: Path) -> None:
+    _claimed(holder, lambda: shutil.rmtree(holder))
+
+
+def _claimed(holder: Path, act: Callable[[], object]) -> bool:
+    """Do something while a temporary is locked, unless its writer lives; return whether it was done."""
     with suppress(OSError):
         lock = os.open(holder, os.O_RDONLY)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            shutil.rmtree(holder)
+            act()
         finally:
             os.close(lock)
+        return True
+    return False
 
 
 def _take_place(temporary: Path, place: Path) -> None:

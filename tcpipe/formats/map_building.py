@@ -16,6 +16,7 @@ from tcpipe.formats.class_table import read_class_scheme
 from tcpipe.formats.geotiff import Raster, open_raster
 from tcpipe.formats.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.map_layers import Layer, RasterLayer, shards_of
+from tcpipe.formats.seals import write_checksums
 from tcpipe.formats.terrain_polygons import SUFFIXES, place_polygons
 from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, ClassTable, named_scheme
 from tcpipe.terrain.grid import MapGrid
@@ -106,6 +107,7 @@ def build_map(
             _refuse_empty(layers)
             summary = _summary(out_path, name, grid, scheme.table, layers)
             writer.finish({**_facts(summary, layers), "classes_from": origin, "inputs": dict(inputs or {})})
+            write_checksums(half)
     return summary
 
 

@@ -33,6 +33,7 @@ from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import plain, write_json
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+from tcpipe.formats.seals import sealed_page, write_sealed
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.dataset_card import CARD_COLUMNS, CardFacts, dataset_card, is_whole, map_to_json
 from tcpipe.pipeline.dataset_content import Content, gather_content
@@ -245,8 +246,8 @@ def _build(
         checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},
     )
     card = plain(dataset_card(read_samples(directory, CARD_COLUMNS), recipe, facts))
-    write_json(directory / CARD, card)
-    write_text(directory / REPORT, dataset_report(directory))
+    write_sealed(directory / CARD, card)
+    write_text(directory / REPORT, sealed_page(dataset_report(directory)))
     return dict(card)
 
 

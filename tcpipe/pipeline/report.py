@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_text
+from tcpipe.formats.seals import sealed_page
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.run_report import run_report
 from tcpipe.store import Store, is_store, run_at
@@ -42,7 +43,7 @@ def report(path: Path) -> list[Page]:
 
 
 def _write(directory: Path, html: str) -> Page:
-    path = directory / "report.html"
+    path, html = directory / "report.html", sealed_page(html)
     changed = not path.is_file() or path.read_bytes() != html.encode()
     if changed:
         write_text(path, html)

@@ -4,17 +4,24 @@ import json
 import shutil
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from synthetic_store import add_run, box, lanes, region_file, segments, small_store
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.dataset_files import file_checksum
+from tcpipe.formats.map_files import open_map
+from tcpipe.formats.parquet import write_table
+from tcpipe.formats.seals import broken_seal, sealed_page, write_checksums, write_sealed
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
+from tcpipe.report.overview import quick_look, write_overview
 from tcpipe.store import Store
+from tcpipe.tables.levels import STREAMS
 
 
 @pytest.fixture(scope="module")
@@ -32,14 +39,14 @@ def copy(made, tmp_path):
     return lambda name: shutil.copytree(made / name, tmp_path / name)
 
 
-def flip(path):
+def flip(path, place=0.5, *, bit=0):
     data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 1
+    data[min(int(place * len(data)), len(data) - 1)] ^= 1 << bit
     path.write_bytes(data)
 
 
-def files(directory, *, but=()):
-    return sorted(path for path in directory.rglob("*") if path.is_file() and path.name not in but)
+def files(directory):
+    return sorted(path for path in directory.rglob("*") if path.is_file())
 
 
 @pytest.mark.parametrize("name", ["zarr", "parquet"])
@@ -57,14 +64,40 @@ def test_a_store_its_runs_and_its_map_verify(made):
     assert verify(made / "store" / "maps" / "site.zarr").kind == "map"
 
 
-@pytest.mark.parametrize("name", ["zarr", "parquet"])
-def test_a_changed_byte_in_any_file_of_a_dataset_is_found(copy, name):
-    directory = copy(name)
-    for path in files(directory, but=("dataset.json", "report.html")):
-        whole = path.read_bytes()
-        flip(path)
-        assert any(str(path) in problem for problem in verify(directory).problems), path
-        path.write_bytes(whole)
+def dress(store):
+    """Add what `ingest`, `add-map` and `report` also leave in a store."""
+    store.remember_source("/logs/north.mcap", {"sha256": "north"})
+    write_overview(store.root / "maps" / "site.png", quick_look(open_map(store.map_path("site"))))
+    for run in store.runs():
+        (run.path / "report.html").write_text(sealed_page("<p>\nwhat was driven\n</p>"))
+        streams = run.path.parent / "streams"
+        write_table(STREAMS["power"].empty(), streams / "power.parquet")
+        write_checksums(streams)
+
+
+SEALED = ("dataset.json", "report.html", "run.json", "manifest.json", "sources.json", "checksums.json")
+
+
+@pytest.mark.parametrize("name", ["zarr", "parquet", "store"])
+def test_a_changed_byte_anywhere_is_found_and_its_file_is_named(copy, name):
+    directory, rng = copy(name), np.random.default_rng(0)
+    if name == "store":
+        dress(Store(directory))
+    listed = [path for path in files(directory) if path.name not in SEALED]
+    whole = {path: path.read_bytes() for path in files(directory)}
+    for place in (0.0, *rng.random(5), 1.0):  # all that are listed at once, then each sealed one alone
+        for path in listed:
+            flip(path, place, bit=int(rng.integers(8)))
+        problems = verify(directory).problems
+        assert [path for path in listed if not any(str(path) in problem for problem in problems)] == []
+        for path in listed:
+            path.write_bytes(whole[path])
+    for path in set(whole) - set(listed):
+        for place in (0.0, *rng.random(8), 1.0):
+            flip(path, place, bit=int(rng.integers(8)))
+            problems = broken_seal(path) if place else "".join(verify(directory).problems)
+            assert str(path) in (problems or ""), (path, place)
+            path.write_bytes(whole[path])
     assert verify(directory).problems == ()
 
 
@@ -72,9 +105,42 @@ def test_a_changed_byte_in_any_file_of_a_dataset_is_found(copy, name):
 def test_a_card_that_says_something_else_is_found(copy, key):
     directory = copy("zarr")
     card = json.loads((directory / "dataset.json").read_text())
-    card[key] = 7
-    (directory / "dataset.json").write_text(json.dumps(card))
-    assert any(key in problem for problem in verify(directory).problems)
+    write_sealed(directory / "dataset.json", {**card, key: 7})
+    assert any(f"{key} is 7, but the samples give" in problem for problem in verify(directory).problems)
+
+
+@pytest.mark.parametrize("key", ["runs", "maps", "checksums", "ledger_m", "layers", "format"])
+def test_a_card_that_lacks_something_is_one_problem_and_no_traceback(copy, key):
+    directory = copy("parquet")
+    card = json.loads((directory / "dataset.json").read_text())
+    del card[key]
+    write_sealed(directory / "dataset.json", card)
+    assert "cannot be followed" in "\n".join(verify(directory).problems)
+
+
+@pytest.mark.parametrize("name", ["zarr", "parquet"])
+def test_rows_that_are_joined_to_others_patches_are_found(copy, name):
+    """Every file is as the card has it, but the samples were sorted and the patches were not."""
+    directory = copy(name)
+    card = json.loads((directory / "dataset.json").read_text())
+    path = directory / "samples.parquet"
+    pq.write_table(pq.read_table(path).sort_by("start_ns"), path)
+    size_bytes, sha256 = file_checksum(path)
+    card["checksums"]["samples.parquet"] = {"size_bytes": size_bytes, "sha256": sha256}
+    write_sealed(directory / "dataset.json", card)
+    assert any("are not those of samples.parquet, in their order" in line for line in verify(directory).problems)
+
+
+def test_a_run_that_holds_anothers_segments_is_found(copy):
+    store = copy("store")
+    north, south = (next((store / "runs" / name).glob("*/manifest.json")).parent for name in ("north", "south"))
+    shutil.copy(north / "segments.parquet", south / "segments.parquet")
+    manifest = json.loads((south / "manifest.json").read_text())
+    manifest["checksums"] = json.loads((north / "manifest.json").read_text())["checksums"]
+    write_sealed(south / "manifest.json", manifest)
+    problems = "\n".join(verify(store).problems)
+    assert "holds segments of run_id north; wanted south" in problems
+    assert "its segment ids are not the run's id" in problems
 
 
 def test_files_that_went_or_came_are_found(copy):
@@ -85,17 +151,6 @@ def test_files_that_went_or_came_are_found(copy):
         "is gone",
         "is no file of this dataset",
     ]
-
-
-def test_a_changed_byte_in_any_table_of_a_run_is_found(copy):
-    store = copy("store")
-    for path in files(store / "runs"):
-        if path.suffix == ".parquet":
-            whole = path.read_bytes()
-            flip(path)
-            assert verify(store).problems, path
-            path.write_bytes(whole)
-    assert verify(store).problems == ()
 
 
 def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
@@ -115,10 +170,33 @@ def test_a_manifest_that_counts_otherwise_is_found(copy):
     manifest = json.loads(path.read_text())
     manifest["counts"]["segments"] += 1
     manifest["ledger_m"]["kept"] += 1.0
-    path.write_text(json.dumps(manifest))
+    write_sealed(path, manifest)
     problems = verify(store).problems
-    assert any("224 rows, its manifest says 225" in problem for problem in problems)
+    assert any("segments is 225, but segments.parquet has 224 rows" in problem for problem in problems)
     assert any("the ledger keeps 225.000 m" in problem for problem in problems)
+
+
+def test_strange_files_in_a_store_are_named_and_what_a_killed_command_left_behind(copy):
+    store = copy("store")
+    strange = ("maps/notes.txt", "runs/notes.txt", "runs/north/notes.txt", "maps/site.zarr/height/notes.txt")
+    for name in (*strange, f"{next((store / 'runs' / 'south').glob('*/manifest.json')).parent}/notes.txt"):
+        (store / name).write_text("mine")
+    (store / "runs" / ".tmp-north-1").mkdir()
+    problems = verify(store).problems
+    assert sum("is no file of this store" in problem for problem in problems) == 5
+    assert next(problem for problem in problems if "killed" in problem).startswith(str(store / "runs" / ".tmp-north-1"))
+    assert len(problems) == 6
+
+
+def test_an_ingestion_that_lost_its_manifest_or_a_table_does_not_hide_behind_another(copy):
+    store = copy("store")
+    run = next((store / "runs" / "north").glob("*/manifest.json")).parent
+    shutil.copytree(run, run.with_name("00000000"))
+    (run / "manifest.json").unlink()
+    (run.with_name("00000000") / "track.parquet").unlink()
+    problems = "\n".join(verify(store).problems)
+    assert f"{run / 'manifest.json'}: cannot be read" in problems
+    assert f"{run.with_name('00000000') / 'track.parquet'}: is gone" in problems
 
 
 def test_what_is_none_of_these_is_said(tmp_path):

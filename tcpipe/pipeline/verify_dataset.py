@@ -1,0 +1,152 @@
+"""A dataset held against its card, its samples against its patches."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.formats.dataset_files import (
+    CARD,
+    PATCHES,
+    REPORT,
+    SAMPLES,
+    PatchFiles,
+    open_patches,
+    read_card,
+    read_samples,
+    rows_in_files,
+    zarr_sample_ids,
+)
+from tcpipe.formats.json_files import plain
+from tcpipe.formats.parquet import read_table
+from tcpipe.formats.seals import broken_checksums, broken_seal
+from tcpipe.pipeline.dataset_card import CARD_COLUMNS, measured
+from tcpipe.pipeline.dataset_segments import KEPT
+from tcpipe.tables.columns import floats
+from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
+
+Finding = tuple[str, int] | str
+
+
+def verify_dataset(directory: Path) -> Iterator[Finding]:
+    """Yield what was read, and a line for everything that is not as the card says."""
+    card = read_card(directory)
+    for path in (directory / CARD, directory / REPORT):
+        problem = broken_seal(path)
+        yield problem or ("files", 1)
+    if card.get("data_model_version") != DATA_MODEL_VERSION:
+        yield (
+            f"{directory / CARD}: of data model {card.get('data_model_version')}, this version knows {DATA_MODEL_VERSION}; "
+            "verify it with the version that wrote it, or build it again"
+        )
+        return
+    try:
+        yield from _files(directory, card)
+        yield from _samples(directory, card)
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+        yield f"{directory / CARD}: cannot be followed any further ({type(error).__name__}: {error})"
+
+
+def _files(directory: Path, card: Mapping[str, Any]) -> Iterator[Finding]:
+    """Compare every file with the checksum that the card has of it; name those that it does not know."""
+    yield from broken_checksums(directory, card["checksums"])
+    yield "files", len(card["checksums"])
+    there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
+    for name in sorted(there - {*card["checksums"], CARD, REPORT}):
+        yield f"{directory / name}: is no file of this dataset"
+
+
+def _samples(directory: Path, card: Mapping[str, Any]) -> Iterator[Finding]:
+    samples, where = read_samples(directory), directory / SAMPLES
+    yield "samples", samples.num_rows
+    try:
+        SAMPLES_SCHEMA.check(samples)
+    except TcpipeError as error:
+        yield from (f"{where}: {problem}" for problem in error.problems)
+        return
+    yield from (f"{where}: {problem}" for problem in _wrong_joins(samples, card))
+    for key, value in plain(measured(samples.select(CARD_COLUMNS), has_terrain="terrain" in card["layers"])).items():
+        if card.get(key) != value:
+            yield f"{directory / CARD}: {key} is {card.get(key)}, but the samples give {value}"
+    used_m = math.fsum(floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
+    if not math.isclose(used_m, card["ledger_m"][KEPT], rel_tol=1e-9, abs_tol=1e-6):
+        yield f"{directory / CARD}: the ledger keeps {card['ledger_m'][KEPT]:.3f} m, the samples cover {used_m:.3f} m"
+    yield from _patches(directory, card, samples)
+
+
+def _wrong_joins(samples: pa.Table, card: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for each kind of row that belongs to nothing, or to something else than its columns say."""
+    ids = samples.column("sample_id")
+    repeated = len(ids) - pc.count_distinct(ids).as_py()
+    if repeated:
+        yield f"{repeated} sample ids occur more than once"
+    yield from _rows(pc.not_equal(ids, samples.column("segment_id")), "have another id than their segment")
+    for column, known in (
+        ("run_id", [run["run_id"] for run in card["runs"]]),
+        ("map", [m["name"] for m in card["maps"]]),
+    ):
+        strange = pc.invert(pc.is_in(samples.column(column), value_set=pa.array(known, pa.string())))
+        yield from _rows(strange, f"have a {column} that the card does not list")
+    names = {entry["id"]: entry["name"] for entry in card["classes"]}
+    pairs = samples.select(["terrain_class", "terrain_name"]).group_by(["terrain_class", "terrain_name"]).aggregate([])
+    for pair in pairs.to_pylist():
+        if names.get(pair["terrain_class"]) != pair["terrain_name"]:
+            yield f"class {pair['terrain_class']} is called {pair['terrain_name']!r}, {names.get(pair['terrain_class'])!r} in the card"
+
+
+def _rows(wrong: pa.ChunkedArray, what: str) -> Iterator[str]:
+    count = int(pc.sum(wrong).as_py() or 0)
+    if count:
+        yield f"{count} rows {what}, the first is row {pc.index(wrong, value=True).as_py()}"
+
+
+def _patches(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Iterator[Finding]:
+    """Decode every patch; compare order, ids and values with the samples and the class table."""
+    files = open_patches(directory, card)
+    split = samples.column("split").to_numpy()
+    place = np.empty(samples.num_rows, np.int64)  # of each row of samples in the files
+    for name, rows in rows_in_files(card, split).items():
+        place[split == name] = rows
+    classes = max((entry["id"] for entry in card["classes"]), default=0)
+    for piece in range(len(files.starts) - 1):
+        try:
+            yield from _piece(files, piece, classes)
+        except DatasetError as error:
+            yield from error.problems
+    in_files = samples.take(pa.array(np.argsort(place, kind="stable")))
+    yield from _beside_patches(directory, card, in_files)
+
+
+def _piece(files: PatchFiles, piece: int, classes: int) -> Iterator[Finding]:
+    pixels = files.read(piece, files.layers)
+    first, rows = int(files.starts[piece]), len(next(iter(pixels.values())))
+    if "terrain" in pixels and pixels["terrain"].max(initial=0) > classes:
+        yield f"{files.directory}: patches {first} to {first + rows - 1} hold classes above {classes}, the last of the table"
+    floor = pixels["height"].reshape(rows, -1).min(axis=1)
+    if floor.any():
+        yield f"{files.directory}: patches {first} to {first + rows - 1}: {int((floor > 0).sum())} do not begin at height 0"
+    yield "patches", rows
+
+
+def _beside_patches(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Iterator[str]:
+    """Compare what stands beside the patches with the samples, given in the order of the files."""
+    if card["format"] == "zarr":
+        if zarr_sample_ids(directory) != samples.column("sample_id").to_pylist():
+            yield f"{directory / PATCHES}: its sample ids are not those of {SAMPLES}, in their order"
+        return
+    first = 0
+    for shard in card["shards"]:
+        found = read_table(directory / shard["path"], samples.column_names)
+        wanted = samples.slice(first, shard["rows"])
+        other = [name for name in samples.column_names if not found.column(name).equals(wanted.column(name))]
+        if other:
+            yield f"{directory / shard['path']}: {', '.join(other)} are not those of {SAMPLES}, in their order"
+        first += shard["rows"]
