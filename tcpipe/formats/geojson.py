@@ -84,6 +84,11 @@ def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
     return features, problems
 
 
+def read_features(path: Path) -> Iterator[tuple[str, Mapping[str, Any], Any]]:
+    """Yield where, properties and geometry object of every feature of a file; `RegionError` if it is not GeoJSON in WGS84."""
+    yield from _features(path, _document(path))
+
+
 def shortened(problems: list[str]) -> list[str]:
     """Return the first few problems, and how many more there are."""
     more = len(problems) - _SHOWN

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -314,3 +314,46 @@ def write_geotiff(
             dataset.write(strip(first, last), window=Window(0, first, cols, last - first))
         if palette is not None:
             dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
+
+
+def write_cog(
+    path: Path,
+    strip: Callable[[int, int], NDArray[Any]],
+    *,
+    rows: int,
+    cols: int,
+    affine: tuple[float, float, float, float, float, float],
+    crs: str,
+    dtype: str,
+    nodata: float | None,
+    bands: Sequence[tuple[str, str]],
+) -> None:
+    """Write a Cloud-Optimised GeoTIFF strip by strip, whole or not at all; overviews hold every second pixel, nothing is averaged.
+
+    ``strip`` and ``affine`` as in `write_geotiff`; ``bands`` are names and units.
+    """
+    with atomic_file(path) as temporary:
+        plain = temporary.with_name("plain.tif")
+        write_geotiff(
+            plain, strip, rows=rows, cols=cols, affine=affine, crs=crs, dtype=dtype, bands=len(bands), nodata=nodata
+        )
+        with rasterio.open(plain, "r+") as dataset:
+            dataset.descriptions = [name for name, _ in bands]
+            dataset.units = [unit for _, unit in bands]
+        options = {"compress": "deflate", "predictor": "yes", "blocksize": 256, "overview_resampling": "nearest"}
+        rasterio.shutil.copy(plain, temporary, driver="COG", bigtiff="IF_SAFER", **options)
+
+
+def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
+    """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols).
+
+    Raises
+    ------
+    MapError
+        It cannot be read.
+    """
+    try:
+        with _opened(path) as dataset:
+            return np.asarray(dataset.read(list(bands)))
+    except RasterioError as error:
+        raise MapError(f"{path}: cannot be read; the file is damaged ({str(error).splitlines()[0]})") from error

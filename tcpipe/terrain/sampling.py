@@ -42,7 +42,13 @@ class Patches:
 
 
 def sample_patches(
-    source: MapReader, frames: PatchFrames, chord_m: NDArray[np.float64], *, patch_m: float, patch_px: int
+    source: MapReader,
+    frames: PatchFrames,
+    chord_m: NDArray[np.float64],
+    *,
+    patch_m: float,
+    patch_px: int,
+    pool: TilePool | None = None,
 ) -> Patches:
     """Return the patches of all frames, in their order, sampled tile by tile from the level of the map that fits them.
 
@@ -56,6 +62,8 @@ def sample_patches(
         Length of each segment on the ground [m], shape (N,).
     patch_m, patch_px
         Side of a patch on the ground [m], and in pixels.
+    pool
+        Tiles of the level `level_for` the patches' pitch, to go on with from call to call; None holds them for this call alone.
     """
     level = level_for(source, patch_m / patch_px)
     pixels = map_px_from_patch(frames, level.grid, patch_m=patch_m, patch_px=patch_px)
@@ -67,7 +75,7 @@ def sample_patches(
     height = np.empty(shape, np.uint16)
     ortho, terrain = (np.empty(shape if has else nothing, np.uint8) for has in (has_ortho, has_terrain))
     stats = np.empty((chord_m.size, 7))
-    pool, pitch_m = TilePool(level), patch_m / patch_px
+    pool, pitch_m = pool or TilePool(level), patch_m / patch_px
     for chosen in groups_by_tile(level.grid.px_from_xy(frames.centre_xy_m), level):
         pool.hold(boxes[chosen])
         where = (pool.slots, *pool.tile_shape, chosen, boxes, pixels, chords, points, pitch_m, HEIGHT_STEP_M)

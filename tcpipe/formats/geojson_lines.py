@@ -1,0 +1,85 @@
+"""Lines in GeoJSON (RFC 7946: always WGS84, lon before lat): a path that is given, paths that were found."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.errors import PathError, RegionError
+from tcpipe.formats.geojson import read_features
+from tcpipe.formats.json_files import write_json
+
+_DECIMALS = 9
+"""A tenth of a millimetre."""
+
+
+def read_line(path: Path) -> NDArray[np.float64]:
+    """Read the one line of a file, WGS84 lon/lat [deg], shape (P, 2), P >= 2.
+
+    Raises
+    ------
+    PathError
+        Not GeoJSON, in another CRS, no line or several, a line of one point, coordinates that are no lon/lat.
+
+    """
+    try:
+        features = list(read_features(path))
+    except RegionError as error:
+        raise PathError(*error.problems) from None
+    if not features:
+        raise PathError(f"{path}: is empty; wanted one LineString")
+    if len(features) > 1:
+        raise PathError(f"{path}: has {len(features)} features, wanted one LineString; a path is one line")
+    where, _, geometry = features[0]
+    name = geometry.get("type") if isinstance(geometry, dict) else None
+    coordinates = geometry.get("coordinates") if isinstance(geometry, dict) else None
+    if name == "MultiLineString" and isinstance(coordinates, list) and len(coordinates) == 1:
+        name, coordinates = "LineString", coordinates[0]
+    if name != "LineString":
+        raise PathError(f"{where}: geometry is {name!r}, wanted one LineString")
+    return _positions(where, coordinates)
+
+
+def _positions(where: str, coordinates: Any) -> NDArray[np.float64]:
+    if not isinstance(coordinates, list) or not coordinates:
+        raise PathError(f"{where}: its line has no points; wanted at least two")
+    try:
+        lonlat = np.array([position[:2] for position in coordinates], dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise PathError(f"{where}: its coordinates are not [lon, lat] positions") from None
+    if lonlat.ndim != 2 or lonlat.shape[1] != 2 or not np.isfinite(lonlat).all():
+        raise PathError(f"{where}: its coordinates are not finite [lon, lat] positions")
+    if len(lonlat) < 2 or (lonlat == lonlat[0]).all():
+        raise PathError(f"{where}: its line is one point; wanted a path from one point to another")
+    check_lonlat(where, lonlat)
+    return lonlat
+
+
+def check_lonlat(where: str, lonlat_deg: NDArray[np.float64]) -> None:
+    """Raise `PathError` for positions, shape (P, 2), that are no longitude and latitude."""
+    lon, lat = lonlat_deg[np.argmax(np.abs(lonlat_deg).max(axis=1))]
+    if 90.0 < abs(lat) <= 180.0 and abs(lon) <= 90.0:
+        raise PathError(f"{where}: ({lon:g}, {lat:g}) is no lon, lat: the axes look swapped; longitude comes first")
+    if abs(lon) > 180.0 or abs(lat) > 90.0:
+        raise PathError(
+            f"{where}: ({lon:g}, {lat:g}) is no lon, lat in degrees: it looks projected; wanted WGS 84 (EPSG:4326)"
+        )
+
+
+def write_lines(
+    path: Path, lines: Sequence[tuple[NDArray[np.float64], Mapping[str, Any]]], about: Mapping[str, Any]
+) -> None:
+    """Write lines (points, shape (P, 2), and properties) as a FeatureCollection, whole or not at all; ``about`` are foreign members."""
+    features = [
+        {
+            "type": "Feature",
+            "properties": dict(properties),
+            "geometry": {"type": "LineString", "coordinates": np.round(lonlat, _DECIMALS).tolist()},
+        }
+        for lonlat, properties in lines
+    ]
+    write_json(path, {"type": "FeatureCollection", "features": features, **about})

@@ -1,0 +1,55 @@
+"""Maps that Nav2's map_server loads: a grey picture (.pgm) and what it means (.yaml), mode ``scale``.
+
+In that mode grey falls from white (cost 0) to black (100, lethal) in even steps. A .pgm has no alpha, so unknown cannot be told from lethal:
+what is not known is lethal here.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.formats.atomic import atomic_file, write_text
+from tcpipe.terrain.grid import MapGrid
+
+LETHAL = 100
+"""Cost of what is never crossed."""
+
+HIGHEST = 99
+"""Largest cost of what can be crossed."""
+
+
+def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, meaning: str) -> None:
+    """Write ``path`` (.yaml) and the picture beside it.
+
+    Parameters
+    ----------
+    path
+        Where the description goes; the picture takes the same name.
+    cost
+        From 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first.
+    grid
+        Where the cells lie; the map's frame is the plane of its CRS.
+    meaning
+        One line that says what a cost is.
+    """
+    grey = np.rint(255.0 * (1.0 - cost / LETHAL)).astype(np.uint8)
+    picture = path.with_suffix(".pgm")
+    with atomic_file(picture) as temporary:
+        temporary.write_bytes(f"P5\n{grid.cols} {grid.rows}\n255\n".encode() + grey.tobytes())
+    x_min, y_min, _, _ = grid.bounds_m
+    lines = (
+        f"# {meaning}",
+        f"# origin: x and y of {grid.crs if len(grid.crs) < 40 else 'the map CRS'} [m]",
+        f"image: {picture.name}",
+        "mode: scale",
+        f"resolution: {grid.pitch_m!r}",
+        f"origin: [{x_min!r}, {y_min!r}, 0.0]",
+        "negate: 0",
+        "occupied_thresh: 1.0",
+        "free_thresh: 0.0",
+        "",
+    )
+    write_text(path, "\n".join(lines))

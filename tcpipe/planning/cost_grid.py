@@ -1,0 +1,146 @@
+"""The cost of a metre along 16 courses at the cells of a coarse grid over a map: which cells, where they lie, what is known of them.
+
+A cell is a square of ``step_m`` map metres; its cost along a course is that of the metre of ground whose middle is the cell's, driven that
+way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.errors import MapError
+from tcpipe.planning.cost_model import CostModel
+from tcpipe.planning.courses import COURSES, DIRECTIONS
+from tcpipe.planning.reasons import NO_COST, Bits, Reason
+from tcpipe.planning.verdicts import BATCH, Verdicts
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.patches import PatchFrames
+from tcpipe.terrain.projection import metres_from_plane, parse_crs
+from tcpipe.terrain.tiles import CACHED_TILES, MapReader, level_for
+
+Floats32 = NDArray[np.float32]
+Cells = NDArray[np.int64]
+
+CELLS_OF_BLOCK = BATCH // COURSES
+
+_STRIP_TILES = CACHED_TILES // 3 - 3
+"""Tiles across a strip of the map: three rows of it are held at once (`tcpipe.terrain.tiles`)."""
+
+BARRED = NO_COST | Reason.OBSTACLE
+"""Ground that a planner never crosses."""
+
+
+def grid_over(source: MapReader, step_m: float) -> MapGrid:
+    """Return the grid of cells: from the map's north-west corner, as many as fit whole.
+
+    Raises
+    ------
+    MapError
+        The map is smaller than a cell.
+    """
+    grid = source.grid
+    cells = [int(size * grid.pitch_m / step_m + 1e-6) for size in (grid.rows, grid.cols)]
+    if min(cells) < 1:
+        raise MapError(f"map {source.name}: is smaller than one cell of {step_m:g} m; choose a smaller --step")
+    return MapGrid(grid.crs, grid.x_min_m, grid.y_max_m, step_m, cells[0], cells[1])
+
+
+@dataclass(frozen=True, slots=True)
+class CostGrid:
+    """What is known of every cell and course.
+
+    Attributes
+    ----------
+    grid : the cells.
+    power_watt, velocity_mps : shape (16, rows, cols); NaN where there is no cost.
+    reasons : `Reason` bits, shape (16, rows, cols).
+    height_m : of the cells' middles, shape (rows, cols); NaN where the map has none.
+    """
+
+    grid: MapGrid
+    power_watt: Floats32
+    velocity_mps: Floats32
+    reasons: Bits
+    height_m: Floats32
+
+    def per_metre(self, objective: str) -> Floats32:
+        """Return what a metre costs: ``energy`` [J/m], ``time`` [s/m] or ``distance`` [m/m]; NaN where there is no cost."""
+        slowness = 1.0 / self.velocity_mps
+        if objective == "energy":
+            return np.asarray(self.power_watt * slowness)
+        return (
+            slowness
+            if objective == "time"
+            else np.asarray(np.where(np.isnan(slowness), np.float32(np.nan), np.float32(1.0)))
+        )
+
+    def put(self, cells: Cells, found: Verdicts) -> None:
+        """Write what was said of cells (flat indices, (n,)), 16 verdicts a cell, courses fastest."""
+        for name in ("power_watt", "velocity_mps", "reasons"):
+            array = getattr(self, name)
+            array.reshape(COURSES, -1)[:, cells] = getattr(found, name).reshape(-1, COURSES).T
+        self.height_m.reshape(-1)[cells] = found.height_m.reshape(-1, COURSES)[:, 0]
+
+
+def empty_grid(grid: MapGrid) -> CostGrid:
+    """Return a grid of which nothing is known, in memory."""
+    shape = (COURSES, grid.rows, grid.cols)
+    nothing = np.float32(np.nan)
+    return CostGrid(
+        grid,
+        np.full(shape, nothing),
+        np.full(shape, nothing),
+        np.full(shape, int(Reason.NODATA), np.uint16),
+        np.full(shape[1:], nothing),
+    )
+
+
+def blocks(
+    source: MapReader, model: CostModel, grid: MapGrid, wanted: NDArray[np.bool_] | None = None
+) -> Iterator[Cells]:
+    """Yield flat indices of cells, at most `CELLS_OF_BLOCK` together, by tile of the map, so that each tile is decoded once.
+
+    Parameters
+    ----------
+    source, model, grid
+        The map, whose patches are sampled from it, and the cells.
+    wanted
+        Which cells, shape (rows, cols); None: all.
+    """
+    level = level_for(source, model.patch_m / model.patch_px)
+    side_m = level.tile_px * level.grid.pitch_m
+    tile_of_row, tile_of_col = (
+        ((np.arange(count) + 0.5) * grid.pitch_m / side_m).astype(np.int64) for count in (grid.rows, grid.cols)
+    )
+    for first in range(0, int(tile_of_col[-1]) + 1, _STRIP_TILES):
+        for i in np.unique(tile_of_row):
+            rows = np.flatnonzero(tile_of_row == i)
+            for j in range(first, min(first + _STRIP_TILES, int(tile_of_col[-1]) + 1)):
+                cols = np.flatnonzero(tile_of_col == j)
+                cells = (rows[:, None] * grid.cols + cols[None, :]).reshape(-1)
+                if wanted is not None:
+                    cells = cells[wanted.reshape(-1)[cells]]
+                yield from (cells[k : k + CELLS_OF_BLOCK] for k in range(0, cells.size, CELLS_OF_BLOCK))
+
+
+class CellFrames:
+    """Frames of the metres through the middles of cells, 16 a cell; the map's scale is taken where the cells lie."""
+
+    __slots__ = ("_crs", "_grid")
+
+    def __init__(self, grid: MapGrid, *, where: str) -> None:
+        self._grid = grid
+        self._crs = parse_crs(grid.crs, where=where)
+
+    def of(self, cells: Cells) -> PatchFrames:
+        """Return the frames of cells (flat indices, (n,)), shape (16 n,), courses fastest."""
+        row, col = np.divmod(cells, self._grid.cols)
+        centre = self._grid.xy_from_px(np.stack([col, row], axis=1).astype(np.float64))
+        ground = metres_from_plane(self._crs, centre.mean(axis=0)[None])[0]
+        along = DIRECTIONS / np.linalg.norm(DIRECTIONS @ ground.T, axis=1)[:, None]
+        along = np.tile(along, (cells.size, 1))
+        return PatchFrames(np.repeat(centre, COURSES, axis=0), along, np.stack([-along[:, 1], along[:, 0]], axis=1))

@@ -1,0 +1,126 @@
+"""What planning asks of a trained model: predictions, what they were learned from, and how wrong they were where it had not learned.
+
+A loaded model satisfies the protocol by having these members; planning imports no trainer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.dataset.tensor import TensorForm
+from tcpipe.errors import ModelError
+from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.layers import LAYERS
+from tcpipe.terrain.sampling import Patches
+from tcpipe.terrain.tiles import MapReader
+
+Floats = NDArray[np.float64]
+
+_BATCH = 2_048
+"""Patches whose tensors exist at once: 40 MB."""
+
+
+class CostModel(Protocol):
+    """A model of power [W] and velocity [m/s] of a patch."""
+
+    @property
+    def name(self) -> str:
+        """What the user calls it, for messages."""
+
+    @property
+    def checksum(self) -> str:
+        """Hex digest of all that rules its predictions."""
+
+    @property
+    def robot(self) -> str:
+        """The robot that it was trained on."""
+
+    @property
+    def classes(self) -> ClassTable:
+        """The class table that it was trained with."""
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels of the tensor, in order (`tcpipe.dataset.tensor`)."""
+
+    @property
+    def patch_m(self) -> float:
+        """Side of a patch on the ground [m]."""
+
+    @property
+    def patch_px(self) -> int:
+        """Side of a patch in pixels."""
+
+    @property
+    def chord_m(self) -> float:
+        """Length of the segments that it was trained on [m]."""
+
+    @property
+    def class_counts(self) -> Mapping[int, int]:
+        """How many training samples each class had under its chord."""
+
+    @property
+    def pixel_classes(self) -> tuple[int, ...]:
+        """Classes of which any pixel occurred in training."""
+
+    @property
+    def seen(self) -> Mapping[str, tuple[float, float]]:
+        """Smallest and largest ``slope_rad``, ``cross_slope_rad`` [rad] and ``relief_m`` [m] of the training patches."""
+
+    @property
+    def residuals(self) -> Mapping[str, NDArray[Any]]:
+        """Held-out samples, one row each.
+
+        ``run_id``, ``start_ns``, ``terrain_class``, labels ``power_watt`` and ``velocity_mps``, and what the model said of them:
+        ``power_predicted_watt``, ``velocity_predicted_mps``.
+        """
+
+    def predict(self, patches: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return power [W] and velocity [m/s], shape (N, 2), of tensors of shape (N, px, px, channels)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Predicted:
+    """Power [W] and velocity [m/s] of N patches, shape (N,); NaN where the model was not asked or answered no velocity."""
+
+    power_watt: Floats
+    velocity_mps: Floats
+
+
+def check_model(model: CostModel, source: MapReader) -> None:
+    """Raise `ModelError` if a map cannot give the model what it was trained on; all differences at once."""
+    problems = []
+    needed = TensorForm(model.channels, model.classes.count).layers
+    missing = [layer for layer in needed if layer not in source.layers]
+    if missing:
+        problems.append(
+            f"map {source.name}: has no {', '.join(missing)}, which model {model.name} wants; add the map with --{missing[0]}"
+        )
+    if "terrain" in needed and "terrain" in source.layers and model.classes != source.classes:
+        different = "; ".join(source.classes.differences(model.classes))
+        problems.append(
+            f"map {source.name}: its classes are not those that model {model.name} was trained with: {different}; "
+            "train on a dataset of this class table, or add the map with the model's"
+        )
+    if problems:
+        raise ModelError(*problems)
+
+
+def predict_patches(model: CostModel, patches: Patches, asked: NDArray[np.bool_]) -> Predicted:
+    """Return what the model says of the patches that it is asked about, shape (N,); tensors are formed batch by batch."""
+    form = TensorForm(model.channels, model.classes.count)
+    pixels = {layer: getattr(patches, layer) for layer in LAYERS if layer in form.layers}
+    out = np.full((asked.size, 2), np.nan)
+    for rows in _batches(np.flatnonzero(asked)):
+        out[rows] = model.predict(form.form(pixels, rows))
+    out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan
+    return Predicted(out[:, 0].copy(), out[:, 1].copy())
+
+
+def _batches(rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    yield from (rows[first : first + _BATCH] for first in range(0, rows.size, _BATCH))

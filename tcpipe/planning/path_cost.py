@@ -1,0 +1,190 @@
+"""The cost of a path: cut into pieces of a metre, one prediction each, and summed (paper, section III)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyproj import CRS, Geod
+
+from tcpipe.errors import PathError
+from tcpipe.geometry.angles import wrap_to_pi
+from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.planning.intervals import COVERAGE, errors_of
+from tcpipe.planning.path_table import PIECES
+from tcpipe.planning.pieces import Pieces, cut_path, ground_scale
+from tcpipe.planning.reasons import Reason, counts_of, names_of
+from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
+from tcpipe.recipe import SegmentConfig
+from tcpipe.terrain.patches import corners_on, footprints
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.tiles import MapReader
+
+Floats = NDArray[np.float64]
+
+_WGS84 = CRS.from_epsg(4326)
+
+
+@dataclass(frozen=True, slots=True)
+class PathCost:
+    """What a path costs; ``pieces`` is a checked table (`path_table.PIECES`), one row a piece in order.
+
+    Totals are over the pieces that have a cost; ``complete`` says whether all have. Intervals are None without held-out samples.
+    """
+
+    pieces: pa.Table
+    length_m: float
+    duration_s: float
+    energy_joule: float
+    duration_interval_s: tuple[float, float] | None
+    energy_interval_joule: tuple[float, float] | None
+    reasons: Mapping[str, int]
+    """Pieces by reason; a piece may have several."""
+
+    @property
+    def without_cost(self) -> int:
+        """Return how many pieces have no cost."""
+        return int(self.pieces.column("duration_s").null_count)
+
+    @property
+    def complete(self) -> bool:
+        """Return whether every piece has a cost."""
+        return not self.without_cost
+
+    def summary(self) -> dict[str, Any]:
+        """Return the totals as JSON values."""
+        return {
+            "length_m": self.length_m,
+            "pieces": self.pieces.num_rows,
+            "pieces_without_cost": self.without_cost,
+            "duration_s": self.duration_s,
+            "energy_joule": self.energy_joule,
+            "duration_interval_s": self.duration_interval_s,
+            "energy_interval_joule": self.energy_interval_joule,
+            "coverage": COVERAGE,
+            "reasons": dict(self.reasons),
+            "complete": self.complete,
+        }
+
+
+def projection_of(source: MapReader) -> Projection:
+    """Return the operation from WGS 84 lon, lat [deg] to the map's CRS."""
+    crs = parse_crs(source.grid.crs, where=f"map {source.name}")
+    return Projection(_WGS84, crs, area_of(crs, source.grid.bounds_m))
+
+
+def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, where: str) -> PathCost:
+    """Return what a path costs.
+
+    Parameters
+    ----------
+    model, source
+        Who predicts, and the map.
+    lonlat_deg
+        The path's points, WGS 84, shape (P, 2).
+    where
+        What the path is called in errors.
+
+    Raises
+    ------
+    ModelError, MapError
+        The map cannot give what the model wants, or cannot be read.
+    PathError
+        The path is shorter than a piece, or nowhere on the map.
+
+    """
+    check_model(model, source)
+    pieces = pieces_of(source, lonlat_deg, chord_m=model.chord_m, where=where)
+    frames = pieces.frames(model.chord_m)
+    if not corners_on(source.grid, footprints(frames, model.patch_m)).any():
+        raise PathError(
+            f"{where}: no metre of it lies on map {source.name} ({extent_text(source)}); "
+            "wanted longitude before latitude, WGS 84, and the map of this site"
+        )
+    said = joined(verdicts_of(model, source, in_batches(frames)))
+    said.reasons[pieces.arc_m > SegmentConfig().max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
+    return _costed(model, source, pieces, said)
+
+
+def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
+    """Return the pieces of a path; `PathError` where it is shorter than one."""
+    crs, xy_m = parse_crs(source.grid.crs, where=f"map {source.name}"), projection_of(source).forward(lonlat_deg)
+    if not np.isfinite(xy_m).all():
+        raise PathError(f"{where}: points of it lie outside the area where the CRS of map {source.name} is defined")
+    length_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum()) if len(xy_m) > 1 else 0.0
+    scale = ground_scale(crs, xy_m)
+    if not length_m:
+        raise PathError(f"{where}: is one point; wanted a path of at least {chord_m:g} m")
+    pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)
+    if not pieces.chord_m.size or pieces.chord_m[0] < chord_m * (1.0 - 1e-6):
+        raise PathError(
+            f"{where}: is {length_m * scale:.2f} m long and never {chord_m:g} m from where it starts; "
+            f"wanted a path of at least {chord_m:g} m"
+        )
+    return pieces
+
+
+def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts) -> PathCost:
+    bits, class_id, errors = said.reasons, said.terrain_class, errors_of(model.residuals)
+    duration = pieces.arc_m / said.velocity_mps
+    energy = said.power_watt * duration
+    nothing = np.full(len(bits), np.nan)
+    (fast, slow), (least, most), sums = (nothing, nothing), (nothing, nothing), None
+    if errors is not None:
+        fast, slow = errors["duration"].of_pieces(duration, class_id)
+        least, most = errors["energy"].of_pieces(energy, class_id)
+        sums = errors["duration"].of_sum(duration, class_id), errors["energy"].of_sum(energy, class_id)
+    table = PIECES.table(
+        piece=np.arange(len(bits)),
+        **_places(source, pieces),
+        terrain_class=class_id,
+        terrain_name=source.classes.names()[class_id].tolist(),
+        slope_rad=said.slope_rad,
+        cross_slope_rad=said.cross_slope_rad,
+        power_watt=said.power_watt,
+        velocity_mps=said.velocity_mps,
+        duration_s=duration,
+        duration_low_s=fast,
+        duration_high_s=slow,
+        energy_joule=energy,
+        energy_low_joule=least,
+        energy_high_joule=most,
+        reasons=bits,
+        reason_names=[" ".join(names_of(int(value))) for value in bits],
+    )
+    return PathCost(
+        pieces=table,
+        length_m=float(pieces.arc_m.sum()),
+        duration_s=float(np.nansum(duration)),
+        energy_joule=float(np.nansum(energy)),
+        duration_interval_s=sums[0] if sums else None,
+        energy_interval_joule=sums[1] if sums else None,
+        reasons=counts_of(bits),
+    )
+
+
+def _places(source: MapReader, pieces: Pieces) -> dict[str, Floats]:
+    """Return where the pieces lie, as columns."""
+    projection = projection_of(source)
+    start, end = (projection.inverse(xy_m) for xy_m in (pieces.start_xy_m, pieces.end_xy_m))
+    azimuth_deg, _, _ = Geod(ellps="WGS84").inv(start[:, 0], start[:, 1], end[:, 0], end[:, 1])
+    return {
+        "start_lon_deg": start[:, 0],
+        "start_lat_deg": start[:, 1],
+        "end_lon_deg": end[:, 0],
+        "end_lat_deg": end[:, 1],
+        "distance_m": np.cumsum(pieces.arc_m) - pieces.arc_m,
+        "chord_m": pieces.chord_m,
+        "arc_length_m": pieces.arc_m,
+        "course_rad": wrap_to_pi(np.radians(90.0 - np.asarray(azimuth_deg))),
+    }
+
+
+def extent_text(source: MapReader) -> str:
+    """Return where a map lies, in degrees."""
+    west, south, east, north = area_of(projection_of(source).target, source.grid.bounds_m)
+    return f"lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}"

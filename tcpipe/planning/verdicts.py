@@ -1,0 +1,95 @@
+"""What a model says of metres of ground: sampled, judged, predicted, batch by batch; the next batch is sampled while the model answers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.planning.cost_model import CostModel, predict_patches
+from tcpipe.planning.reasons import NO_COST, Bits, Reason, reasons_of
+from tcpipe.terrain.layers import HEIGHT_STEP_M
+from tcpipe.terrain.patches import PatchFrames, corners_on, footprints
+from tcpipe.terrain.sampling import Patches, sample_patches
+from tcpipe.terrain.tiles import MapReader, TilePool, level_for
+
+Floats = NDArray[np.float64]
+
+BATCH = 4_096
+"""Metres judged together: 26 MB of patches."""
+
+
+@dataclass(frozen=True, slots=True)
+class Verdicts:
+    """What is said of N metres, shape (N,): `Reason` bits, predictions (NaN without a cost), and what the ground is.
+
+    ``height_m`` is that of the metre's middle, NaN where the map has none.
+    """
+
+    reasons: Bits
+    power_watt: Floats
+    velocity_mps: Floats
+    terrain_class: NDArray[np.uint8]
+    slope_rad: Floats
+    cross_slope_rad: Floats
+    height_m: Floats
+
+
+def verdicts_of(
+    model: CostModel, source: MapReader, batches: Iterable[PatchFrames], *, pool: TilePool | None = None
+) -> Iterator[Verdicts]:
+    """Yield what the model says of each batch of frames, in order; tiles of the map are kept from batch to batch."""
+    tiles = pool or TilePool(level_for(source, model.patch_m / model.patch_px))
+
+    def sampled(frames: PatchFrames) -> tuple[Patches, NDArray[np.bool_]]:
+        chord_m = np.full(len(frames.centre_xy_m), model.chord_m)
+        on_map = corners_on(source.grid, footprints(frames, model.patch_m)) == 4
+        patch_m, patch_px = model.patch_m, model.patch_px
+        return sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles), on_map
+
+    with ThreadPoolExecutor(max_workers=1) as ahead:
+        waiting = None
+        for frames in batches:
+            following = ahead.submit(sampled, frames)
+            if waiting is not None:
+                yield _judged(model, source, *waiting.result())
+            waiting = following
+        if waiting is not None:
+            yield _judged(model, source, *waiting.result())
+
+
+def _judged(model: CostModel, source: MapReader, patches: Patches, on_map: NDArray[np.bool_]) -> Verdicts:
+    bits = reasons_of(patches, on_map, model, source)
+    asked = bits & NO_COST == 0
+    said = predict_patches(model, patches, asked)
+    bits[asked & np.isnan(said.velocity_mps)] |= np.uint16(Reason.NO_MOTION)
+    known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
+    middle = patches.height[:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
+    return Verdicts(
+        reasons=bits,
+        power_watt=said.power_watt,
+        velocity_mps=said.velocity_mps,
+        terrain_class=patches.terrain_class,
+        slope_rad=np.where(known, patches.slope_rad, np.nan),
+        cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),
+        height_m=np.where(known, patches.height_min_m + middle, np.nan),
+    )
+
+
+def joined(parts: Iterable[Verdicts]) -> Verdicts:
+    """Return the verdicts of all batches as one."""
+    found = list(parts)
+    columns: dict[str, Any] = {
+        entry.name: np.concatenate([getattr(part, entry.name) for part in found]) for entry in fields(Verdicts)
+    }
+    return Verdicts(**columns)
+
+
+def in_batches(frames: PatchFrames) -> Iterator[PatchFrames]:
+    """Yield frames in batches of `BATCH`, in order."""
+    for first in range(0, len(frames.centre_xy_m), BATCH):
+        yield frames.rows(np.arange(first, min(first + BATCH, len(frames.centre_xy_m))))
