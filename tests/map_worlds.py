@@ -136,6 +136,12 @@ class ArrayMap:
     def read(self, layer, row0, row1, col0, col1):
         return self.arrays[layer][row0:row1, col0:col1]
 
+    def read_tile(self, layer, i, j, out):
+        side = self.tile_px
+        part = self.read(layer, i * side, (i + 1) * side, j * side, (j + 1) * side)
+        out[...] = np.nan if layer == "height" else 0
+        out[: part.shape[0], : part.shape[1]] = part
+
 
 def random_map(seed=0, rows=300, cols=260, pitch_m=0.05, tile_px=64) -> ArrayMap:
     """Rough random layers in UTM 33N, nothing missing."""

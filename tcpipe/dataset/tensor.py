@@ -58,12 +58,11 @@ class TensorForm:
         px = next(iter(pixels.values())).shape[1]
         out = np.empty((len(rows), px, px, self.depth), np.float32)
         step = np.float32(HEIGHT_STEP_M / HEIGHT_RANGE_M)
-        grey, scaled = ortho_channel(_BYTES), terrain_channel(_BYTES, self.class_count)
         if self.channels == LAYERS:
-            form_paper_tensor(
-                pixels["ortho"], pixels["terrain"], pixels["height"], rows, flips, grey, scaled, step, out
-            )
+            most = np.float32(255.0), np.float32(max(self.class_count - 1, 1))
+            form_paper_tensor(*(pixels[layer] for layer in LAYERS), rows, flips, *most, step, out)
             return out
+        grey, scaled = ortho_channel(_BYTES), terrain_channel(_BYTES, self.class_count)
         at = 0
         for channel in self.channels:
             if channel == "height":

@@ -1,4 +1,7 @@
-"""Stored layers to float tensors, gathered, shuffled and mirrored on the way: one pass over the pixels."""
+"""Stored layers to float tensors, gathered, shuffled and mirrored on the way: one pass over the pixels.
+
+Layers and tensor are walked as flat arrays with unsigned indices, which the compiler vectorises; a pixel without data becomes 0.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,9 @@ from tcpipe.compiled import kernel
 
 Floats = NDArray[np.float32]
 
+HEIGHT_NODATA = np.uint16(65535)
+"""A stored height without data (`tcpipe.terrain.layers.HEIGHT_NODATA`)."""
+
 
 @kernel
 def form_paper_tensor(  # noqa: PLR0917
@@ -19,25 +25,33 @@ def form_paper_tensor(  # noqa: PLR0917
     height: Any,
     rows: Any,
     mirrored: Any,
-    grey: Floats,
-    scaled: Floats,
+    most_grey: Any,
+    most_class: Any,
     step: Any,
     out: Floats,
 ) -> None:
     """Form ``rows`` of all three layers into ``out``, (B, px, px, 3).
 
-    ``grey`` and ``scaled`` say what each byte of ortho and terrain becomes, (256,); ``step`` is a stored height over 1 m, float32.
+    ``most_grey`` and ``most_class`` are what becomes 1 of ortho and, from class 1 on, of terrain; ``step`` is a stored height over 1 m;
+    all float32.
     """
-    px = out.shape[1]
+    side, one, depth = np.uint64(out.shape[1]), np.uint64(1), np.uint64(3)
+    none, whole = np.float32(0.0), np.float32(1.0)
     for b in range(rows.size):
         n = rows[b]
-        for r in range(px):
-            source = px - 1 - r if mirrored[b] else r
-            o, t, h, line = ortho[n, source], terrain[n, source], height[n, source], out[b, r]
-            for c in range(px):
-                line[c, 0] = grey[o[c]]
-                line[c, 1] = scaled[t[c]]
-                line[c, 2] = min(np.float32(h[c]) * step, np.float32(1.0))
+        greys, classes, heights = ortho[n].reshape(-1), terrain[n].reshape(-1), height[n].reshape(-1)
+        line = out[b].reshape(-1)
+        for r in range(side):
+            first = r * side
+            source = (side - one - r) * side if mirrored[b] else first
+            for c in range(side):
+                at, i = (first + c) * depth, source + c
+                line[at] = np.float32(greys[i]) / most_grey
+                above = np.float32(classes[i]) - whole
+                line[at + one] = (above if above > none else none) / most_class  # noqa: FURB136  (vectorises, max does not)
+                rise = np.float32(heights[i]) * step
+                rise = rise if rise < whole else whole  # noqa: FURB136
+                line[at + depth - one] = rise if heights[i] != HEIGHT_NODATA else none
 
 
 @kernel
@@ -63,4 +77,5 @@ def form_height(layer: Any, rows: Any, mirrored: Any, step: Any, channel: int, o
             source = px - 1 - r if mirrored[b] else r
             stored, line = layer[n, source], out[b, r]
             for c in range(px):
-                line[c, channel] = min(np.float32(stored[c]) * step, np.float32(1.0))
+                rise = min(np.float32(stored[c]) * step, np.float32(1.0))
+                line[c, channel] = rise if stored[c] != HEIGHT_NODATA else np.float32(0.0)

@@ -17,7 +17,8 @@ so does GDAL from 3.13 on, the first that reads shards.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -90,8 +91,23 @@ class MapFile:
         MapError
             A tile of the window is damaged.
         """
-        try:
+        with self._told(layer, row0, row1, col0, col1):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
+
+    def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
+        """Decode the tile in row i and column j into ``out``, contiguous, `tile_px` each way; `MapError` as `read`."""
+        grid, side = self.grid, self.tile_px
+        with self._told(layer, i * side, (i + 1) * side, j * side, (j + 1) * side):
+            array = self._levels[self._factor][layer]
+            array.chunk((i, j), out=out)
+        out[max(grid.rows - i * side, 0) :] = array.fill  # what a file holds beyond its array is nobody's promise
+        out[:, max(grid.cols - j * side, 0) :] = array.fill
+
+    @contextmanager
+    def _told(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> Iterator[None]:
+        """Say which part of the map it was that could not be read."""
+        try:
+            yield
         except StoreError as error:
             raise MapError(
                 f"map {self.name}: {layer}, rows {row0} to {row1}, columns {col0} to {col1} cannot be read ({error}); add the map again"

@@ -66,7 +66,7 @@ class ShardedArray:
                 if offset == _ABSENT:
                     out[...] = self.fill
                     return out
-                data = _checked(os.pread(file.fileno(), size, offset), size)
+                data = _checked(file.fileno(), size, offset)
                 self.codec.decode(data, out=out)
         except FileNotFoundError:
             if not self.sparse:
@@ -139,7 +139,7 @@ class ShardedArray:
             per_shard = self.per_shard
             size = 16 * math.prod(per_shard) + _CRC_BYTES
             end = os.fstat(descriptor).st_size
-            table = _checked(os.pread(descriptor, size, max(end - size, 0)), size)
+            table = _checked(descriptor, size, max(end - size, 0))
             self._indices[shard] = np.frombuffer(table, "<u8").reshape(*per_shard, 2)
         return self._indices[shard]
 
@@ -189,8 +189,9 @@ def _crc(data: bytes) -> bytes:
     return checksum.to_bytes(_CRC_BYTES, "little")
 
 
-def _checked(data: bytes, size: int) -> bytes:
-    """Return the data without its checksum; `ValueError` if it does not agree."""
-    if len(data) != size or _crc(data[:-_CRC_BYTES]) != data[-_CRC_BYTES:]:
+def _checked(descriptor: int, size: int, offset: int) -> bytes:
+    """Read so many bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
+    content = os.pread(descriptor, size - _CRC_BYTES, offset)
+    if _crc(content) != os.pread(descriptor, _CRC_BYTES, offset + size - _CRC_BYTES):
         raise ValueError("its checksum does not agree")
-    return data[:-_CRC_BYTES]
+    return content

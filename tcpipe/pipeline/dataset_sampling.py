@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, overload
@@ -24,6 +26,7 @@ from tcpipe.tables.columns import floats
 from tcpipe.terrain.layers import LAYERS
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.sampling_kernel import morton
+from tcpipe.terrain.tiles import TilePool, level_for
 
 _BATCH_ROWS = 8_192
 """Segments sampled together: 50 MB of patches."""
@@ -35,6 +38,12 @@ _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that a map tile is decoded for few of them."""
 
 _XY, _LONLAT, _MAP = "footprint_xy_m", "footprint_lonlat_deg", "map_index"
+
+_HELD_POOLS = 2
+"""Maps whose tiles a process keeps from batch to batch: 0.3 GB."""
+
+_pools: OrderedDict[Path, TilePool] = OrderedDict()
+"""Of this process, while it samples."""
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -195,17 +204,17 @@ def sample_all_segments(
     kept = np.zeros(segments.num_rows, np.bool_)
     columns: dict[str, NDArray[Any]] = {}
     parts: dict[int, _Part] = {}
-    for outcome in run_all(_sample_batch, batches, jobs=jobs):
-        part = outcome.result
-        if part is None:
-            raise DatasetError("a worker process died while sampling (killed, or out of memory); try fewer --jobs")
-        if isinstance(part, TcpipeError):
-            raise part
-        kept[part.segment] = True
-        for name, values in part.columns.items():
-            whole = columns.setdefault(name, np.zeros((len(kept), *values.shape[1:]), values.dtype))
-            whole[part.segment] = values
-        parts[outcome.index] = replace(part, columns={})
+    try:
+        with closing(run_all(_sample_batch, batches, jobs=jobs)) as outcomes:
+            for outcome in outcomes:
+                part = _sound(outcome.result)
+                kept[part.segment] = True
+                for name, values in part.columns.items():
+                    whole = columns.setdefault(name, np.zeros((len(kept), *values.shape[1:]), values.dtype))
+                    whole[part.segment] = values
+                parts[outcome.index] = replace(part, columns={})
+    finally:
+        _pools.clear()
     ended = [parts[index] for index in sorted(parts)]
     segment = np.flatnonzero(kept)
     for name in columns:
@@ -221,6 +230,15 @@ def sample_all_segments(
         lost_m={loss: math.fsum(part.ledger_m.get(str(loss.name).lower(), 0.0) for part in ended) for loss in _LOSSES},
         warnings=tuple(dict.fromkeys(warning for part in ended for warning in part.warnings)),
     )
+
+
+def _sound(part: _Part | TcpipeError | None) -> _Part:
+    """Return what a batch gave; raise what was wrong with it."""
+    if part is None:
+        raise DatasetError("a worker process died while sampling (killed, or out of memory); try fewer --jobs")
+    if isinstance(part, TcpipeError):
+        raise part
+    return part
 
 
 def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
@@ -245,7 +263,8 @@ def _sample_batch(batch: _Batch) -> _Part | TcpipeError:
     """Sample one batch; its pixels go to its slots of the spool."""
     try:
         sources = [open_map(path) for path in batch.map_paths]
-        sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs)
+        pools = [_pool(path, source, batch.config) for path, source in zip(batch.map_paths, sources, strict=True)]
+        sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
         parts = [
             {
                 **_columns(part),
@@ -261,6 +280,15 @@ def _sample_batch(batch: _Batch) -> _Part | TcpipeError:
             batch.spool.write(layer, batch.slots[rows], getattr(part.patches, layer))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     return _Part(batch.rows[np.concatenate(sampled.rows)], columns, sampled.ledger_m, sampled.warnings)
+
+
+def _pool(path: Path, source: MapFile, config: SampleConfig) -> TilePool:
+    """Return the tiles of a map that this process's last batch left: the next batch lies beside it."""
+    pool = _pools.pop(path, None) or TilePool(level_for(source, config.patch_m / config.patch_px))
+    _pools[path] = pool
+    if len(_pools) > _HELD_POOLS:
+        _pools.popitem(last=False)
+    return pool
 
 
 def _in_first_plane(sampled: Sampled, source: MapFile, first: MapFile) -> NDArray[np.float64]:

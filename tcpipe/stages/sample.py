@@ -17,7 +17,7 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS, Findings
 from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.sampling import Patches, sample_patches
-from tcpipe.terrain.tiles import MapReader, level_for
+from tcpipe.terrain.tiles import MapReader, TilePool, level_for
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -42,13 +42,15 @@ class Sampled:
     findings: Findings
 
 
-def sample_segments(segments: pa.Table, source: MapReader, config: SampleConfig, *, gnss_crs: str) -> Sampled:
+def sample_segments(
+    segments: pa.Table, source: MapReader, config: SampleConfig, *, gnss_crs: str, pool: TilePool | None = None
+) -> Sampled:
     """Return the patches of all segments that lie on the map.
 
     Parameters
     ----------
     segments : L5 table of any number of runs; the reasons rule in the order position uncertain, outside the map, nodata, not traversable.
-    source : the map.
+    source, pool : the map, and its tiles as `sample_patches` takes them.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
 
     Raises
@@ -70,7 +72,7 @@ def sample_segments(segments: pa.Table, source: MapReader, config: SampleConfig,
     rows = np.flatnonzero(lost_by == 0)
     frames = frames.rows(rows)
     check_scale(frames)
-    patches = sample_patches(source, frames, chord_m[rows], patch_m=config.patch_m, patch_px=config.patch_px)
+    patches = sample_patches(source, frames, chord_m[rows], patch_m=config.patch_m, patch_px=config.patch_px, pool=pool)
     lost_by[rows] = _lost(patches, corners[rows], source, config)
     good = lost_by[rows] == 0
     kept, patches = rows[good], patches if good.all() else patches.rows(good)
@@ -112,9 +114,7 @@ def _facts(lost_by: NDArray[np.uint32]) -> dict[str, object]:
 
 
 def _warnings(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[str, ...]:
-    doubt, patch_pitch_m = projection.doubt(), config.patch_m / config.patch_px
-    notes = [
-        f"{doubt}; say which datum the GNSS is in (recipe key read.gnss_crs)" if doubt else None,
-        pitch_note(patch_pitch_m, level_for(source, patch_pitch_m).grid.pitch_m),
-    ]
-    return tuple(f"map {source.name}: {note}" for note in notes if note)
+    doubt, pitch_m = projection.doubt(), config.patch_m / config.patch_px
+    datum = f"{doubt}; say which datum the GNSS is in (recipe key read.gnss_crs)" if doubt else None
+    pitch = pitch_note(pitch_m, level_for(source, pitch_m).grid.pitch_m)
+    return tuple(f"map {source.name}: {note}" for note in (datum, pitch) if note)

@@ -14,7 +14,7 @@ from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled, ledger_by_loss, sample_segments
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import floats
-from tcpipe.terrain.tiles import MapReader
+from tcpipe.terrain.tiles import MapReader, TilePool
 
 _ELSEWHERE = (Loss.OUTSIDE_MAP, Loss.NODATA)
 """What is lost so on one map may be found on the next; what is not traversable, or nobody knows where, is lost on all."""
@@ -36,7 +36,12 @@ class SampledOnMaps:
 
 
 def sample_on_maps(
-    segments: pa.Table, sources: Sequence[MapReader], config: SampleConfig, *, gnss_crs: str
+    segments: pa.Table,
+    sources: Sequence[MapReader],
+    config: SampleConfig,
+    *,
+    gnss_crs: str,
+    pools: Sequence[TilePool | None] | None = None,
 ) -> SampledOnMaps:
     """Return the patches of all segments that lie on one of the maps.
 
@@ -45,6 +50,7 @@ def sample_on_maps(
     segments : L5 table of any number of runs.
     sources : the maps; where they overlap, the earlier one is taken.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
+    pools : as `sample_patches`, one a map.
 
     Raises
     ------
@@ -55,9 +61,9 @@ def sample_on_maps(
     waiting = np.arange(segments.num_rows)
     rows: list[NDArray[np.int64]] = []
     sampled: list[Sampled] = []
-    for source in sources:
+    for source, pool in zip(sources, pools or [None] * len(sources), strict=True):
         here = segments if len(waiting) == segments.num_rows else segments.take(pa.array(waiting))
-        found = sample_segments(here, source, config, gnss_crs=gnss_crs)
+        found = sample_segments(here, source, config, gnss_crs=gnss_crs, pool=pool)
         known = found.lost_by != Loss.OUTSIDE_MAP  # a hole in one map outweighs lying outside the next
         lost_by[waiting[known]] = found.lost_by[known]
         rows.append(waiting[found.kept])

@@ -7,6 +7,8 @@ ortho      grey, one byte                              O / 255
 terrain    class id, one byte, 0 = no data             (C - 1) / (c - 1)
 height     0.5 mm steps above the patch's smallest     (H - min H) / 1 m, clipped to [0, 1]
 =========  ==========================================  =======================================
+
+A pixel without data is 0 in every channel; only a recipe with ``min_valid_fraction`` below 1 lets one in.
 """
 
 from __future__ import annotations
@@ -37,14 +39,16 @@ def ortho_channel(ortho: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 def terrain_channel(terrain: NDArray[np.uint8], class_count: int) -> NDArray[np.float32]:
     """Return (C - 1) / (c - 1): ids from 1 to ``class_count`` onto [0, 1]."""
-    return (terrain.astype(np.float32) - np.float32(1.0)) / np.float32(max(class_count - 1, 1))
+    above = np.maximum(terrain.astype(np.float32) - np.float32(1.0), np.float32(0.0))
+    scaled: NDArray[np.float32] = above / np.float32(max(class_count - 1, 1))
+    return scaled
 
 
 def height_channel(height: NDArray[np.uint16]) -> NDArray[np.float32]:
     """Return heights above the patch's smallest over 1 m, clipped to [0, 1]."""
     scaled = height.astype(np.float32) * np.float32(HEIGHT_STEP_M / HEIGHT_RANGE_M)
     clipped: NDArray[np.float32] = np.minimum(scaled, np.float32(1.0))
-    return clipped
+    return np.where(height == HEIGHT_NODATA, np.float32(0.0), clipped)
 
 
 def paper_tensor(

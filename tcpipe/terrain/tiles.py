@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter, OrderedDict
 from collections.abc import Iterator
+from itertools import product
 from typing import Any, Protocol
 
 import numpy as np
@@ -68,6 +69,9 @@ class MapReader(Protocol):
         ``height`` is float32 metres above `height_reference_m`, NaN where there is no data; ``ortho`` is uint8 grey from 1 to 255 and
         ``terrain`` uint8 class ids, 0 where there is no data.
         """
+
+    def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
+        """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
 
 
 def level_for(source: MapReader, pitch_m: float) -> MapReader:
@@ -161,28 +165,24 @@ class TilePool:
                 self._flat[layer][: old.size] = old
 
     def _read(self, tile: tuple[int, int], slot: int) -> None:
-        side, grid, (high, wide) = self._map.tile_px, self._map.grid, self.tile_shape
-        row0, col0 = tile[0] * side, tile[1] * side
+        (high, wide), grid = self.tile_shape, self._map.grid
         for layer in self._map.layers:
-            part = self._map.read(layer, row0, min(row0 + side, grid.rows), col0, min(col0 + side, grid.cols))
             self.decoded[layer, *tile] += 1
             if self.slots.size == 1:
-                self._flat[layer] = np.ascontiguousarray(part).reshape(-1)
-                continue
-            place = self._flat[layer][slot * high * wide : (slot + 1) * high * wide].reshape(high, wide)
-            if part.shape != place.shape:
-                place[...] = _LAYERS[layer][1]
-            place[: part.shape[0], : part.shape[1]] = part
+                whole = self._map.read(layer, 0, grid.rows, 0, grid.cols)
+                self._flat[layer] = np.ascontiguousarray(whole).reshape(-1)
+            else:
+                place = self._flat[layer][slot * high * wide : (slot + 1) * high * wide]
+                self._map.read_tile(layer, *tile, place.reshape(high, wide))
 
 
 def _touched(boxes: NDArray[np.int64], side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:
     """Return the tiles of the map that boxes touch, row by row."""
     first, last = boxes[:, :2] // side, (boxes[:, 2:] - 1) // side
-    spans = last - first + 1
-    tiles = [
-        first + np.array([i, j])
-        for i in range(int(spans[:, 0].max(initial=0)))
-        for j in range(int(spans[:, 1].max(initial=0)))
-    ]
-    inside = [tile[((tile >= 0) & (tile < shape) & (tile <= last)).all(axis=1)] for tile in tiles]
-    return [(int(i), int(j)) for i, j in np.unique(np.concatenate(inside), axis=0)] if inside else []
+    rows, cols = (last - first + 1).max(axis=0, initial=0).tolist()
+    touched = np.zeros(shape, np.bool_)
+    for i, j in product(range(rows), range(cols)):
+        tile = first + np.array([i, j])
+        inside = ((tile >= 0) & (tile < shape) & (tile <= last)).all(axis=1)
+        touched[tuple(tile[inside].T)] = True
+    return [(int(i), int(j)) for i, j in np.argwhere(touched)]
