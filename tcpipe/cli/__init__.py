@@ -27,6 +27,7 @@ from tcpipe.cli.process import Ended, prepare_process
 from tcpipe.cli.report import report
 from tcpipe.cli.schemas import schemas
 from tcpipe.cli.simulate import simulate
+from tcpipe.cli.train import train
 from tcpipe.cli.verify import verify
 from tcpipe.errors import TcpipeError, UsageError, plain_line
 
@@ -62,6 +63,7 @@ for command in (
     ingest,
     add_map,
     build_dataset,
+    train,
     report,
     export,
     explain,

@@ -1,0 +1,57 @@
+"""``tcpipe train``: a dataset to a model."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from tcpipe.cli.options import json_option, quiet_option
+
+
+@click.command(short_help="Train the paper's network on a dataset")
+@click.argument("dataset", metavar="DATASET")
+@click.argument("out", default="model", metavar="[OUT]")
+@click.option(
+    "--loss", default="nrmse", show_default=True, type=click.Choice(["nrmse", "paper_eq4"]),
+    help="paper_eq4 is the paper's equation 4 as printed; nrmse makes both errors dimensionless.",
+)  # fmt: skip
+@click.option("--epochs", default=100, show_default=True, type=click.IntRange(1), help="At most.")
+@click.option(
+    "--patience", default=12, show_default=True, type=click.IntRange(1), help="Epochs without a better held-out loss."
+)
+@click.option("--batch", default=64, show_default=True, type=click.IntRange(1), help="Samples in a batch.")
+@click.option("--learning-rate", default=1e-4, show_default=True, type=click.FloatRange(0.0, min_open=True))
+@click.option("--fold", default=0, show_default=True, type=click.IntRange(0), help="Fold of train to stop early by.")
+@click.option(
+    "--mirror/--no-mirror", default=True, show_default=True, help="Mirror every other patch across its travel."
+)
+@click.option("--weights", is_flag=True, help="Weigh each label by its inverse variance.")
+@click.option(
+    "--width",
+    default=64,
+    show_default=True,
+    type=click.IntRange(1, 512),
+    help="Filters of the first stage; 64 is ResNet-18.",
+)
+@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of weights, shuffles and mirrors.")
+@click.option("--fresh", is_flag=True, help="Do not go on from where an earlier training was stopped.")
+@json_option
+@quiet_option
+def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+    """Train ResNet-18 on DATASET's patches and labels, stop early by a fold of train, and write the model folder OUT.
+
+    Needs the extra: pip install 'tcpipe[train]'. Runs on a GPU when there is one. A training that was stopped goes on where it was.
+    """
+    from dataclasses import asdict
+
+    from tcpipe.cli.output import print_json, progress
+    from tcpipe.learning.fitting import FitConfig
+    from tcpipe.learning.training import train as run
+
+    with progress("train", 1, quiet=quiet):
+        result = run(dataset, out, config=FitConfig(**options), fresh=fresh)
+    if as_json:
+        print_json({**asdict(result), "feeding_share": result.spent.feeding_share})
+    else:
+        click.echo(str(result))

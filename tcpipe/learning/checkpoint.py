@@ -1,0 +1,65 @@
+"""Where training stands, after every epoch: one file, so that a killed training goes on as if nothing had happened."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.errors import ModelError
+from tcpipe.formats.json_files import to_json
+from tcpipe.formats.weights import read_arrays, write_arrays
+
+Arrays = dict[str, NDArray[Any]]
+
+_STATE = "state"
+
+
+@dataclass(slots=True)
+class Progress:
+    """Losses so far; ``best_epoch`` counts from 1, as does ``epoch``."""
+
+    key: str
+    """Of dataset and options: a checkpoint of others is not gone on from."""
+    epoch: int = 0
+    best_epoch: int = 0
+    best_loss: float = float("inf")
+    history: list[tuple[int, float, float]] = field(default_factory=list)
+    """Epoch, loss, loss of the held-out fold."""
+
+
+def write_checkpoint(path: Path, progress: Progress, parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+    """Write where training stands and its weights, whole or not at all."""
+    state = np.frombuffer(to_json(asdict(progress)).encode(), np.uint8)
+    arrays = {f"{part}/{name}": array for part, named in parts.items() for name, array in named.items()}
+    write_arrays(path, {_STATE: state, **arrays})
+
+
+def read_checkpoint(path: Path, key: str) -> tuple[Progress, dict[str, Arrays]]:
+    """Return what `write_checkpoint` wrote.
+
+    Raises
+    ------
+    ModelError
+        It is cut short, or of another dataset or other options.
+
+    """
+    try:
+        arrays = read_arrays(path)
+        found = json.loads(arrays.pop(_STATE).tobytes())
+        progress = Progress(**{**found, "history": [tuple(row) for row in found["history"]]})
+    except (ModelError, KeyError, TypeError, ValueError) as error:
+        reason = error.problems[0].removeprefix(f"{path}: ") if isinstance(error, ModelError) else "not a checkpoint"
+        raise ModelError(f"{path}: {reason}; remove it, or start anew with --fresh") from None
+    if progress.key != key:
+        raise ModelError(f"{path}: of another dataset or other options; remove it, or start anew with --fresh")
+    parts: dict[str, Arrays] = {}
+    for name, array in arrays.items():
+        part, _, rest = name.partition("/")
+        parts.setdefault(part, {})[rest] = array
+    return progress, parts

@@ -1,0 +1,42 @@
+"""The model card for people: ``MODEL.md``."""
+
+from __future__ import annotations
+
+import numpy as np
+from jinja2 import Environment, StrictUndefined
+
+from tcpipe.learning.model_card import ModelCard
+
+_TEXT = """# Terrain-cost model
+
+Predicts {{ outputs }} of {{ chord }} m of ground ahead of the robot from a patch of map:
+mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{ chord }} m.
+
+- Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
+- Velocity is the {{ velocity }} one; robot {{ robot }}.
+- Network: ResNet-18 of width {{ width }}; loss {{ config.loss }}, Adam {{ config.learning_rate }}, batch {{ config.batch }},
+  seed {{ config.seed }}; best of {{ told.epochs }} epochs by fold {{ config.fold }} of train: {{ told.best_epoch }},
+  loss {{ "%.4f" | format(told.held_out_loss) }}.
+- Trained on {{ told.samples["fitted"] }} samples of {{ dataset.name }}, checksum {{ dataset.sha256 }}.
+- Seen: {{ classes }}; slope {{ slope }}; relief of a patch {{ relief }}. Beyond these it has no business.
+
+```python
+from tcpipe.learning.models import load_model
+
+load_model("model").predict(patches)
+```
+"""
+
+
+def model_readme(card: ModelCard) -> str:
+    """Return the text of MODEL.md."""
+    names = {entry.id: entry.name for entry in card.classes.classes}
+    counts = (f"{names.get(class_id, class_id)} {count}" for class_id, count in card.seen.class_counts.items())
+    return Environment(autoescape=False, undefined=StrictUndefined, keep_trailing_newline=True).from_string(_TEXT).render(  # noqa: S701  Markdown
+        outputs=", ".join(card.outputs), chord=f"{card.chord_m:g}", px=card.architecture.patch_px,
+        depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
+        velocity=card.label_velocity, robot=card.robot, width=card.architecture.width,
+        config=card.training["config"], told=card.training, dataset=card.dataset, classes=", ".join(counts),
+        slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.seen.ranges["slope_rad"]),
+        relief=" to ".join(f"{value:.2f} m" for value in card.seen.ranges["relief_m"]),
+    )  # fmt: skip

@@ -1,0 +1,260 @@
+"""``tcpipe train``: from a dataset to a model folder."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from tcpipe.dataset import Dataset, Split, open_dataset
+from tcpipe.errors import DatasetError, ModelError
+from tcpipe.formats.class_table import table_from_json
+from tcpipe.formats.json_files import digest
+from tcpipe.learning.checkpoint import Progress
+from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
+from tcpipe.learning.keras_backend import device_name
+from tcpipe.learning.model_card import ModelCard, Seen
+from tcpipe.learning.model_readme import model_readme
+from tcpipe.learning.models import CARD, read_model_card, write_model
+from tcpipe.learning.network import Architecture
+from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+from tcpipe.terrain.layers import HEIGHT_STEP_M
+
+logger = logging.getLogger("tcpipe")
+
+_READ_TOGETHER = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """What another network than the paper's is trained on: its baselines, and its ablation when it is trained anew."""
+
+    channels: tuple[str, ...] = ()
+    """Of the patch; empty: all that the dataset has."""
+    classes: tuple[int, ...] = ()
+    """Only samples of these terrain classes; empty: all."""
+    energy_only: bool = False
+    """One output, E, instead of w and v."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrainResult:
+    """What became of a training; ``str`` of it is what the command prints."""
+
+    path: Path
+    status: str
+    """``done`` or ``unchanged``."""
+    samples: Mapping[str, int]
+    """Fitted, and held out to stop by."""
+    epochs: int
+    best_epoch: int
+    held_out_loss: float
+    device: str
+    spent: Spent
+
+    def __str__(self) -> str:
+        """Return how it went, as plain lines."""
+        if self.status == "unchanged":
+            return f"{self.path}: nothing to do: trained on the same dataset with the same options"
+        fitted, held = self.samples["fitted"], self.samples["held out"]
+        speed, share = self.spent.samples / max(self.spent.total_s, 1e-9), 100.0 * self.spent.feeding_share
+        return (
+            f"{self.path}: trained on {fitted} samples, stopped by {held}; best of {self.epochs} epochs is {self.best_epoch}\n"
+            f"held-out loss {self.held_out_loss:.4f}; {speed:.0f} samples/s on {self.device}, {share:.1f} % of the time feeding"
+        )
+
+
+def train(
+    dataset: str | Path,
+    out: str | Path = "model",
+    *,
+    config: FitConfig | None = None,
+    variant: Variant | None = None,
+    fresh: bool = False,
+) -> TrainResult:
+    """Train the paper's network on a dataset and write the model folder ``out``, whole or not at all.
+
+    Parameters
+    ----------
+    dataset
+        What ``tcpipe build-dataset`` wrote.
+    out
+        The folder: new, or a model, which is replaced unless it was trained on the same with the same options. While training runs
+        its state is kept beside it, in ``<out>.checkpoint``, and gone on from.
+    config
+        How.
+    variant
+        On what, where it is not the paper's network.
+    fresh
+        Leave an earlier state aside.
+
+    Raises
+    ------
+    DatasetError, ModelError
+        The dataset has nothing to train on, ``out`` is something else, or the state is cut short or of another training.
+
+    """
+    rules, other, place, data = config or FitConfig(), variant or Variant(), Path(out), open_dataset(dataset)
+    key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
+    if (known := _known(place)) is not None and known["training"].get("key") == key and not fresh:
+        return _unchanged(place, known)
+    task = training_task(data, rules.fold, other)
+    checkpoint = place.with_name(f"{place.name}.checkpoint")
+    if fresh:
+        checkpoint.unlink(missing_ok=True)
+    logger.info("%s: %d samples to fit, %d to stop by, on %s", place, len(task.fit), len(task.held), device_name())
+    fitted = fit(task, rules, name=str(place), key=key, checkpoint=checkpoint)
+    card = _card(data, task, rules, fitted, key)
+    history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.progress.history)
+    write_model(
+        place, card=card, network=fitted.network, residuals=_residuals(task.held, fitted, task.outputs),
+        history="epoch,loss,held_out_loss\n" + history, readme=model_readme(card),
+    )  # fmt: skip
+    checkpoint.unlink(missing_ok=True)
+    counts = {"fitted": len(task.fit), "held out": len(task.held)}
+    progress = fitted.progress
+    return TrainResult(
+        place, "done", counts, progress.epoch, progress.best_epoch, progress.best_loss, device_name(), fitted.spent
+    )
+
+
+def dataset_checksum(card: Mapping[str, Any]) -> str:
+    """Return one checksum of every file of a dataset."""
+    return digest(card["checksums"])
+
+
+def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
+    """Return what is fitted and what it is stopped by: a fold of train, never anything else; samples without a label are left out.
+
+    Raises
+    ------
+    DatasetError
+        There is nothing to train on, or the fold is empty.
+
+    """
+    train, outputs = data["train"], (ENERGY,) if variant.energy_only else tuple(data.card["label"]["columns"])
+    wanted = np.isfinite(train.labels).all(axis=1)
+    if variant.classes:
+        wanted &= np.isin(train.column("terrain_class"), variant.classes)
+    train = train.take(wanted)
+    if variant.channels:
+        train = train.with_channels(*variant.channels)
+    if not len(train):
+        raise DatasetError(
+            f"{data.path}: no labelled samples in split train; is its region (--split) where the runs are?"
+        )
+    fitted, held = train.fold(fold)
+    if not len(held) or not len(fitted):
+        folds = sorted({int(number) for number in train.column("fold")})
+        named = ", ".join(map(str, folds))
+        raise DatasetError(
+            f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} to stop by; "
+            f"wanted both (there are folds {named}; a block holds 10 m of ground: drive more of it)"
+        )
+    return Task(fitted, held, outputs)
+
+
+def what_was_seen(split: Split) -> Seen:
+    """Return classes and ranges of what a split holds."""
+    pixel_classes: set[int] = set()
+    relief = [np.inf, -np.inf]
+    for first in range(0, len(split), _READ_TOGETHER):
+        layers = split.layers(np.arange(first, min(first + _READ_TOGETHER, len(split))))
+        if "terrain" in layers:
+            pixel_classes |= set(np.flatnonzero(np.bincount(layers["terrain"].ravel())).tolist())
+        if "height" in layers:
+            spans_m = (layers["height"].max(axis=(1, 2)) - layers["height"].min(axis=(1, 2))) * HEIGHT_STEP_M
+            relief = [min(relief[0], float(spans_m.min())), max(relief[1], float(spans_m.max()))]
+    ranges = {name: _range(split.column(name)) for name in ("slope_rad", "cross_slope_rad")}
+    return Seen(_class_counts(split), tuple(sorted(pixel_classes)), {**ranges, "relief_m": (relief[0], relief[1])})
+
+
+def _range(values: Any) -> tuple[float, float]:
+    return float(np.min(values)), float(np.max(values))
+
+
+def _class_counts(split: Split) -> dict[int, int]:
+    found = split.column("terrain_class").astype(np.float64)
+    ids, counts = np.unique(found[np.isfinite(found)].astype(int), return_counts=True)
+    return dict(zip(ids.tolist(), counts.tolist(), strict=True))
+
+
+def _known(place: Path) -> dict[str, Any] | None:
+    """Return model.json of what is there, None if nothing is; `ModelError` if it is something else."""
+    if not place.exists() or (place.is_dir() and not any(place.iterdir())):
+        return None
+    if not place.is_dir() or not (place / CARD).is_file():
+        raise ModelError(f"{place}: exists and is no model; it is left alone; give another OUT")
+    return read_model_card(place)
+
+
+def _unchanged(place: Path, known: Mapping[str, Any]) -> TrainResult:
+    told = known["training"]
+    return TrainResult(
+        place,
+        "unchanged",
+        told["samples"],
+        told["epochs"],
+        told["best_epoch"],
+        told["held_out_loss"],
+        told["device"],
+        Spent(),
+    )
+
+
+def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:
+    card, form = data.card, task.fit.view.form
+    return ModelCard(
+        architecture=Architecture(card["patch_px"], form.depth, len(fitted.scale), config.width),
+        channels=task.fit.channels,
+        outputs=task.outputs,
+        scale=fitted.scale,
+        patch_m=card["patch_m"],
+        chord_m=card["recipe"]["segment"]["chord_m"],
+        label_velocity=card["label"]["velocity"],
+        robot=", ".join(card["robots"]),
+        classes=class_table(card),
+        seen=what_was_seen(task.fit),
+        dataset={
+            "name": card["name"],
+            "sha256": dataset_checksum(card),
+            "data_model_version": card["data_model_version"],
+            "samples": card["splits"],
+        },
+        training=_told(task, config, fitted.progress, key),
+    )
+
+
+def class_table(card: Mapping[str, Any]) -> ClassTable:
+    """Return a dataset's class table; one without a terrain layer has the paper's."""
+    return table_from_json(card["classes"]) if card["classes"] else PAPER_CLASSES
+
+
+def _told(task: Task, config: FitConfig, progress: Progress, key: str) -> dict[str, Any]:
+    """Return what a model card tells of its training."""
+    return {
+        "key": key,
+        "config": asdict(config),
+        "optimizer": "Adam",
+        "samples": {"fitted": len(task.fit), "held out": len(task.held)},
+        "epochs": progress.epoch,
+        "best_epoch": progress.best_epoch,
+        "held_out_loss": progress.best_loss,
+        "device": device_name(),
+    }
+
+
+def _residuals(held: Split, fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
+    """Return labels and predictions of the held-out fold, one row a sample."""
+    said, labels = predicted(fitted.network, held, fitted.scale), labels_of(held, outputs)
+    columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class")}
+    for number, name in enumerate(("power_watt", "velocity_mps") if len(outputs) > 1 else outputs):
+        quantity, _, unit = name.rpartition("_")
+        columns[name] = labels[:, number].astype(np.float64)
+        columns[f"{quantity}_predicted_{unit}"] = said[:, number].astype(np.float64)
+    return pa.table(columns)
