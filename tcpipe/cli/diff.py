@@ -13,12 +13,15 @@ from tcpipe.cli.options import json_option
 @json_option
 def diff(a: str, b: str, *, as_json: bool) -> int:
     """Name what changed from A to B and why (log, recipe key, map, region, code), with the labels' shift; exit code 1 if they differ."""
+    from dataclasses import asdict
+
     from tcpipe.cli.output import print_json, say
     from tcpipe.pipeline.diff import diff as run
 
     found = run(a, b)
     if as_json:
-        print_json({"same": found.same, "difference": found})
+        print_json({"same": found.same, **asdict(found)})
     else:
-        say(str(found))
+        for line in found.lines():
+            say(line)
     return 0 if found.same else 1

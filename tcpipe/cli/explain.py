@@ -23,5 +23,6 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
     if as_json:
         print_json(found)
     else:
-        say(str(found))
+        for line in found.lines():
+            say(line)
     return 1 if found.differences else 0

@@ -21,5 +21,6 @@ def verify(path: str, *, as_json: bool) -> int:
     if as_json:
         print_json(found)
     else:
-        say(str(found))
+        for line in found.lines():
+            say(line)
     return 1 if found.problems else 0

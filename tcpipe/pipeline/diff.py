@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,12 +12,17 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
+from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files
 from tcpipe.formats.json_files import plain
 from tcpipe.pipeline.explain import flat_recipe
 from tcpipe.splits.assignment import SPLITS
 
 _LABELS = ("power_watt", "velocity_mps", "duration_s", "energy_joule")
+_LABELLED = (
+    *(*_LABELS, "fused_velocity_mps"),
+    *("power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule"),
+)
+_DRAWN = ("split", "fold")
 _VERSIONS = ("tcpipe_version", "data_model_version")
 
 Ints = NDArray[np.int64]
@@ -32,7 +37,7 @@ class Difference:
     causes: tuple[str, ...]
     """What the two are made from differently."""
     samples: Mapping[str, int]
-    """Samples only in one, in both, and of these how many have other labels or patches."""
+    """Samples only in one, in both, and how many of these have other labels, columns beside them, patches, folds."""
     moved: Mapping[str, int]
     """Samples of both by the splits that they moved between, ``train to test`` …."""
     labels: Mapping[str, Mapping[str, float]]
@@ -44,11 +49,15 @@ class Difference:
         return not (self.causes or self.moved or any(self.samples[name] for name in _CHANGES))
 
     def __str__(self) -> str:
+        """Return the lines as one text."""
+        return "\n".join(self.lines())
+
+    def lines(self) -> list[str]:
         """Return causes and effects as plain lines."""
-        return "\n".join(_lines(self))
+        return list(_lines(self))
 
 
-_CHANGES = ("only in a", "only in b", "other labels", "other patches")
+_CHANGES = ("only in a", "only in b", "other labels", "other columns", "other patches", "other fold")
 
 
 def diff(a: str | Path, b: str | Path) -> Difference:
@@ -62,26 +71,25 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     """
     first, second = Path(a), Path(b)
     cards = read_card(first), read_card(second)
-    tables = _columns(first), _columns(second)
+    tables = read_samples(first), read_samples(second)
     at = pc.index_in(tables[0].column("sample_id"), value_set=tables[1].column("sample_id").combine_chunks())
     row = at.to_numpy(zero_copy_only=False)  # of b for each of a, NaN where it is not there
     in_a = np.flatnonzero(np.isfinite(row))
     in_b = row[in_a].astype(np.int64)
+    both = tables[0].take(pa.array(in_a)), tables[1].take(pa.array(in_b))
+    shared = [name for name in tables[0].column_names if name in tables[1].column_names]
     counts = {
         "only in a": tables[0].num_rows - len(in_a),
         "only in b": tables[1].num_rows - len(in_a),
         "in both": len(in_a),
-        "other labels": int(_other_labels(*tables, in_a, in_b).sum()),
+        "other labels": _other(both, [name for name in shared if name in _LABELLED]),
+        "other columns": _other(both, [name for name in shared if name not in (*_LABELLED, *_DRAWN)]),
         "other patches": _other_patches((first, second), cards, tables, in_a, in_b),
+        "other fold": _other(both, [name for name in shared if name == "fold"]),
     }
-    moved = _moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
+    moved = _moved(*(table.column("split").to_numpy() for table in both))
     shifts = {name: _shift(*(_values(table, name) for table in tables)) for name in _LABELS}
     return Difference(first, second, tuple(_causes(*cards)), counts, moved, plain(shifts))
-
-
-def _columns(directory: Path) -> pa.Table:
-    there = sample_columns(directory)
-    return read_samples(directory, [name for name in ("sample_id", "split", *_LABELS) if name in there])
 
 
 def _values(table: pa.Table, name: str) -> NDArray[np.float64]:
@@ -89,10 +97,14 @@ def _values(table: pa.Table, name: str) -> NDArray[np.float64]:
     return values
 
 
-def _other_labels(a: pa.Table, b: pa.Table, in_a: Ints, in_b: Ints) -> NDArray[np.bool_]:
-    pairs = [(_values(a, name)[in_a], _values(b, name)[in_b]) for name in _LABELS]
-    other: NDArray[np.bool_] = np.any([ours != theirs for ours, theirs in pairs], axis=0)
-    return other
+def _other(both: tuple[pa.Table, pa.Table], names: Sequence[str]) -> int:
+    """Return how many rows differ in any of the columns; what is missing in both is the same."""
+    other = np.zeros(both[0].num_rows, np.bool_)
+    for name in names:
+        ours, theirs = (table.column(name) for table in both)
+        one_null = pc.xor(pc.is_null(ours), pc.is_null(theirs))
+        other |= pc.coalesce(pc.not_equal(ours, theirs), one_null).to_numpy()
+    return int(other.sum())
 
 
 def _other_patches(
@@ -208,7 +220,11 @@ def _lines(found: Difference) -> Iterator[str]:
         return
     yield f"{found.a} → {found.b}"
     yield from found.causes or ("no cause on record: same code, recipe, logs, maps and region",)
-    yield "samples: " + ", ".join(f"{count} {name}" for name, count in found.samples.items())
+    yield "samples: " + ", ".join(
+        f"{count} {name}"
+        for name, count in found.samples.items()
+        if count or name in ("only in a", "only in b", "in both")
+    )
     if found.moved:
         yield "splits: " + ", ".join(f"{count} from {name}" for name, count in found.moved.items())
     for name, shift in found.labels.items():

@@ -14,10 +14,19 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, TcpipeError
-from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files
+from tcpipe.errors import DatasetError, StoreError, TcpipeError
+from tcpipe.formats.dataset_files import (
+    SAMPLES,
+    file_checksum,
+    open_patches,
+    read_card,
+    read_samples,
+    rows_in_files,
+    sample_columns,
+)
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
 from tcpipe.formats.recipe_toml import parse_recipe, read_key
 from tcpipe.pipeline.ingest import run_stages
 from tcpipe.recipe import Recipe
@@ -51,8 +60,12 @@ class Explained:
     """Empty: the sample was made again bit for bit."""
 
     def __str__(self) -> str:
+        """Return the lines as one text."""
+        return "\n".join(self.lines())
+
+    def lines(self) -> list[str]:
         """Return the history as plain lines."""
-        return "\n".join(_lines(self.sample_id, self.facts, self.differences))
+        return list(_lines(self.sample_id, self.facts, self.differences))
 
 
 def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
@@ -83,6 +96,8 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     window = sample["start_ns"], sample["end_ns"]
     made = _made_again(sample, run, streams, source, recipe)
     differences = tuple(_differences(directory, card, sample, made))
+    if differences:
+        differences += tuple(_reasons(card, sample, run, source))
     facts = {
         "sample": sample,
         "labels": {name: sample[name] for name in _LABELS},
@@ -122,12 +137,20 @@ def _sample(directory: Path, sample_id: str) -> dict[str, Any]:
             f"; did you mean {', '.join(near)}?" if near else f"; an id of it is {ids[0].as_py()}" if len(ids) else ""
         )
         raise DatasetError(f"{directory}: no sample {sample_id!r}{hint}")
-    found: dict[str, Any] = read_samples(directory).slice(row, 1).to_pylist()[0]
+    try:
+        group = read_row_group(directory / SAMPLES, row // ROWS_PER_GROUP, sample_columns(directory))
+    except StoreError as error:
+        raise DatasetError(*error.problems) from None
+    found: dict[str, Any] = group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0]
     return {**found, "row": row}
 
 
 def _run(store: Store, directory: Path, card: Mapping[str, Any], sample: Mapping[str, Any]) -> RunDirectory:
-    recipe_id = next(run["recipe_id"] for run in card["runs"] if run["run_id"] == sample["run_id"])
+    recipe_id = next((run["recipe_id"] for run in card["runs"] if run["run_id"] == sample["run_id"]), None)
+    if recipe_id is None:
+        raise DatasetError(
+            f"{directory}: its card lists no run {sample['run_id']}; 'tcpipe verify {directory}' tells what else is wrong"
+        )
     for run in store.recipes_of(sample["run_id"]):
         if run.recipe_id == recipe_id:
             return run
@@ -204,10 +227,11 @@ def _refused(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[dict[str
 
 
 def _map(source: MapFile, sample: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
-    """Return which map, made from what, and the tiles of it that the patch touches."""
+    """Return which map, made from what, and the tiles of it that the patch touches; none where the map gives no patch any more."""
     corners = _sampled(sample, source, recipe).footprint_xy_m.reshape(-1, 2)
     px = source.grid.px_from_xy(corners)
-    low, high = (np.floor(end / source.tile_px).astype(int) for end in (px.min(axis=0), px.max(axis=0)))
+    ends = (px.min(axis=0), px.max(axis=0)) if len(px) else (np.zeros(2), -np.ones(2))
+    low, high = (np.floor(end / source.tile_px).astype(int) for end in ends)
     return {
         "name": source.name,
         "crs": source.grid.crs,
@@ -242,7 +266,9 @@ def _made_again(
             return "; ".join(error.problems)
     row = pc.index(segments.column("segment_id"), sample["sample_id"]).as_py()
     if row < 0:
-        return f"no segment of run {run.run_id} begins at this stamp any more"
+        away_s = np.abs(integers(segments, "start_ns") - sample["start_ns"]).min(initial=np.iinfo(np.int64).max) / 1e9
+        near = f"; the nearest begins {away_s:.3f} s away" if segments.num_rows else "; it has none now"
+        return f"no segment of run {run.run_id} begins at this stamp any more{near}"
     segment = segments.slice(row, 1).to_pylist()[0]
     sampled = _sampled(segment, source, recipe)
     if len(sampled.kept) == 0:
@@ -263,12 +289,29 @@ def _differences(
     patches = made["patches"]
     for name in _PATCH_COLUMNS:
         values = getattr(patches, name)
-        if sample[name] is not None and values[0] != sample[name]:
-            yield f"{name}: {values[0]!r} now, {sample[name]!r} in the dataset"
+        now = None if values is None else values[0].item()
+        if now != sample[name]:
+            yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"
     for layer, stored in _stored(directory, card, sample["row"]).items():
-        new = getattr(patches, layer)[0]
-        if not np.array_equal(new, stored):
-            yield f"{layer}: {int((new != stored).sum())} of {stored.size} pixels differ"
+        pixels = getattr(patches, layer)
+        if pixels is None:
+            yield f"{layer}: map {sample['map']} has no such layer any more"
+        elif not np.array_equal(pixels[0], stored):
+            yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
+
+
+def _reasons(card: Mapping[str, Any], sample: Mapping[str, Any], run: RunDirectory, source: MapFile) -> Iterator[str]:
+    """Yield what is not as it was when the dataset was built, which may be why."""
+    versions = {card["tcpipe_version"], run.manifest["tcpipe_version"], __version__}
+    if len(versions) > 1:
+        yield f"made by tcpipe {', '.join(sorted(versions - {__version__}))}, this is {__version__}"
+    for entry in card["maps"]:
+        if entry["name"] == sample["map"] and entry.get("inputs") != source.facts.get("inputs"):
+            yield f"map {source.name} was added anew since, from other files"
+    for entry in card["runs"]:
+        now = file_checksum(run.path / "segments.parquet")[1]
+        if entry["run_id"] == run.run_id and entry["segments_sha256"] != now:
+            yield f"run {run.run_id} was ingested anew since, with other segments"
 
 
 def _stored(directory: Path, card: Mapping[str, Any], row: int) -> dict[str, NDArray[Any]]:
@@ -309,7 +352,8 @@ def _lines(sample_id: str, facts: Mapping[str, Any], differences: Sequence[str])
         f"duration {labels['duration_s']:.3f} s, energy {labels['energy_joule']:.1f} J; "
         f"quality {', '.join(facts['quality']) or 'clean'}"
     )
-    yield f"log      {', '.join(log['paths']) or 'unknown'} (sha256 {str(log['sha256'])[:12]}…), run {log['run_id']}, robot {log['robot']}"
+    paths = [path if Path(path).exists() else f"{path} (not there now)" for path in log["paths"]]
+    yield f"log      {', '.join(paths) or 'unknown'} (sha256 {str(log['sha256'])[:12]}…), run {log['run_id']}, robot {log['robot']}"
     yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
     for role, found in facts["messages"].items():
         count = found["last"] - found["first"] + 1

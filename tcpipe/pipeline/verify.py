@@ -27,11 +27,15 @@ class Verified:
     problems: tuple[str, ...]
 
     def __str__(self) -> str:
+        """Return the lines as one text."""
+        return "\n".join(self.lines())
+
+    def lines(self) -> list[str]:
         """Return a line of what was read, and one for each problem."""
         read = ", ".join(f"{count} {what}" for what, count in self.read.items()) or "nothing"
         count = len(self.problems)
         verdict = f"{count} problem{'s' if count > 1 else ''}" if count else "all as it was written"
-        return "\n".join((f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems))
+        return [f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems]
 
 
 def verify(path: Path) -> Verified:

@@ -6,11 +6,13 @@ import shutil
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from synthetic_store import add_run, box, lanes, region_file, segments, small_store
+from map_worlds import World
+from synthetic_store import WORLD, add_run, box, lanes, region_file, segments, small_store
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.dataset_files import file_checksum
+from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import open_map
 from tcpipe.formats.parquet import write_table
 from tcpipe.formats.seals import broken_seal, sealed_page, write_checksums, write_sealed
@@ -232,8 +234,21 @@ def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path
         row for row in open_dataset(made / "zarr")["train"].samples["sample_id"].to_pylist() if "north" in row
     )
     found = explain(sample, dataset=made / "zarr", store=store.root)
-    assert len(found.differences) == 1
     assert found.differences[0].startswith("power_watt: ")
+    assert found.differences[1:] == ("run north was ingested anew since, with other segments",)
+
+
+def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
+    store = Store(copy("store"))
+    sample = open_dataset(made / "zarr")["train"].samples["sample_id"][0].as_py()
+    build_map(store.map_path("site"), name="site", height=made / "rasters" / "height.tif", inputs={"files": "others"})
+    found = explain(sample, dataset=made / "zarr", store=store.root).differences
+    assert "terrain: map site has no such layer any more" in found
+    assert found[-1] == "map site was added anew since, from other files"
+    elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pitch_m=0.2)
+    build_map(store.map_path("site"), name="site", height=elsewhere["height"], inputs={"files": "others"})
+    found = explain(sample, dataset=made / "zarr", store=store.root).differences
+    assert found[0] == "map site gives no patch for it any more"
 
 
 def test_an_unknown_sample_and_an_unknown_run_are_said(made, copy):
@@ -253,7 +268,8 @@ def test_an_unknown_sample_and_an_unknown_run_are_said(made, copy):
 def test_two_formats_hold_the_same_samples(made):
     found = diff(made / "zarr", made / "parquet")
     assert found.causes == ("format: zarr → parquet",)
-    assert (found.samples["in both"], found.samples["other patches"], found.moved) == (448, 0, {})
+    assert {name: count for name, count in found.samples.items() if count} == {"in both": 448}
+    assert found.moved == {}
     assert diff(made / "zarr", made / "zarr").same
 
 
@@ -275,8 +291,11 @@ def test_causes_and_effects_are_named(made, copy, tmp_path):
         "only in b": 28,
         "in both": 448,
         "other labels": 0,
+        "other columns": 448,
         "other patches": 448,
+        "other fold": found.samples["other fold"],
     }
+    assert found.samples["other fold"] > 112
     assert found.moved["unseen to train"] + found.moved["unseen to test"] == 112
     assert not found.same
     lines = str(found)
