@@ -34,20 +34,26 @@ def twist_on_grid(source: BodyVelocities, at_ns: NDArray[np.int64]) -> Floats:
     return on_grid(source.stamp_ns[known], np.column_stack((forward, yaw_rate))[known], at_ns)
 
 
-def fix_velocity(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
-    """Return the antenna's velocity [m/s], east and i times north, shape (M,); wild fixes are bridged, NaN in gaps."""
+def fix_places(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
+    """Return the antenna's places [m], east and i times north, averaged over half a second, shape (M,); wild fixes are bridged."""
     place = gnss.position_enu_m[:, :2]
     wild = np.zeros(place.shape[0], np.bool_)
     for axis in place.T:
         off = _off_neighbours(axis)
         wild |= off > _STRAY_M + _STRAY * float(np.median(off))
+    if (~wild).sum() < 2:
+        return np.full(at_ns.size, np.nan + 0j)
+    smooth = averaged(on_grid(gnss.stamp_ns[~wild], place[~wild], at_ns), FIXES_S)
+    return smooth[:, 0] + 1j * smooth[:, 1]
+
+
+def fix_velocity(gnss: Positions, at_ns: NDArray[np.int64]) -> NDArray[np.complex128]:
+    """Return the antenna's velocity [m/s], east and i times north, shape (M,); wild fixes are bridged, NaN in gaps."""
     velocity = np.full(at_ns.size, np.nan + 0j)
     half = round(FIXES_S / 2 / GRID_S)
-    if (~wild).sum() < 2 or at_ns.size <= 2 * half:
-        return velocity
-    smooth = averaged(on_grid(gnss.stamp_ns[~wild], place[~wild], at_ns), FIXES_S)
-    steps = (smooth[2 * half :] - smooth[: -2 * half]) / (2 * half * GRID_S)
-    velocity[half:-half] = steps[:, 0] + 1j * steps[:, 1]
+    if at_ns.size > 2 * half:
+        place = fix_places(gnss, at_ns)
+        velocity[half:-half] = (place[2 * half :] - place[: -2 * half]) / (2 * half * GRID_S)
     return velocity
 
 

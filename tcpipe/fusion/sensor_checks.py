@@ -1,8 +1,8 @@
 """Sensors that contradict physics or each other, and what would set each right; such a sensor is not to be fused.
 
-An IMU in degrees or in g, one that does not stand upright, one that looks elsewhere; an odometry that drives or turns the other way.
-Where two disagree a third decides: the command, the camera, the course of the fixes. Mountings that somebody stated weigh more than
-assumed ones.
+An IMU in degrees or in g, one that does not stand upright, one that looks elsewhere; an odometry that drives or turns the other way;
+fixes on a mirrored path; a sensor that is frozen, or goes another distance than the rest. Where two disagree a third decides: the command,
+the camera, the course of the fixes. Mountings that somebody stated weigh more than assumed ones.
 """
 
 from __future__ import annotations
@@ -14,9 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.distances import COMMAND, Distances, contradictions, find_distances, mirrored
+from tcpipe.fusion.frozen import frozen_sensors
 from tcpipe.fusion.gridded_motion import course_rate, fix_velocity, on_grid, twist_on_grid
-from tcpipe.fusion.lags import Floats, averaged, grid_ns
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements
+from tcpipe.fusion.lags import Floats, averaged
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.plausibility import (
     YawAxis,
     agreement,
@@ -27,9 +29,9 @@ from tcpipe.fusion.plausibility import (
     yaw_axis,
 )
 from tcpipe.fusion.signals import hold_last
+from tcpipe.fusion.windows import liveliest_ns
 
 _SMOOTH_S = 0.1
-_LONG_ENOUGH_NS = 1_800_000_000_000
 _IN_G = (0.8, 1.25)
 _IN_MPS2 = (8.0, 12.0)
 _IN_DEGREES = 1.0 / 15.0  # rad/s by the wheels over the gyroscope's rate; in radians 0.5 to 2
@@ -88,25 +90,66 @@ def check_sensors(
     felt : median size of the specific force as the IMU told it, before its lever arm was taken out; NaN without an IMU.
     """
     checks = Checks()
-    sources = {GNSS: measurements.gnss, IMU: measurements.imu, WHEELS: measurements.wheels, VISUAL: measurements.visual}
-    present = [source.stamp_ns for source in sources.values() if source is not None and source.stamp_ns.size > 1]
-    if not present:
+    at_ns = liveliest_ns(measurements)
+    if at_ns is None:
         return checks
-    first_ns, last_ns = min(int(stamp[0]) for stamp in present), max(int(stamp[-1]) for stamp in present)
-    at_ns = grid_ns(first_ns, min(last_ns, first_ns + _LONG_ENOUGH_NS))
     twists = {
         role: twist_on_grid(source, at_ns)
         for role, source in ((WHEELS, measurements.wheels), (VISUAL, measurements.visual))
         if source is not None
     }
+    found = find_distances(measurements.gnss, _with_command(twists, command, at_ns), at_ns)
+    frozen = frozen_sensors(measurements, found)
+    checks.refusals += [Refusal(role, why) for role, why in frozen.items()]
+    twists = {role: twist for role, twist in twists.items() if role not in frozen}
+    gnss = None if GNSS in frozen else measurements.gnss
     turning = {role: averaged(twist, _SMOOTH_S)[:, 1] for role, twist in twists.items()}
-    if measurements.gnss is not None:
-        turning[GNSS] = course_rate(fix_velocity(measurements.gnss, at_ns))
+    if gnss is not None:
+        turning[GNSS] = course_rate(fix_velocity(gnss, at_ns))
     looks: dict[str, float] = {}
-    if measurements.imu is not None:
+    if measurements.imu is not None and IMU not in frozen:
         looks = _check_imu(checks, measurements.imu, at_ns, felt, twists=twists, turning=turning, stated=stated)
     _check_directions(checks, twists, at_ns, command=command, looks=looks, stated=stated)
+    _check_distances(checks, found.without(frozen))
+    if gnss is not None:
+        _check_mirrored(checks, gnss, twists, at_ns)
     return checks
+
+
+def _with_command(twists: Mapping[str, Floats], command: Command | None, at_ns: NDArray[np.int64]) -> dict[str, Floats]:
+    """Return the twists and, under `COMMAND`, the commanded speed with the yaw rate that an odometry tells."""
+    if command is None or not twists:
+        return dict(twists)
+    wanted = hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
+    return {**twists, COMMAND: np.column_stack((wanted, next(iter(twists.values()))[:, 1]))}
+
+
+def _check_distances(checks: Checks, found: Distances) -> None:
+    """Check that all sensors go about as far."""
+    axes = checks.facts.get("yaw_axis", {})
+    turning = frozenset(role for role, axis in axes.items() if role != GNSS)
+    checks.facts["distance_m"] = {
+        role: float(np.nanmedian(chord)) for role, chord in found.chord_m.items() if np.isfinite(chord).any()
+    }
+    refused = {refusal.role for refusal in checks.refusals}
+    why = contradictions(found, turning=turning)
+    checks.refusals += [Refusal(role, text) for role, text in why.items() if role not in refused]
+
+
+def _check_mirrored(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> None:
+    """Check that the fixes bend the way the odometries do; one odometry that no gyroscope confirms is as doubtful as they are."""
+    refused = {refusal.role for refusal in checks.refusals}
+    told = {role: mirrored(gnss, twist, at_ns) for role, twist in twists.items() if role not in refused}
+    against = [role for role, is_mirrored in told.items() if is_mirrored]
+    if GNSS in refused or not against or False in told.values():
+        return
+    exchanged = f"its path is the mirror image of that by {' and '.join(against)} (latitude and longitude exchanged?)"
+    if len(against) > 1 or against[0] in checks.facts.get("yaw_axis", {}):
+        checks.refusals.append(Refusal(GNSS, exchanged))
+        return
+    doubt = "and nothing tells which of the two is right"
+    checks.refusals.append(Refusal(GNSS, f"{exchanged}, {doubt}"))
+    checks.refusals.append(Refusal(against[0], f"its yaw rate has the opposite sign of {GNSS}, {doubt}", turned_by=YAW))
 
 
 def _check_imu(

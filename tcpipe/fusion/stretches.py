@@ -7,17 +7,16 @@ longer than 5 s (a paused recording): whatever happened meanwhile, the estimator
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.measurements import Measurements
 from tcpipe.fusion.signals import in_gap, median_period_ns
+from tcpipe.fusion.windows import part
 
 _PAUSE_NS = 5_000_000_000
-_Source = TypeVar("_Source", Positions, BodyVelocities, InertialMeasurements)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +43,10 @@ def cut_stretches(
         first = stamp[np.concatenate(([0], pause + 1))]
         last = stamp[np.concatenate((pause, [stamp.size - 1]))]
         for start, end in zip(first.tolist(), last.tolist(), strict=True):
-            part = _within(whole, start, end)
-            motion = _stamps(part, with_imu=False)
+            inside = part(whole, start, end)
+            motion = _stamps(inside, with_imu=False)
             if motion.size > 1:
-                found.append(Stretch(epoch, int(motion[0]), int(motion[-1]), part))
+                found.append(Stretch(epoch, int(motion[0]), int(motion[-1]), inside))
     return found
 
 
@@ -68,23 +67,3 @@ def _stamps(measurements: Measurements, *, with_imu: bool) -> NDArray[np.int64]:
     sources = [measurements.gnss, measurements.wheels, measurements.visual]
     stamps = [source.stamp_ns for source in (*sources, measurements.imu if with_imu else None) if source is not None]
     return np.unique(np.concatenate(stamps)) if stamps else np.empty(0, np.int64)
-
-
-def _within(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
-    return replace(
-        whole,
-        gnss=_part(whole.gnss, start_ns, end_ns),
-        imu=_part(whole.imu, start_ns, end_ns),
-        wheels=_part(whole.wheels, start_ns, end_ns),
-        visual=_part(whole.visual, start_ns, end_ns),
-    )
-
-
-def _part(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
-    """Return the rows between two stamps."""
-    if source is None:
-        return None
-    inside = (source.stamp_ns >= start_ns) & (source.stamp_ns <= end_ns)
-    values = {field.name: getattr(source, field.name) for field in fields(source)}
-    rows: dict[str, Any] = {name: value[inside] for name, value in values.items() if isinstance(value, np.ndarray)}
-    return replace(source, **rows) if inside.any() else None

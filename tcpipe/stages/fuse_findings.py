@@ -15,6 +15,7 @@ from tcpipe.stages.fuse_inputs import Inputs
 from tcpipe.tables.levels import REJECTIONS
 
 _MANY_REFUSED = 0.2
+_LOCAL = "the track lies in a local frame that starts at 0, 0, 0 and cannot be placed on a map"
 
 
 def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> dict[str, Any]:
@@ -63,12 +64,11 @@ def fuse_facts(inputs: Inputs, stretches: list[dict[str, Any]], *, rows: int, sk
 
 def fuse_warnings(inputs: Inputs, stretches: list[dict[str, Any]], summary: dict[str, Any]) -> tuple[str, ...]:
     """Return what a person should know before trusting the track."""
-    found = list(inputs.remarks)
-    if inputs.datum_deg_m is None:
-        found.append(
-            "no GNSS fix: the track is in a local frame that starts at 0, 0, 0; it cannot be sampled from a map"
-        )
-    else:
+    counts = {role: count for role, count in inputs.counts.items() if role not in inputs.refused}
+    found = [remark for remark in inputs.remarks if remark.split(":")[0] not in inputs.refused]
+    if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was warned of when it was read
+        found.append(f"no GNSS position is used: {_LOCAL}")
+    elif inputs.datum_deg_m is not None:
         found += [
             f"clock epoch {stretch['epoch']}: no 5 m of course over ground, so its initial yaw is from {stretch['heading_from']}"
             for stretch in stretches
@@ -81,7 +81,7 @@ def fuse_warnings(inputs: Inputs, stretches: list[dict[str, Any]], summary: dict
         if stretch.get("gnss_variance_factor", 1.0) > 1.0
     ]
     if IMU not in summary["sensors"]:
-        found.append("no IMU: attitude is inferred from the path; roll and pitch are weak")
+        found.append("no IMU is used: attitude is inferred from the path; roll and pitch are weak")
     found += [
         f"{role}: {summary['rejected'][role]} of {count} measurements were refused by the gate (rejections.parquet)"
         for role, count in summary["measurements"].items()
@@ -91,7 +91,7 @@ def fuse_warnings(inputs: Inputs, stretches: list[dict[str, Any]], summary: dict
         ("variances_replaced", "rows without a usable variance; the recipe's is used"),
         ("invalid", "rows without a usable value"),
     ):
-        found += [f"{role}: {count[key]} {text}" for role, count in inputs.counts.items() if count[key]]
+        found += [f"{role}: {count[key]} {text}" for role, count in counts.items() if count[key]]
     if summary["skipped_s"]:
         found.append(f"{summary['skipped_s']:.1f} s between pauses or clock steps hold too little to place a track")
     return tuple(found)

@@ -23,13 +23,14 @@ from tcpipe.tables.levels import Sensor, Streams
 
 @dataclass(slots=True)
 class Inputs:
-    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, stamps of unusable rows, counts and remarks."""
+    """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps, counts and remarks; refused roles."""
 
     datum_deg_m: tuple[float, float, float] | None
     measurements: dict[int, Measurements] = field(default_factory=dict)
     invalid_ns: dict[str, list[NDArray[np.int64]]] = field(default_factory=dict)
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
+    refused: frozenset[str] = frozenset()
 
     def note(self, role: str, prepared: Prepared) -> None:
         """Remember what was set aside."""

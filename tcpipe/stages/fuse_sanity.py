@@ -26,14 +26,15 @@ def sane_inputs(inputs: Inputs, streams: Streams) -> tuple[Inputs, Findings]:
     checks = check_sensors(
         inputs.measurements[epoch], command=_command(streams, epoch), stated=stated, felt=_felt(streams)
     )
-    refused = {refusal.role for refusal in checks.refusals}
+    refused = frozenset(refusal.role for refusal in checks.refusals)
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
     facts = {**checks.facts, "refused": {refusal.role: refusal.why for refusal in checks.refusals}}
     warnings = tuple(_warning(refusal, streams.sensors[refusal.role]) for refusal in checks.refusals)
-    return replace(inputs, measurements=kept), Findings(warnings, facts)
+    datum = None if GNSS in refused else inputs.datum_deg_m
+    return replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused), Findings(warnings, facts)
 
 
-def _without(refused: set[str], m: Measurements) -> Measurements:
+def _without(refused: frozenset[str], m: Measurements) -> Measurements:
     return replace(
         m,
         gnss=None if GNSS in refused else m.gnss,
@@ -75,7 +76,7 @@ def _warning(refusal: Refusal, sensor: Sensor) -> str:
     if refusal.units is not None:
         return f'{what}; if that is so, declare it in the recipe under [read]: imu_units = "{refusal.units}"'
     if refusal.turned_by is None:
-        return f"{what}; leave it out in the recipe under [read]: ignore_topics"
+        return f'{what}; to leave it out by name, write in the recipe under [read]: ignore_topics = ["{sensor.topic}"]'
     rpy_rad = rpy_from_matrix(refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
     place = ", ".join(f"{value:g}" for value in sensor.xyz_m)
     turn = ", ".join(f"{value:.4f}" for value in np.where(np.abs(rpy_rad) < 5e-5, 0.0, rpy_rad))

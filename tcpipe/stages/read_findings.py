@@ -55,7 +55,9 @@ def _warnings(source: Source, timeline: Timeline | None) -> Iterable[str]:
     unexpected = {reason: count for reason, count in dropped.items() if reason != "not_gga"}
     if sum(unexpected.values()) > _MANY_DROPPED * rows:
         counts = ", ".join(f"{reason} {count}" for reason, count in unexpected.items())
-        yield f"{name}: {sum(unexpected.values())} of {rows} messages are not used ({counts})"
+        lost = f"{name}: {sum(unexpected.values())} of {rows} messages are not used ({counts})"
+        nowhere = source.role == "gnss" and not len(source.readings.row)
+        yield lost + (": the track lies in a local frame and cannot be placed on a map" if nowhere else "")
     if timeline is None:
         return
     if timeline.source == "log" and source.readings.header_ns is not None:

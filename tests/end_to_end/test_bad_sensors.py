@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tcpipe.errors import RoleError
+from tcpipe.errors import FusionError, RoleError
 from tcpipe.formats.log_file import open_log
 from tcpipe.formats.log_writing import MessageStream, write_mcap
 from tcpipe.pipeline.ingest import run_stages
@@ -189,6 +189,48 @@ def test_a_camera_that_drives_backwards_is_refused(drive, tmp_path):
     labelled = run(other, tmp_path)
     assert refused(labelled) == {"visual_odometry"}
     assert_labels_hold(labelled, drive.truth)
+
+
+def constant(names: str, value: float | None = None) -> Callable[[Columns], Columns]:
+    return lambda c: {
+        n: np.full_like(v, v[len(v) // 2] if value is None else value) for n, v in c.items() if n.startswith(names)
+    }
+
+
+UNLIKE = {
+    "fixes that never change": ("gnss", constant(("latitude", "longitude", "altitude")), "same place"),
+    "places in radians": ("gnss", lambda c: {n: np.radians(c[n]) for n in ("latitude", "longitude")}, "radians?"),
+    "exchanged axes": ("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]}, "exchanged?"),
+    "wheels that never change": ("wheels", constant("twist.twist"), "on all of its"),
+    "wheels in km/h": ("wheels", lambda c: {"twist.twist.linear.x": 3.6 * c["twist.twist.linear.x"]}, "km/h?"),
+    "a dead camera": ("visual", constant("twist.twist", 0.0), "is 0 m/s on all"),
+    "a dead IMU": ("imu", constant(("angular_velocity.", "linear_acceleration."), 0.0), "never changes"),
+}
+
+
+@pytest.mark.parametrize("what", UNLIKE)
+def test_a_sensor_that_is_unlike_the_rest_is_refused(drive, tmp_path, what):
+    sensor, change, word = UNLIKE[what]
+    other = drive.changed(sensor, change)
+    if sensor == "visual":  # its pose too, or the velocities would be taken from that
+        other = other.changed(sensor, lambda c: {**constant("twist.twist", 0.0)(c), **constant("pose.pose")(c)})
+    labelled = run(other, tmp_path)
+    role = {"wheels": "wheel_odometry", "visual": "visual_odometry"}.get(sensor, sensor)
+    assert refused(labelled) == {role}
+    (why,) = [w for w in labelled.info.findings.warnings if "is not fused" in w]
+    assert word in why
+    assert "ignore_topics" in why
+    assert (labelled.info.datum is None) == (sensor == "gnss")
+    assert_labels_hold(labelled, drive.truth, within=0.06 if sensor == "gnss" else 0.03)
+
+
+def test_two_that_contradict_each_other_are_both_refused(drive, tmp_path):
+    """Without camera, IMU and command nothing tells whether fixes or wheels are right: no label is better than a wrong one."""
+    alone = drive.without("visual", "imu", "command")
+    other = alone.changed("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]})
+    with pytest.raises(FusionError) as error:
+        run(other, tmp_path)
+    assert sum("nothing tells which of the two is right" in line for line in error.value.problems) == 2
 
 
 def scattered(size: int, share: float = 0.05) -> np.ndarray:

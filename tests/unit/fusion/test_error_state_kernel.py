@@ -8,8 +8,8 @@ from unit.fusion import dense_reference, drive
 from tcpipe.fusion import error_state, error_state_kernel
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.standing import standing_intervals
-from tcpipe.fusion.stretches import _within
 from tcpipe.fusion.timeline import build_timeline
+from tcpipe.fusion.windows import part
 
 RNG = np.random.default_rng(5)
 X = np.concatenate((Rotation.from_euler("ZYX", [1.0, 0.2, -0.3]).as_matrix().ravel(), 0.1 * RNG.normal(size=14)))
@@ -18,13 +18,13 @@ P = 0.01 * ROOT @ ROOT.T + 0.01 * np.eye(17)
 RATE, FORCE, LEVER = np.array([0.3, -0.2, 0.8]), np.array([0.5, 0.3, 9.7]), np.array([0.3, 0.1, 0.5])
 
 
-@pytest.mark.parametrize("mode", [0, 1, 2, 3])
-def test_prediction_is_the_unscented_transform(mode):
+@pytest.mark.parametrize(("mode", "scaled"), [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)])
+def test_prediction_is_the_unscented_transform(mode, scaled):
     x, covariance, moved = X.copy(), P.copy(), np.zeros((12, 9))
     work, _ = error_state_kernel.workspace()
-    q = np.linspace(0.01, 0.02, 18)
-    error_state_kernel.predict(x, covariance, q, 0.4, RATE, FORCE, mode, moved, work)
-    wanted_x, wanted_P, cross = dense_reference.predict(X, P, q, 0.4, RATE, FORCE, mode)
+    q = np.append(np.linspace(0.01, 0.02, 19), scaled)
+    error_state_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
+    wanted_x, wanted_P, cross = dense_reference.predict(X, P, q, 0.03, 0.4, RATE, FORCE, mode)
     assert np.allclose(x, wanted_x, atol=1e-13)
     assert np.allclose(covariance, wanted_P, atol=1e-13)
     transposed = np.linalg.solve(P, cross)  # the linear map with the sigma points' second moments
@@ -69,7 +69,7 @@ def _short_run():
 
 def test_filter_and_smoother_are_those_written_out(monkeypatch):
     measurements, standing, initial, output = _short_run()
-    timeline = build_timeline(_within(measurements, 0, int(output[-1])), standing, output)
+    timeline = build_timeline(part(measurements, 0, int(output[-1])), standing, output)
     monkeypatch.setattr(error_state, "_BLOCK", 40)  # several blocks,
     monkeypatch.setattr(error_state, "_KEPT_BLOCKS", 2)  # some of them filtered twice
     run = error_state._Run(timeline, measurements, 0.999, lags=(3, 10))
@@ -112,7 +112,7 @@ def test_a_covariance_that_is_none_is_repaired_and_counted():
     work, _ = error_state_kernel.workspace()
     broken = P.copy()
     broken[3, 3] = -1e-12
-    error_state_kernel.predict(X.copy(), broken, np.zeros(18), 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
+    error_state_kernel.predict(X.copy(), broken, np.zeros(20), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
     assert work[8][0] > 0
     assert np.isfinite(broken).all()
     assert np.linalg.eigvalsh(broken).min() > 0
