@@ -57,7 +57,7 @@ class MemoryMap:
     factors: tuple[int, ...] = (1,)
 
     def read(self, layer, row0, row1, col0, col1):
-        """Return a window of a layer."""
+        """Return a window of a layer: all that is asked of a map of one tile."""
         return self.arrays[layer][row0:row1, col0:col1]
 
 

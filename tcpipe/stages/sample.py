@@ -75,7 +75,7 @@ def sample_segments(
     patches = sample_patches(source, frames, chord_m[rows], patch_m=config.patch_m, patch_px=config.patch_px, pool=pool)
     lost_by[rows] = _lost(patches, corners[rows], source, config)
     good = lost_by[rows] == 0
-    kept, patches = rows[good], patches if good.all() else patches.rows(good)
+    kept, patches = rows[good], patches if good.all() else patches.only(good)
     return Sampled(
         map_name=source.name,
         kept=kept,

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.terrain.layers import HEIGHT_STEP_M
+from tcpipe.terrain.layers import HEIGHT_STEP_M, LAYERS
 from tcpipe.terrain.patches import PatchFrames, chord_px, map_px_from_patch
 from tcpipe.terrain.sampling_kernel import sample_tiles
 from tcpipe.terrain.tiles import MapReader, TilePool, groups_by_tile, level_for
+
+_MOVED_ROWS = 128
+"""Patches moved at once: they stay in the processor's cache on the way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,11 +37,16 @@ class Patches:
     terrain_class: NDArray[np.uint8]
     terrain_purity: NDArray[np.float64]
 
-    def rows(self, chosen: NDArray[np.bool_] | NDArray[np.int64]) -> Patches:
-        """Return the chosen patches, in their order."""
+    def only(self, good: NDArray[np.bool_]) -> Patches:
+        """Return the good patches, in their order; their pixels move together in place, and these patches are void."""
+        rising = np.flatnonzero(good)
+        layers: list[NDArray[Any]] = [layer for layer in (self.ortho, self.terrain, self.height) if layer is not None]
+        for layer, first in product(layers, range(0, len(rising), _MOVED_ROWS)):
+            here = rising[first : first + _MOVED_ROWS]
+            layer[first : first + len(here)] = layer[here]
         found: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         for name, values in found.items():
-            found[name] = None if values is None else values[chosen]
+            found[name] = None if values is None else values[: len(rising)] if name in LAYERS else values[good]
         return Patches(**found)
 
 

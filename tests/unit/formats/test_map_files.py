@@ -136,3 +136,15 @@ def test_a_layer_that_is_gone_is_named(path, tmp_path):
     shutil.rmtree(copy / "overviews" / "4")
     with pytest.raises(MapError, match=r"the map's overviews/4/height, .* is gone"):
         open_map(copy)
+
+
+def test_tiles_are_windows_and_hold_no_data_beyond_the_map(path):
+    source = open_map(path)
+    for level in (source, source.at(2)):
+        for layer in level.layers:
+            tile = np.full((level.tile_px, level.tile_px), 7, np.float32 if layer == "height" else np.uint8)
+            level.read_tile(layer, 0, 0, tile)
+            part = level.read(layer, 0, level.grid.rows, 0, level.grid.cols)
+            np.testing.assert_array_equal(tile[: part.shape[0], : part.shape[1]], part)
+            beyond = np.concatenate([tile[part.shape[0] :].ravel(), tile[:, part.shape[1] :].ravel()])
+            assert np.isnan(beyond).all() if layer == "height" else not beyond.any()

@@ -229,3 +229,14 @@ def test_no_frames_give_no_patches():
     got = sample(source, frames_at(source.grid, 0))
     assert got.height.shape == (0, 40, 40)
     assert got.ortho.shape == (0, 40, 40)
+
+
+def test_good_patches_move_together():
+    source = random_map()
+    frames = frames_at(source.grid, 700)
+    whole, good = sample(source, frames), np.random.default_rng(0).random(700) < 0.8
+    good[:150] = True
+    got = sample(source, frames).only(good)
+    for name in ("ortho", "terrain", "height", "slope_rad", "terrain_class"):
+        np.testing.assert_array_equal(getattr(got, name), getattr(whole, name)[good])
+    assert sample(ArrayMap(source.grid, {"height": source.arrays["height"]}), frames).only(good).ortho is None
