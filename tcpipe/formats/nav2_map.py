@@ -1,7 +1,7 @@
 """Maps that Nav2's map_server loads: a grey picture (.pgm) and what it means (.yaml), mode ``scale``.
 
-In that mode grey falls from white (cost 0) to black (100, lethal) in even steps. A .pgm has no alpha, so unknown cannot be told from lethal:
-what is not known is lethal here.
+In that mode grey falls from white (cost 0) to black (100, lethal) in even steps. A .pgm has no alpha, so unknown cannot be told from
+lethal: what is not known is lethal here.
 """
 
 from __future__ import annotations

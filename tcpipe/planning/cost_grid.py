@@ -68,22 +68,26 @@ class CostGrid:
     height_m: Floats32
 
     def per_metre(self, objective: str) -> Floats32:
-        """Return what a metre costs: ``energy`` [J/m], ``time`` [s/m] or ``distance`` [m/m]; NaN where there is no cost."""
+        """Return what a metre costs: ``energy`` [J/m], ``time`` [s/m] or ``distance`` [m/m]; NaN where it is not known."""
+        if objective == "distance":
+            return np.ones_like(self.velocity_mps)
         slowness = 1.0 / self.velocity_mps
-        if objective == "energy":
-            return np.asarray(self.power_watt * slowness)
-        return (
-            slowness
-            if objective == "time"
-            else np.asarray(np.where(np.isnan(slowness), np.float32(np.nan), np.float32(1.0)))
-        )
+        return np.asarray(self.power_watt * slowness if objective == "energy" else slowness)
+
+    def open_courses(self, *, allow_unseen: bool) -> NDArray[np.bool_]:
+        """Return where a course may be driven, shape (16, rows, cols): without obstacle, and on ground the model knows."""
+        forbidden = np.uint16(BARRED) if allow_unseen else np.uint16(0xFFFF)
+        return np.asarray(self.reasons & forbidden == 0)
 
     def put(self, cells: Cells, found: Verdicts) -> None:
         """Write what was said of cells (flat indices, (n,)), 16 verdicts a cell, courses fastest."""
         for name in ("power_watt", "velocity_mps", "reasons"):
             array = getattr(self, name)
             array.reshape(COURSES, -1)[:, cells] = getattr(found, name).reshape(-1, COURSES).T
-        self.height_m.reshape(-1)[cells] = found.height_m.reshape(-1, COURSES)[:, 0]
+        height = found.height_m.reshape(-1, COURSES)
+        known = np.isfinite(height)
+        count, total = known.sum(axis=1), np.where(known, height, 0.0).sum(axis=1)
+        self.height_m.reshape(-1)[cells] = np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
 def empty_grid(grid: MapGrid) -> CostGrid:
@@ -130,17 +134,26 @@ def blocks(
 class CellFrames:
     """Frames of the metres through the middles of cells, 16 a cell; the map's scale is taken where the cells lie."""
 
-    __slots__ = ("_crs", "_grid")
+    __slots__ = ("_corners", "_grid")
 
     def __init__(self, grid: MapGrid, *, where: str) -> None:
         self._grid = grid
-        self._crs = parse_crs(grid.crs, where=where)
+        corners = grid.xy_from_px(
+            np.array([(c, r) for r in (0, grid.rows - 1) for c in (0, grid.cols - 1)], np.float64)
+        )
+        self._corners = metres_from_plane(parse_crs(grid.crs, where=where), corners).reshape(2, 2, 2, 2)
 
     def of(self, cells: Cells) -> PatchFrames:
         """Return the frames of cells (flat indices, (n,)), shape (16 n,), courses fastest."""
         row, col = np.divmod(cells, self._grid.cols)
         centre = self._grid.xy_from_px(np.stack([col, row], axis=1).astype(np.float64))
-        ground = metres_from_plane(self._crs, centre.mean(axis=0)[None])[0]
-        along = DIRECTIONS / np.linalg.norm(DIRECTIONS @ ground.T, axis=1)[:, None]
-        along = np.tile(along, (cells.size, 1))
+        along = np.tile(DIRECTIONS / self.metres(cells)[:, None], (cells.size, 1))
         return PatchFrames(np.repeat(centre, COURSES, axis=0), along, np.stack([-along[:, 1], along[:, 0]], axis=1))
+
+    def metres(self, cells: Cells) -> NDArray[np.float64]:
+        """Return ground metres a map metre along each course, shape (16,), where cells lie; between the grid's corners it is linear."""
+        down, right = np.divmod(cells, self._grid.cols)
+        v, u = down.mean() / max(self._grid.rows - 1, 1), right.mean() / max(self._grid.cols - 1, 1)
+        (north_west, north_east), (south_west, south_east) = self._corners
+        ground = (1 - v) * ((1 - u) * north_west + u * north_east) + v * ((1 - u) * south_west + u * south_east)
+        return np.asarray(np.linalg.norm(DIRECTIONS @ ground.T, axis=1))

@@ -40,10 +40,13 @@ class Verdicts:
 
 
 def verdicts_of(
-    model: CostModel, source: MapReader, batches: Iterable[PatchFrames], *, pool: TilePool | None = None
+    model: CostModel, source: MapReader, batches: Iterable[PatchFrames], *, ask: bool = True
 ) -> Iterator[Verdicts]:
-    """Yield what the model says of each batch of frames, in order; tiles of the map are kept from batch to batch."""
-    tiles = pool or TilePool(level_for(source, model.patch_m / model.patch_px))
+    """Yield what is said of each batch of frames, in order; tiles of the map are kept from batch to batch.
+
+    Without ``ask`` the ground is judged alone: no predictions.
+    """
+    tiles = TilePool(level_for(source, model.patch_m / model.patch_px))
 
     def sampled(frames: PatchFrames) -> tuple[Patches, NDArray[np.bool_]]:
         chord_m = np.full(len(frames.centre_xy_m), model.chord_m)
@@ -56,15 +59,15 @@ def verdicts_of(
         for frames in batches:
             following = ahead.submit(sampled, frames)
             if waiting is not None:
-                yield _judged(model, source, *waiting.result())
+                yield _judged(model, source, *waiting.result(), ask=ask)
             waiting = following
         if waiting is not None:
-            yield _judged(model, source, *waiting.result())
+            yield _judged(model, source, *waiting.result(), ask=ask)
 
 
-def _judged(model: CostModel, source: MapReader, patches: Patches, on_map: NDArray[np.bool_]) -> Verdicts:
+def _judged(model: CostModel, source: MapReader, patches: Patches, on_map: NDArray[np.bool_], *, ask: bool) -> Verdicts:
     bits = reasons_of(patches, on_map, model, source)
-    asked = bits & NO_COST == 0
+    asked = (bits & NO_COST == 0) & ask
     said = predict_patches(model, patches, asked)
     bits[asked & np.isnan(said.velocity_mps)] |= np.uint16(Reason.NO_MOTION)
     known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0

@@ -1,0 +1,349 @@
+"""A whole map's directional costs as files, block by block, resumable, in bounded memory.
+
+::
+
+    cost-map.json                      what it is made from, courses, reasons, shares, checksums
+    power.tif velocity.tif             [W], [m/s]: a band a course, then min, mean, best course
+    duration.tif energy.tif            [s/m], [J/m]: the same
+    reasons.tif                        `Reason` bits: a band a course, then those that all courses share
+    height.tif                         of the cells' middles [m]
+    duration.{yaml,pgm} energy.{…}     Nav2 maps of the mean over the courses
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from shutil import rmtree
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.atomic import atomic_directory, exclusive
+from tcpipe.formats.dataset_files import checksums_to_json
+from tcpipe.formats.geotiff import read_bands, write_cog
+from tcpipe.formats.json_files import digest, read_json, write_json
+from tcpipe.formats.map_files import MapFile
+from tcpipe.formats.nav2_map import HIGHEST, LETHAL, write_nav2_map
+from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
+from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.planning.courses import ANGLES_DEG, COURSES
+from tcpipe.planning.reasons import Reason
+from tcpipe.planning.verdicts import verdicts_of
+from tcpipe.terrain.grid import MapGrid
+
+logger = logging.getLogger("tcpipe")
+
+Floats32 = NDArray[np.float32]
+
+CARD = "cost-map.json"
+KIND = "tcpipe cost map"
+VERSION = "1.0"
+
+_BLOCKS_KEPT = 8
+"""Blocks after which what is done is on disk."""
+
+_QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
+_BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)
+_GREATEST_IS_BEST = "velocity"
+
+
+@dataclass(frozen=True, slots=True)
+class CostMapResult:
+    """What became of a cost map; ``str`` of it is what the command prints."""
+
+    path: Path
+    status: str
+    """``done`` or ``unchanged``."""
+    card: Mapping[str, Any]
+
+    def __str__(self) -> str:
+        """Return where it is and what it holds, as plain lines."""
+        grid, cells = self.card["grid"], self.card["cells"]
+        head = f"{self.path}: {grid['rows']} x {grid['cols']} cells of {grid['pitch_m']:g} m, {COURSES} courses"
+        if self.status == "unchanged":
+            head += "; nothing to do: it is made from the same model, map and step"
+        reasons = ", ".join(
+            f"{name.replace('_', ' ')} {share:.1%}" for name, share in self.card["reason_share"].items()
+        )
+        return "\n".join(
+            (
+                head,
+                f"{cells['with_cost']} cells with a cost, {cells['trusted']} of them on ground the model knows along some course",
+                *((f"cells and courses: {reasons}",) if reasons else ()),
+            )
+        )
+
+
+def cost_map_key(model: CostModel, source: MapFile, step_m: float) -> str:
+    """Return what a cost map is made from, as a digest."""
+    return digest({"model": model.checksum, "map": source.summary(), "step_m": step_m, "version": VERSION})
+
+
+def make_cost_map(
+    model: CostModel,
+    source: MapFile,
+    out: Path,
+    *,
+    step_m: float,
+    step: Callable[[int, int], None] = lambda _, __: None,
+) -> CostMapResult:
+    """Write the cost map of a whole map to ``out``, whole or not at all; an interrupted call goes on where it was.
+
+    Parameters
+    ----------
+    model, source
+        Who predicts, and the map.
+    out
+        Its directory: new, empty, or a cost map, which is replaced unless it is made from the same.
+    step_m
+        Side of a cell in the map's plane [m].
+    step
+        Is told how many blocks of how many are done.
+
+    Raises
+    ------
+    ModelError, MapError
+        The map cannot give what the model wants, is smaller than a cell, or cannot be read.
+    UsageError, StoreError
+        ``out`` is something else, or cannot be written.
+
+    """
+    check_model(model, source)
+    grid, key = grid_over(source, step_m), cost_map_key(model, source, step_m)
+    found = read_cost_map_card(out)
+    if found is None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise UsageError(f"{out}: exists and is no cost map; give another directory with --out")
+    with _claimed(out) as place:
+        found = read_cost_map_card(out)  # another process may have been first
+        if found is not None and found["key"] == key and _is_whole(out, found):
+            return CostMapResult(out, "unchanged", found)
+        spool = _spool(place, key, grid)
+        _fill(model, source, spool, step)
+        about = {"kind": KIND, "version": VERSION, "key": key, "map": source.name, "model": model.checksum}
+        with atomic_directory(out) as directory:
+            card = {**about, "robot": model.robot, **_write(directory, spool.costs)}
+            write_json(directory / CARD, {**card, "checksums": checksums_to_json(directory)})
+        rmtree(place)
+    return CostMapResult(out, "done", card)
+
+
+def read_cost_map_card(path: Path) -> dict[str, Any] | None:
+    """Return the card of a cost map, or None where there is none."""
+    if not (path / CARD).is_file():
+        return None
+    try:
+        card = read_json(path / CARD)
+    except StoreError:
+        return None
+    return card if card.get("kind") == KIND else None
+
+
+def open_cost_map(path: Path, card: Mapping[str, Any]) -> CostGrid:
+    """Read the costs of a cost map into memory; `MapError` names a file that is damaged."""
+    courses = range(1, COURSES + 1)
+    power, velocity, reasons = (read_bands(path / f"{name}.tif", courses) for name in ("power", "velocity", "reasons"))
+    return CostGrid(MapGrid(**card["grid"]), power, velocity, reasons, read_bands(path / "height.tif", (1,))[0])
+
+
+def _is_whole(path: Path, card: Mapping[str, Any]) -> bool:
+    return all(
+        (path / name).is_file() and (path / name).stat().st_size == entry["size_bytes"]
+        for name, entry in card["checksums"].items()
+    )
+
+
+_ARRAYS = ("power_watt", "velocity_mps", "reasons", "height_m")
+
+
+@dataclass(frozen=True, slots=True)
+class _Spool:
+    """Costs in files that outlive an interruption, and which cells are done, (rows · cols,)."""
+
+    costs: CostGrid
+    done: NDArray[np.uint8]
+    files: tuple[np.memmap[Any, Any], ...]
+
+    def keep(self, cells: Cells) -> None:
+        """Put on disk what is known, then that these cells are done."""
+        for file in self.files:
+            file.flush()
+        self.done[cells] = 1
+
+
+@contextmanager
+def _claimed(out: Path) -> Iterator[Path]:
+    """Yield the directory beside ``out`` where its costs wait, for one process at a time; it stays when that is interrupted."""
+    place = out.parent / f".{out.name}.partial"
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StoreError(f"{out}: cannot be written ({error.strerror})") from None
+    with exclusive(place):
+        place.mkdir(exist_ok=True)  # another process may have finished meanwhile
+        yield place
+    with suppress(OSError):
+        place.rmdir()
+
+
+def _spool(place: Path, key: str, grid: MapGrid) -> _Spool:
+    """Return the costs so far, or new files without any."""
+    if _job(place) != key:
+        for file in place.iterdir():
+            file.unlink()
+        nothing = empty_grid(replace(grid, rows=1, cols=1))
+        for name in _ARRAYS:
+            one = getattr(nothing, name)
+            shape = (*one.shape[:-2], grid.rows, grid.cols)
+            array = np.lib.format.open_memmap(place / f"{name}.npy", "w+", one.dtype, shape)
+            with (place / f"{name}.npy").open("r+b") as opened:  # a full disk is an error here, not a crash later
+                os.posix_fallocate(opened.fileno(), 0, array.offset + array.nbytes)
+            array[...] = one
+        np.save(place / "done.npy", np.zeros(grid.rows * grid.cols, np.uint8))
+        write_json(place / "job.json", {"key": key})
+    held = {name: np.load(place / f"{name}.npy", mmap_mode="r+") for name in (*_ARRAYS, "done")}
+    files = tuple(held.values())
+    done = held.pop("done")
+    return _Spool(CostGrid(grid, **held), done, files)
+
+
+def _job(place: Path) -> str | None:
+    try:
+        return str(read_json(place / "job.json")["key"])
+    except (StoreError, KeyError):
+        return None
+
+
+def _fill(model: CostModel, source: MapFile, spool: _Spool, step: Callable[[int, int], None]) -> None:
+    """Ask the model about every cell that is not done."""
+    costs = spool.costs
+    frames = CellFrames(costs.grid, where=f"map {source.name}")
+    missing = (spool.done == 0).reshape(costs.grid.rows, costs.grid.cols)
+    todo = list(blocks(source, model, costs.grid, missing))
+    if not missing.all():
+        logger.info("going on where it was: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
+    ready: list[Cells] = []
+    answers = verdicts_of(model, source, (frames.of(cells) for cells in todo))
+    for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
+        costs.put(cells, found)
+        ready.append(cells)
+        if len(ready) == _BLOCKS_KEPT or number == len(todo):
+            spool.keep(np.concatenate(ready))
+            ready = []
+        step(number, len(todo))
+
+
+def _write(directory: Path, costs: CostGrid) -> dict[str, Any]:
+    """Write all files but the card; return what the card says of them."""
+    grid = costs.grid
+    layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}
+    layout["affine"] = (grid.pitch_m, 0.0, grid.x_min_m, 0.0, -grid.pitch_m, grid.y_max_m)
+    for name, unit in _QUANTITIES.items():
+        bands = [*((band, unit) for band in (*_BAND_NAMES, "min", "mean")), ("best course, ccw from grid east", "deg")]
+        strip = _strip_of(costs, name)
+        write_cog(directory / f"{name}.tif", strip, dtype="float32", nodata=float("nan"), bands=bands, **layout)
+    bands = [(band, "bits") for band in (*_BAND_NAMES, "all courses")]
+    write_cog(directory / "reasons.tif", _reason_strip(costs), dtype="uint16", nodata=None, bands=bands, **layout)
+    height = [("height", "m")]
+    write_cog(
+        directory / "height.tif",
+        lambda first, last: costs.height_m[None, first:last],
+        dtype="float32",
+        nodata=float("nan"),
+        bands=height,
+        **layout,
+    )
+    scales = {name: _write_nav2(directory / f"{name}.yaml", costs, name) for name in ("duration", "energy")}
+    return {
+        "grid": {field: getattr(grid, field) for field in MapGrid.__slots__},
+        "courses_deg": ANGLES_DEG,
+        "bands": {name: [*_BAND_NAMES, "min", "mean", "best course"] for name in _QUANTITIES},
+        "units": _QUANTITIES,
+        "reasons": {str(int(reason)): str(reason.name).lower() for reason in Reason},
+        "nav2_scale": scales,
+        **_shares(costs),
+    }
+
+
+def _values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
+    """Return a quantity of rows, shape (16, rows, cols)."""
+    power, velocity = costs.power_watt[:, first:last], costs.velocity_mps[:, first:last]
+    values = {"power": power, "velocity": velocity}.get(name)
+    if values is None:
+        values = 1.0 / velocity if name == "duration" else power / velocity
+    return np.asarray(values)
+
+
+def _strip_of(costs: CostGrid, name: str) -> Callable[[int, int], Floats32]:
+    def strip(first: int, last: int) -> Floats32:
+        values = _values(costs, name, first, last)
+        known = ~np.isnan(values)
+        some = known.any(axis=0)
+        least = np.where(known, values, np.inf).min(axis=0)
+        worth = np.where(known, -values if name == _GREATEST_IS_BEST else values, np.inf)
+        best = ANGLES_DEG[worth.argmin(axis=0)]
+        more = [np.where(some, band, np.nan) for band in (least, _mean(values), best)]
+        return np.concatenate([values, np.stack(more)]).astype(np.float32)
+
+    return strip
+
+
+def _mean(values: Floats32) -> NDArray[np.float64]:
+    """Return the mean over the courses that have a value; NaN where none has."""
+    known = ~np.isnan(values)
+    count = known.sum(axis=0)
+    total = np.where(known, values, 0.0).sum(axis=0, dtype=np.float64)
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1), np.nan))
+
+
+def _reason_strip(costs: CostGrid) -> Callable[[int, int], NDArray[np.uint16]]:
+    def strip(first: int, last: int) -> NDArray[np.uint16]:
+        bits = np.asarray(costs.reasons[:, first:last])
+        return np.concatenate([bits, np.bitwise_and.reduce(bits, axis=0)[None]])
+
+    return strip
+
+
+_ROWS_TOGETHER = 256
+
+
+def _row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
+    rows = costs.grid.rows
+    yield from ((first, min(first + _ROWS_TOGETHER, rows)) for first in range(0, rows, _ROWS_TOGETHER))
+
+
+def _write_nav2(path: Path, costs: CostGrid, name: str) -> dict[str, float]:
+    """Write the mean over the trusted courses from 0 to `HIGHEST`; return what these two stand for."""
+    means = []
+    for first, last in _row_strips(costs):
+        trusted = costs.reasons[:, first:last] == 0
+        means.append(_mean(np.where(trusted, _values(costs, name, first, last), np.float32(np.nan))))
+    mean = np.concatenate(means)
+    known = np.isfinite(mean)
+    low, high = np.percentile(mean[known], (1.0, 99.0)).tolist() if known.any() else (0.0, 1.0)
+    share = (np.where(known, mean, low) - low) / max(high - low, 1e-9)
+    cost = np.where(known, np.rint(HIGHEST * np.clip(share, 0.0, 1.0)), LETHAL).astype(np.uint8)
+    unit = _QUANTITIES[name]
+    meaning = f"{name} a metre, mean over the courses: 0 is {low:.6g} {unit}, {HIGHEST} is {high:.6g} {unit}, {LETHAL} is not crossed"
+    write_nav2_map(path, cost, costs.grid, meaning=meaning)
+    return {"lowest": low, "highest": high}
+
+
+def _shares(costs: CostGrid) -> dict[str, Any]:
+    """Return how many cells have a cost, and the share of cells and courses that each reason holds."""
+    counts, with_cost, trusted = dict.fromkeys(Reason, 0), 0, 0
+    for first, last in _row_strips(costs):
+        bits = np.asarray(costs.reasons[:, first:last])
+        with_cost += int(np.count_nonzero((~np.isnan(costs.velocity_mps[:, first:last])).any(axis=0)))
+        trusted += int(np.count_nonzero((bits == 0).any(axis=0)))
+        for reason in counts:
+            counts[reason] += int(np.count_nonzero(bits & reason))
+    shares = {str(reason.name).lower(): count / costs.reasons.size for reason, count in counts.items() if count}
+    cells = {"all": costs.grid.rows * costs.grid.cols, "with_cost": with_cost, "trusted": trusted}
+    return {"cells": cells, "reason_share": shares, "barred_by": [str(r.name).lower() for r in Reason if r & BARRED]}

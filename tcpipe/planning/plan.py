@@ -1,0 +1,233 @@
+"""The least-cost path between two points (the paper's purpose, section I), proved against all the ground that was not looked at.
+
+A path over a point p is at least as long as the straight ways start-p-goal. So once a path of cost C is found, no point can lie on a
+better one for which that length times the cheapest metre exceeds C: all others are inside an ellipse. The ellipse is looked at, first
+without predictions (what can be driven at all, and the shortest way), then with; it grows until it holds every point that could matter, as
+long as no metre outside is cheaper than the cheapest inside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.errors import PathError
+from tcpipe.planning.cost_grid import BARRED
+from tcpipe.planning.path_cost import PathCost, cost_of_path, extent_text, projection_of
+from tcpipe.planning.reasons import names_of
+from tcpipe.planning.search import Found, least_cost_path, steps_of
+from tcpipe.planning.straight import straightened
+from tcpipe.planning.survey import Mask, Survey
+from tcpipe.terrain.classes import NODATA_ID
+from tcpipe.terrain.point_classes import classes_at
+
+Floats = NDArray[np.float64]
+Objective = Literal["energy", "time", "distance"]
+
+OBJECTIVES: tuple[Objective, ...] = ("energy", "time", "distance")
+
+_FIRST = 1.3
+"""The first ellipse is of all points that make the straight way no longer than so many times."""
+
+_GROWTH = 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A path, what it costs, and how it was found.
+
+    Attributes
+    ----------
+    objective : what it is the least of.
+    lonlat_deg, xy_m : its points, WGS 84 and in the map's CRS, shape (P, 2); from the start as given to the goal as given.
+    cost : what `tcpipe predict-path` says of it.
+    grid_cost : what it costs on the grid of cells, in the objective's unit.
+    predicted_cells : cells that the model was asked about.
+    negative_steps : steps that give back more than height explains, taken as free.
+    """
+
+    objective: Objective
+    lonlat_deg: Floats
+    xy_m: Floats
+    cost: PathCost
+    grid_cost: float
+    predicted_cells: int
+    negative_steps: int
+
+    def properties(self) -> dict[str, Any]:
+        """Return what a GeoJSON feature says of it."""
+        facts: Mapping[str, Any] = self.cost.summary()
+        return {
+            "objective": self.objective,
+            **facts,
+            "grid_cost": self.grid_cost,
+            "predicted_cells": self.predicted_cells,
+            "negative_steps": self.negative_steps,
+        }
+
+
+def plan_path(
+    survey: Survey,
+    start_deg: Floats,
+    goal_deg: Floats,
+    objective: Objective,
+    *,
+    allow_unseen: bool = False,
+    step: Callable[[int, int], None] = lambda _, __: None,
+) -> Plan:
+    """Return the least-cost path from a point to another.
+
+    Parameters
+    ----------
+    survey
+        The map and the model, and what is known so far; it learns what it lacks.
+    start_deg, goal_deg
+        Longitude and latitude, WGS 84 [deg], shape (2,).
+    objective
+        What is to be least.
+    allow_unseen
+        Whether ground unlike any that the model was trained on may be crossed.
+    step
+        Is told how many blocks of how many are predicted.
+
+    Raises
+    ------
+    PathError
+        Start or goal is off the map, cannot be stood on, or there is no way between them.
+
+    """
+    ends_xy_m = projection_of(survey.source).forward(np.stack([start_deg, goal_deg]))
+    search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_unseen, step)
+    search.check_ends()
+    bound_m, shortest = search.shortest()
+    found = shortest if objective == "distance" else search.best(objective, bound_m)
+    xy_m, grid_cost = search.straight(found, objective)
+    lonlat = projection_of(survey.source).inverse(xy_m)
+    cost = cost_of_path(survey.model, survey.source, lonlat, where="the planned path")
+    predicted = int(np.count_nonzero(survey.predicted))
+    return Plan(objective, lonlat, xy_m, cost, grid_cost, predicted, found.negative_steps)
+
+
+@dataclass(frozen=True, slots=True)
+class _Search:
+    survey: Survey
+    ends_xy_m: Floats
+    ends_deg: Floats
+    allow_unseen: bool
+    step: Callable[[int, int], None]
+
+    @property
+    def _cells(self) -> NDArray[np.int64]:
+        """Flat indices of the cells of start and goal."""
+        grid = self.survey.costs.grid
+        col, row = np.floor(grid.px_from_xy(self.ends_xy_m) + 0.5).astype(np.int64).T
+        return np.asarray(np.clip(row, 0, grid.rows - 1) * grid.cols + np.clip(col, 0, grid.cols - 1))
+
+    def check_ends(self) -> None:
+        """Raise `PathError` for ends off the map, on ground that cannot be driven, or nearer than a chord; both at once."""
+        source, problems = self.survey.source, []
+        labels = [
+            f"--{name} {lon:.6f},{lat:.6f}" for name, (lon, lat) in zip(("from", "to"), self.ends_deg, strict=True)
+        ]
+        on = np.isfinite(self.ends_xy_m).all(axis=1) & source.grid.contains(
+            np.nan_to_num(self.ends_xy_m, posinf=np.inf)
+        )
+        problems += [
+            f"{label}: is not on map {source.name} ({extent_text(source)}); longitude comes first"
+            for label, inside in zip(labels, on, strict=True)
+            if not inside
+        ]
+        if problems:
+            raise PathError(*problems)
+        if "terrain" in source.layers:
+            names, may = source.classes.names(), source.classes.traversable()
+            for label, class_id in zip(labels, classes_at(source, self.ends_xy_m).tolist(), strict=True):
+                if class_id == NODATA_ID:
+                    problems.append(f"{label}: map {source.name} has no data there")
+                elif not may[class_id]:
+                    problems.append(f"{label}: stands on {names[class_id]}, which is not traversable")
+        apart_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]))
+        if apart_m < self.survey.model.chord_m:
+            problems.append(
+                f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; wanted at least {self.survey.model.chord_m:g} m"
+            )
+        if problems:
+            raise PathError(*problems)
+
+    def _ellipse(self, bound_m: float) -> Mask:
+        """Return the cells over which a path from start to goal need not be longer than ``bound_m``, and those beside the ends."""
+        grid = self.survey.costs.grid
+        scale = self._metres().max()
+        x = grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pitch_m
+        y = grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pitch_m
+        away = sum(np.hypot(x[None, :] - end[0], y[:, None] - end[1]) for end in self.ends_xy_m)
+        return np.asarray(away * scale <= bound_m + 4.0 * grid.pitch_m)
+
+    def _metres(self) -> Floats:
+        return self.survey.frames.metres(self._cells)
+
+    def _found(self, objective: Objective, known: Mask) -> Found | None:
+        costs, (start, goal) = self.survey.costs, self._cells.tolist()
+        open_ = costs.open_courses(allow_unseen=self.allow_unseen) & known
+        if start == goal or not open_.any():
+            return None
+        steps = steps_of(costs, objective, open_, self._metres())
+        return least_cost_path(steps, costs.grid.rows * costs.grid.cols, start, goal)
+
+    def shortest(self) -> tuple[float, Found]:
+        """Return the shortest way that can be driven, and its length; only the ground is looked at."""
+        straight_m = float(np.linalg.norm(self.ends_xy_m[1] - self.ends_xy_m[0]) * self._metres().max())
+        bound_m = straight_m * _FIRST
+        while True:
+            ellipse = self._ellipse(bound_m)
+            self.survey.judge(ellipse, self.step)
+            found = self._found("distance", self.survey.judged)
+            if found is not None and (found.cost <= bound_m or ellipse.all()):
+                return found.cost, found
+            if ellipse.all():
+                raise PathError(self._no_way())
+            bound_m = max(bound_m * _GROWTH, found.cost if found else 0.0)
+
+    def best(self, objective: Objective, bound_m: float) -> Found:
+        """Return the least-cost path; the model is asked about every cell that could be on it."""
+        while True:
+            ellipse = self._ellipse(bound_m)
+            self.survey.predict(ellipse, self.step)
+            found = self._found(objective, self.survey.predicted)
+            if found is None and ellipse.all():
+                raise PathError(self._no_way())
+            reach_m = found.reduced_cost / found.cheapest_per_m if found and found.cheapest_per_m > 0.0 else np.inf
+            if found and (reach_m <= bound_m or ellipse.all()):
+                return found
+            bound_m = min(bound_m * _GROWTH, reach_m) if found else bound_m * _GROWTH
+
+    def straight(self, found: Found, objective: Objective) -> tuple[Floats, float]:
+        """Return the path's points in the map's CRS [m], from end to end as they were given, and its cost; bends that cost are left out."""
+        costs = self.survey.costs
+        row, col = np.divmod(found.cells, costs.grid.cols)
+        points = np.stack([col, row], axis=1).astype(np.float64)
+        points[[0, -1]] = costs.grid.px_from_xy(self.ends_xy_m)
+        open_ = costs.open_courses(allow_unseen=self.allow_unseen) & (objective == "distance" or self.survey.predicted)
+        kept, cost = straightened(costs, objective, open_, self._metres(), points)
+        return costs.grid.xy_from_px(kept), cost
+
+    def _no_way(self) -> str:
+        """Say why there is no way: what start and goal stand on, or what lies between."""
+        reasons = self.survey.costs.reasons.reshape(len(self.survey.costs.reasons), -1)
+        forbidden = BARRED if self.allow_unseen else 0xFFFF
+        for name, cell in zip(("from", "to"), self._cells.tolist(), strict=True):
+            shut = [int(bits) & forbidden for bits in reasons[:, cell]]
+            if all(shut):
+                common = names_of(int(np.bitwise_and.reduce(shut))) or names_of(int(np.bitwise_or.reduce(shut)))
+                words = ", ".join(reason.replace("_", " ") for reason in common)
+                return f"--{name}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point"
+        text = f"there is no way from start to goal on map {self.survey.source.name}"
+        if not self.allow_unseen:
+            other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_unseen=True, step=self.step)
+            if other._found("distance", self.survey.judged) is not None:
+                return f"{text} but over ground unlike any that the model was trained on; --allow-unseen crosses it"
+        return f"{text}: what lies between cannot be driven over, or has no data"

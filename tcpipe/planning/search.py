@@ -1,0 +1,151 @@
+"""Least-cost paths over a cost grid: scipy's Dijkstra on a sparse graph of 16 courses (docs/adr, Courses and edge costs).
+
+The cost of a step is the integral of the cost a metre, along the step's course, over the cells it crosses. Down a slope energy comes back
+and a metre may cost less than nothing, which Dijkstra forbids. A potential that is proportional to height takes the grade out: with
+c' = c - k (h_b - h_a) all paths from a start to a goal change by the same amount, so the best one stays the best, and k is chosen so that
+the cheapest metre is as dear as it can be. What is negative even then, a metre that gives back more than it was lifted for, is taken as
+nothing, and counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from tcpipe.planning.cost_grid import CostGrid
+from tcpipe.planning.courses import COURSES, MOVES, touches
+
+Floats = NDArray[np.float64]
+
+_LEAST = 1e-9
+"""Steps that cost nothing cost this: a zero is no edge to scipy."""
+
+_BINS = 512
+_FLAT = 1e-9
+_STEEPEST_PER_M = 1e5
+"""No robot's weight over its drive's efficiency is above this [N]: ten tonnes."""
+
+_PRECISION = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """All steps between neighbouring cells that can be made.
+
+    Attributes
+    ----------
+    begin, end : flat indices of cells, shape (M,).
+    cost : of the step, in the objective's unit, shape (M,).
+    length_m : on the ground [m], shape (M,).
+    rise_m : height of the end above the begin [m], shape (M,).
+    """
+
+    begin: NDArray[np.int64]
+    end: NDArray[np.int64]
+    cost: Floats
+    length_m: Floats
+    rise_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A least-cost path: flat indices of its cells, its cost, and what bounds it (see `reach`)."""
+
+    cells: NDArray[np.int64]
+    cost: float
+    reduced_cost: float
+    cheapest_per_m: float
+    negative_steps: int
+
+
+def steps_of(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: Floats) -> Steps:
+    """Return every step along every course.
+
+    Parameters
+    ----------
+    costs, objective
+        What a metre costs.
+    open_
+        Where a course may be driven, shape (16, rows, cols): cells a step only touches at a corner must be open, too.
+    metres
+        Ground metres a map metre along each course, shape (16,).
+    """
+    rows, cols = costs.grid.rows, costs.grid.cols
+    per_metre = costs.per_metre(objective)
+    height = np.nan_to_num(costs.height_m.astype(np.float64), nan=_middle(costs))
+    parts: list[tuple[NDArray[np.int64], NDArray[np.int64], Floats, Floats, Floats]] = []
+    for course in range(COURSES):
+        east, north = MOVES[course].tolist()
+        length_m = float(np.hypot(east, north)) * costs.grid.pitch_m * float(metres[course])
+        row0, row1 = max(north, 0), rows + min(north, 0)  # rows run south
+        col0, col1 = max(-east, 0), cols - max(east, 0)
+        if row0 >= row1 or col0 >= col1:
+            continue
+        can = np.ones((row1 - row0, col1 - col0), np.bool_)
+        mean = np.zeros(can.shape)
+        for touch in touches(course):
+            part = (slice(row0 - touch.north, row1 - touch.north), slice(col0 + touch.east, col1 + touch.east))
+            can &= open_[course][part]
+            if touch.share:
+                mean += touch.share * np.where(open_[course][part], per_metre[course][part], 0.0)
+        i, j = np.nonzero(can)
+        begin = (i + row0) * cols + j + col0
+        end = begin - north * cols + east
+        rise = height.reshape(-1)[end] - height.reshape(-1)[begin]
+        parts.append((begin, end, mean[i, j] * length_m, np.full(i.size, length_m), rise))
+    return Steps(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _middle(costs: CostGrid) -> float:
+    known = costs.height_m[np.isfinite(costs.height_m)]
+    return float(np.median(known)) if known.size else 0.0
+
+
+def best_potential(steps: Steps) -> float:
+    """Return k, the potential a metre of height, that makes the cheapest metre of ``steps`` as dear as can be: a concave search.
+
+    Metres of about the same grade are taken as their cheapest at either end of the bin, so that a step is never dearer than it is.
+    """
+    per_m, grade = steps.cost / steps.length_m, steps.rise_m / steps.length_m
+    if not grade.size or float(np.ptp(grade)) < _FLAT:
+        return 0.0
+    edges = np.linspace(grade.min(), grade.max(), _BINS + 1)
+    cheapest = np.full(_BINS, np.inf)
+    np.minimum.at(cheapest, np.clip(np.searchsorted(edges, grade, side="right") - 1, 0, _BINS - 1), per_m)
+    used = np.isfinite(cheapest)
+    grades, costs = np.concatenate([edges[:-1][used], edges[1:][used]]), np.tile(cheapest[used], 2)
+    low, high = -_STEEPEST_PER_M, _STEEPEST_PER_M
+    while high - low > _PRECISION:
+        a, b = low + (high - low) / 3.0, high - (high - low) / 3.0
+        low, high = (a, high) if (costs - a * grades).min() < (costs - b * grades).min() else (low, b)
+    return 0.5 * (low + high)
+
+
+def least_cost_path(steps: Steps, cells: int, start: int, goal: int) -> Found | None:
+    """Return the least-cost path from a cell to another (flat indices of ``cells`` in all); None where there is none."""
+    if not steps.cost.size:
+        return None
+    k = best_potential(steps)
+    reduced = steps.cost - k * steps.rise_m
+    negative = int(np.count_nonzero(reduced < 0.0))
+    graph = csr_array((np.maximum(reduced, _LEAST), (steps.begin, steps.end)), shape=(cells, cells))
+    cost, before = dijkstra(graph, indices=start, return_predecessors=True)
+    if not np.isfinite(cost[goal]):
+        return None
+    path = [goal]
+    while path[-1] != start:
+        path.append(int(before[path[-1]]))
+    order = np.array(path[::-1])
+    total = float(path_cost(steps, order, cells))
+    cheapest = max(float((reduced / steps.length_m).min()), 0.0)
+    return Found(order, total, float(cost[goal]), cheapest, negative)
+
+
+def path_cost(steps: Steps, path: NDArray[np.int64], cells: int) -> float:
+    """Return the summed cost of the steps of a path."""
+    taken = np.isin(steps.begin * cells + steps.end, path[:-1] * cells + path[1:])
+    return float(steps.cost[taken].sum())
