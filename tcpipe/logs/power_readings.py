@@ -9,8 +9,20 @@ from typing import Any, Literal
 import numpy as np
 
 from tcpipe.logs.messages import LOG_TIME, Columns, Floats, Readings, header_ns
-from tcpipe.logs.power_sources import PowerSource, Rail, power_source, read_rails, sign_by_mean, why_refused, with_sign
+from tcpipe.logs.power_sources import (
+    LARGEST_AMP,
+    PowerSource,
+    Rail,
+    power_source,
+    read_rails,
+    sign_by_mean,
+    why_refused,
+    with_sign,
+)
 from tcpipe.logs.profiles import Robot
+
+_OF_USUAL_VOLTAGE = (0.2, 3.0)
+"""A battery's voltage stays within these shares of its median."""
 
 CurrentSign = Literal["auto", "drawn_positive", "drawn_negative"]
 
@@ -66,8 +78,12 @@ def read_power(
     refused = refused or _incomplete([rail for found in rails.values() for rail in found])
     if refused:
         return PowerReadings(warnings=tuple(f"power refused: {why}; there will be no energy" for why in refused))
+    rails, odd = _believable(rails)
     log_times = {topic: np.asarray(columns[LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
     sign, warnings, facts = _sign(rails, log_times, sources, current_sign)
+    if sign == 0:
+        return PowerReadings(warnings=tuple(warnings))
+    warnings += odd
     warnings += [f"power: {source.includes} are part of it" for source in sources if source.includes]
     return PowerReadings(
         {
@@ -108,16 +124,48 @@ def _incomplete(rails: list[Rail]) -> list[str]:
     return missing
 
 
+def _believable(rails: Mapping[str, list[Rail]]) -> tuple[dict[str, list[Rail]], list[str]]:
+    """Return the rails with NaN for single values that no battery and no drive has (saturated, lost), and a line on each rail.
+
+    Without current a low voltage may be true: a drive that is not switched on yet tells zeros.
+    """
+    kept: dict[str, list[Rail]] = {}
+    lines = []
+    for topic, found in rails.items():
+        kept[topic] = []
+        for rail in found:
+            known = rail.voltage_volt[np.isfinite(rail.voltage_volt)]
+            usual = float(np.median(known)) if known.size else np.nan
+            low_volt, high_volt = usual * _OF_USUAL_VOLTAGE[0], usual * _OF_USUAL_VOLTAGE[1]
+            odd_volt = ((rail.voltage_volt < low_volt) & (rail.current_amp != 0.0)) | (rail.voltage_volt > high_volt)
+            odd_amp = np.abs(rail.current_amp) > LARGEST_AMP
+            counts = [(odd_volt, f"voltages outside {low_volt:.0f} to {high_volt:.0f} V")]
+            counts += [(odd_amp, f"currents above {LARGEST_AMP:.0f} A")]
+            said = [f"{np.count_nonzero(odd)} {what}" for odd, what in counts if odd.any()]
+            if said:
+                lines.append(f"power: {rail.name}: {' and '.join(said)} are set aside")
+            volt, amp = np.where(odd_volt, np.nan, rail.voltage_volt), np.where(odd_amp, np.nan, rail.current_amp)
+            kept[topic].append(replace(rail, voltage_volt=volt, current_amp=amp))
+    return kept, lines
+
+
 def _sign(
     rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
 ) -> tuple[int, list[str], dict[str, Any]]:
+    """Return what makes a drawn current positive (0 where the record contradicts its type), warnings and facts."""
     if given != "auto":
         return (1 if given == "drawn_positive" else -1), [], {"current_sign": f"{given} (recipe)"}
-    if all(source.sign for source in sources):
-        return 1, [], {"current_sign": "drawn_positive (message type)"}
     time_s, whole = _whole_current(rails, log_times)
     sign, one_sided = sign_by_mean(whole, np.gradient(time_s) if len(time_s) > 1 else np.ones_like(time_s))
     share = f"{100 * abs(one_sided):.0f} % of the charge moved"
+    if all(source.sign for source in sources):
+        if sign >= 0:
+            return 1, [], {"current_sign": "drawn_positive (message type)"}
+        why = f"power refused: the current is negative, {share} flows back; there will be no energy"
+        cure = (
+            'if this robot counts drawn current so, write in the recipe under [read]: current_sign = "drawn_negative"'
+        )
+        return 0, [f'{why}; {cure}; if it truly rolled downhill throughout: "drawn_positive"'], {}
     if sign > 0:
         why = f"power: the current counts as positive when drawn, against the ROS convention: {share} is positive"
         return (

@@ -160,6 +160,11 @@ def quantity(topic: str) -> Literal["voltage", "current"] | None:
     return "voltage" if found[-1].startswith("v") else "current"
 
 
+def bare_unit(type_name: str, topic: str) -> str | None:
+    """Return the unit of a bare number on a topic, V or A, None where neither its type nor the name says so."""
+    return {"voltage": "V", "current": "A", None: None}[quantity(topic) if type_name in FLOAT_TYPES else None]
+
+
 def rail_of(topic: str) -> str:
     """Return the rail's name: the topic's without its quantity, so that a rail's voltage and current share it."""
     return _QUANTITY.sub("", topic.lower().removesuffix(_CORRECTED)).rstrip("/_")
@@ -258,13 +263,13 @@ def _against_current(current: Floats) -> str | None:
     if len(current) > _MIN_ROWS_TO_JUDGE and np.ptp(current) == 0:
         return f"the current is {current[0]:g} A on all {len(current)} rows"
     typical_amp = float(np.median(np.abs(current))) if len(current) else 0.0
-    if typical_amp > _LARGEST_AMP:
+    if typical_amp > LARGEST_AMP:
         return f"the median current is {typical_amp:g} A (milliamperes?)"
     return None
 
 
 _LARGEST_VOLT = 1000.0
-_LARGEST_AMP = 1000.0
+LARGEST_AMP = 1000.0
 _MIN_ROWS_TO_JUDGE = 20
 _UNAMBIGUOUS = 0.8
 

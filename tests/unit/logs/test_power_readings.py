@@ -165,7 +165,31 @@ def test_a_warthogs_negative_currents_come_as_unsigned(robot: str) -> None:
     found = read_power(topics, ROBOTS[robot])
     name = columns_of("/left_drive/status/battery")[1]
     recorded = found.readings["/left_drive/status/battery_current"].columns[name]
-    np.testing.assert_array_equal(recorded, current if robot == "warthog" else current % 4096)
+    np.testing.assert_array_equal(recorded, current if robot == "warthog" else current[current > 0])
+    assert any("currents above 1000 A are set aside" in line for line in found.warnings) == (robot == "generic")
+
+
+def test_single_values_that_no_battery_has_are_set_aside() -> None:
+    columns = battery(VOLT.copy(), AMP.copy())
+    columns["voltage"][[4, 9]] = 65.535e3, 0.0
+    columns["current"][7] = -32768.0
+    columns["voltage"][12] = columns["current"][12] = 0.0  # switched off: nothing is drawn
+    found = read_power({"/b": (BATTERY_STATE, columns)}, ROBOTS["generic"])
+    volt, amp = (found.readings["/b"].columns[name] for name in columns_of("/b"))
+    assert np.flatnonzero(np.isnan(volt)).tolist() == [4, 9]
+    assert np.flatnonzero(np.isnan(amp)).tolist() == [7]
+    assert "2 voltages outside 5 to 78 V and 1 currents above 1000 A are set aside" in found.warnings[-1]
+
+
+def test_a_current_against_its_type_is_refused_until_the_recipe_says_how_it_counts() -> None:
+    columns = husky_status()
+    columns = {**columns, **{name: -value for name, value in columns.items() if name.endswith("driver_current")}}
+    topics = {"/status": (HUSKY_STATUS, columns)}
+    found = read_power(topics, ROBOTS["husky"])
+    assert found.readings == {}
+    assert 'current_sign = "drawn_negative"' in found.warnings[0]
+    told = read_power(topics, ROBOTS["husky"], current_sign="drawn_negative")
+    np.testing.assert_allclose(power_watt(told), VOLT * (2 * AMP + 1.0))
 
 
 def test_rows_that_carry_nothing_are_counted() -> None:
