@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import mmap
 import os
+import struct
 import threading
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,9 @@ _PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO = 1 << 26, 1000
 """What claims to hold more than both so many bytes and so many times its compressed size is taken for damaged: a bomb."""
 SEARCH_BYTES = 1 << 20
 
+_LZ4_HEAD = struct.Struct("<4sBBQ")
+"""An LZ4 frame's first fields: magic, flags, block size, size of the content."""
+_LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 14
 _GAP_BYTES = 1 << 15
 """Pieces of a file that lie no further apart are read as one."""
@@ -158,6 +162,15 @@ class ByteSource:
         found = os.preadv(self._file.fileno(), [view], offset)
         return view if found == size else self.read(offset, size)
 
+    def read_pieces(self, pieces: Sequence[tuple[int, memoryview]]) -> None:
+        """Fill each view with the bytes at its offset; what lies between them is not read. `DamageError` as `read`."""
+        self.skips()
+        for offset, view in pieces:
+            os.posix_fadvise(self._file.fileno(), offset, len(view), os.POSIX_FADV_WILLNEED)
+        for offset, view in pieces:
+            if os.preadv(self._file.fileno(), [view], offset) != len(view):
+                view[:] = self.read(offset, len(view))
+
     def peek(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes at ``offset`` (fewer at the end); cheap for many small, mostly ascending reads."""
         at, held = self._peeked  # one assignment below: threads may lose each other's piece, never mix two
@@ -233,7 +246,7 @@ def search_windows(start: int, end: int, overlap: int) -> Iterator[tuple[int, in
         start, size = start + size, min(2 * size, SEARCH_BYTES)
 
 
-def decompressed(codec: str, data: memoryview, size: int) -> memoryview:
+def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
     """Return the ``size`` bytes that ``data`` holds.
 
     Parameters
@@ -244,6 +257,8 @@ def decompressed(codec: str, data: memoryview, size: int) -> memoryview:
         The compressed bytes.
     size
         How many bytes they hold.
+    checked
+        A checksum of the result is compared afterwards.
 
     Raises
     ------
@@ -257,8 +272,8 @@ def decompressed(codec: str, data: memoryview, size: int) -> memoryview:
     if codec not in ("lz4", "zstd", "bz2"):
         raise DamageError(f"its compression {codec!r} is unknown (lz4, zstd and bz2 are read)")
     try:
-        if codec == "zstd":
-            return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec))
+        if codec == "zstd" or (codec == "lz4" and (checked or _lz4_content_bytes(data) == size)):
+            return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec)).cast("B")
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
             found = stream.read_buffer(size)
             more = stream.read(1)  # also brings the reading to the end, where checksums are compared
@@ -266,7 +281,17 @@ def decompressed(codec: str, data: memoryview, size: int) -> memoryview:
         raise DamageError(f"it does not decompress ({error})") from None
     if len(found) != size or more:
         raise DamageError(f"it holds {'more' if more else f'{len(found)} bytes'}, not the {size} bytes it claims")
-    return memoryview(found)
+    return memoryview(found).cast("B")
+
+
+def _lz4_content_bytes(frame: memoryview) -> int:
+    """Return what an LZ4 frame says of its content's size, which decompressing proves; -1 where it says nothing.
+
+    Without either this or a checksum, what a frame lacks of the size that a chunk claims would be whatever lay in memory before.
+    """
+    if len(frame) < _LZ4_HEAD.size or frame[:4] != _LZ4_MAGIC or not frame[4] & _LZ4_HAS_CONTENT_SIZE:
+        return -1
+    return int(_LZ4_HEAD.unpack_from(frame)[3])
 
 
 def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
@@ -282,7 +307,7 @@ def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
     return memoryview(b"".join(pieces)[:size])
 
 
-def gathered(buffer: memoryview, offsets: Int64Array, code: str) -> Int64Array:
+def gathered(buffer: bytes | memoryview, offsets: Int64Array, code: str) -> Int64Array:
     """Return the little-endian integers (numpy's ``code``: ``u2``, ``u4``, ``i8``) that lie at ``offsets``, of any alignment.
 
     The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the sign bit, and

@@ -6,13 +6,16 @@ covers) is believed only as far as the chunk's own records bear it out.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from isal.isal_zlib import crc32
+from numpy.typing import NDArray
 
+from tcpipe.formats.chunk_runs import MAX_PLANNED_BYTES, Entries, Run, by_place, groups, pieces, runs
 from tcpipe.formats.log_part import (
     MAX_CHUNK_BYTES,
     ByteSource,
@@ -45,10 +48,13 @@ from tcpipe.formats.mcap_records import (
     RECORD_HEAD,
     ChannelRecord,
     Chunk,
-    Messages,
     Schema,
     Statistics,
+    borne_out,
     index_entries,
+    index_messages,
+    message_blocks,
+    message_heads,
     message_offsets,
     parse_channel,
     parse_chunk_head,
@@ -128,68 +134,123 @@ class McapPart:
         return f"{len(self._without_crc)} of {len(self._read_chunks)} chunks read carry no CRC"
 
     def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels, chunk by chunk."""
+        """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
         if not self._complete:
             self._fill_gaps()
 
         if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
             self._bytes.skips()
 
-        def read(piece: tuple[int, Chunk]) -> tuple[Chunk, list[MessageBlock], DamageError | None]:
-            base, chunk = piece
-            try:
-                return chunk, self._chunk_blocks(chunk, wanted, base), None
-            except DamageError as error:
-                return chunk, [], error
+        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[tuple[Chunk, DamageError]]]:
+            lost: list[tuple[Chunk, DamageError]] = []
+            return list(self._run_blocks(run, wanted, lost)), lost
 
-        for chunk, blocks, error in in_order(read, self._wanted_chunks(wanted), threads=threads):
-            self._read_chunks.add(chunk.offset)
-            if error:
+        for blocks, lost in in_order(read, self._runs(wanted), threads=threads):
+            for chunk, error in lost:
                 self._note_lost(chunk, str(error))
             yield from blocks
 
-    def _wanted_chunks(self, wanted: frozenset[int]) -> Iterator[tuple[int, Chunk]]:
-        """Yield the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
-        base = 0
+    def _wanted_chunks(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
+        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
+        base, found = 0, []
         for chunk in self._contents.chunks:
             if chunk.index is None or not wanted.isdisjoint(chunk.index):
-                yield base, chunk
-            base += chunk.uncompressed_bytes
+                found.append((base, chunk))
+            base += min(chunk.size, MAX_CHUNK_BYTES)
+        return found
 
-    def _chunk_blocks(self, chunk: Chunk, wanted: frozenset[int], base: int) -> list[MessageBlock]:
-        head = b"" if chunk.headless else self._bytes.read(chunk.offset, chunk.data_offset - chunk.offset)
-        if chunk.headless or not any(head[CHUNK_CRC]):
+    def _runs(self, wanted: frozenset[int]) -> Iterator[_ChunkRun]:
+        """Yield what to read at once; the indexes of some chunks are read ahead."""
+        chunks = self._wanted_chunks(wanted)
+        for group in groups(chunk.size for _, chunk in chunks):
+            members = chunks[group.start : group.stop]
+            sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
+            entries, sound = self._entries([chunk for _, chunk in members], sizes)
+            for run in runs(entries, sizes, sound, sorted(wanted)):
+                yield _ChunkRun(run, members)
+
+    def _run_blocks(
+        self, run: _ChunkRun, wanted: frozenset[int], lost: list[tuple[Chunk, DamageError]]
+    ) -> Iterator[MessageBlock]:
+        """Yield the wanted messages of a run; a chunk that is lost is added to ``lost``."""
+        doubtful = list(run.plan.chunks)
+        if run.plan.entries is not None:
+            data, offsets, entries = self._excerpt(run, run.plan.entries, lost)
+            heads = message_heads(data, offsets)
+            true = borne_out(heads, entries)
+            doubtful = np.unique(entries.chunk[~true]).tolist()
+            if doubtful:
+                true = ~np.isin(entries.chunk, doubtful)
+                offsets, heads, entries = offsets[true], heads[true], entries.at(true)
+            yield from message_blocks(data, offsets, heads, run.bases[entries.chunk] + entries.offset)
+        for number in doubtful:
+            base, chunk = run.members[number]
+            try:
+                data = self._load(chunk)
+            except DamageError as error:
+                lost.append((chunk, error))
+            else:
+                offsets = _wanted_messages(data, wanted)
+                yield from message_blocks(data, offsets, message_heads(data, offsets), offsets + base)
+
+    def _excerpt(
+        self, run: _ChunkRun, entries: Entries, lost: list[tuple[Chunk, DamageError]]
+    ) -> tuple[memoryview, Int64Array, Entries]:
+        """Return bytes in which a run's messages lie, where in them each begins, and which they are (all but those that are lost)."""
+        kept = pieces(entries) if run.plan.compact else None
+        data = np.empty(kept.size if kept else 0, np.uint8).data
+        gone = []
+        for number in run.plan.chunks:
+            _, chunk = run.members[number]
+            try:
+                if kept:
+                    self._take_pieces(chunk, kept.of(number), data)
+                else:
+                    data = self._load(chunk)
+            except DamageError as error:
+                lost.append((chunk, error))
+                gone.append(number)
+        offsets = kept.offset if kept else entries.offset
+        if gone:
+            left = ~np.isin(entries.chunk, gone)
+            return data, offsets[left], entries.at(left)
+        return data, offsets, entries
+
+    def _take_pieces(self, chunk: Chunk, wanted: Iterator[tuple[int, int, int]], to: memoryview) -> None:
+        """Copy pieces (start, stop, place) of a chunk; what need not be read as a whole, to check or decompress it, is not."""
+        if chunk.compression or self._crc(chunk):
+            data = self._load(chunk, once=True)
+            for start, stop, place in wanted:
+                to[place : place + stop - start] = data[start:stop]
+            return
+        self._note_read(chunk, checked=False)
+        self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in wanted])
+
+    def _crc(self, chunk: Chunk) -> int:
+        """Return the CRC of a chunk's records; 0 where there is none."""
+        if chunk.headless:
+            return 0
+        return int.from_bytes(self._bytes.read(chunk.offset + CHUNK_CRC, 4), "little")
+
+    def _note_read(self, chunk: Chunk, *, checked: bool) -> None:
+        self._read_chunks.add(chunk.offset)
+        if not checked:
             self._without_crc.add(chunk.offset)
-        skipping = not chunk.headless and self._may_skip(chunk, head)
-        index = self._indexes(chunk, None if skipping else wanted)
-        data = self._load(chunk, head, _pieces(chunk, index, wanted) if skipping else None)
-        messages = _indexed(data, index, wanted)
-        return (_walked(data, wanted) if messages is None else messages).blocks(data, base)
 
-    @staticmethod
-    def _may_skip(chunk: Chunk, head: bytes | memoryview) -> bool:
-        """Return whether nothing compels to read all of a chunk: it is neither compressed nor does a CRC want checking."""
-        return not (chunk.compression or chunk.cut or any(head[CHUNK_CRC]))
-
-    def _load(
-        self, chunk: Chunk, head: bytes | memoryview, pieces: tuple[Int64Array, Int64Array] | None = None
-    ) -> memoryview:
+    def _load(self, chunk: Chunk, *, once: bool = False) -> memoryview:
         """Return the chunk's records, its CRC checked; of a chunk that the file's end cuts, what can still be had.
 
-        Where not all of it must be read, hardly more than ``pieces`` (starts, ends) is read from the disk.
+        With ``once`` they may be overwritten when this thread reads again.
         """
-        if chunk.headless:
-            return self._bytes.read(chunk.data_offset, chunk.data_bytes)
+        crc = self._crc(chunk)
+        self._note_read(chunk, checked=bool(crc))
         if chunk.cut:
             return self._load_cut(chunk, self._bytes.read(chunk.data_offset, chunk.data_bytes))
-        if self._may_skip(chunk, head):
-            return self._bytes.mapped(chunk.data_offset, chunk.data_bytes, pieces)
         if chunk.compression:
             data = self._bytes.read_once(chunk.data_offset, chunk.data_bytes)
-            data = decompressed(chunk.compression, data, chunk.uncompressed_bytes)
+            data = decompressed(chunk.compression, data, chunk.uncompressed_bytes, checked=bool(crc))
         else:
-            data = self._bytes.read(chunk.data_offset, chunk.data_bytes)
-        crc = int.from_bytes(head[CHUNK_CRC], "little")
+            data = (self._bytes.read_once if once else self._bytes.read)(chunk.data_offset, chunk.data_bytes)
         if crc and crc32(data) != crc:
             raise DamageError("its CRC does not match")
         return data
@@ -202,30 +263,45 @@ class McapPart:
         )
         return kept
 
-    def _indexes(self, chunk: Chunk, wanted: frozenset[int] | None) -> dict[int, Int64Array] | None:
-        """Return the message indexes of a chunk's wanted channels (None: of all), None where one is missing or broken.
+    def _entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+        """Return the messages of several chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+        regions: list[memoryview | bytes] = []
+        places: list[tuple[int, int, int, int]] = []
+        unsound, before = [], 0
+        for number, chunk in enumerate(chunks):
+            if chunk.index is None or chunk.cut or chunk.size > MAX_PLANNED_BYTES:
+                unsound.append(number)
+                continue
+            try:
+                region, records = self._index_region(chunk, chunk.index)
+            except DamageError:
+                unsound.append(number)
+                continue
+            end = before + len(region)
+            places += [(number, channel, before + at, end) for channel, at in records]
+            regions.append(region)
+            before = end
+        of, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
+        right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
+        entries, sound = by_place(
+            of[record], channels[record], offsets, stamps, sizes, least_bytes=RECORD_HEAD + MESSAGE_HEAD
+        )
+        sound[unsound] = False
+        sound[of[~right]] = False
+        return entries, sound
 
-        They lie together, right behind the chunk.
+    def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview | bytes, list[tuple[int, int]]]:
+        """Return bytes that hold a chunk's message indexes, and of each channel's where it begins in them.
+
+        As a rule they lie together, right behind the chunk.
         """
-        if chunk.index is None or chunk.cut:
-            return None
-        index = {at: channel for channel, at in sorted(chunk.index.items()) if wanted is None or channel in wanted}
-        found = {}
-        try:
-            held = self._bytes.read(chunk.end, chunk.index_bytes)
-            for at, channel in index.items():
-                start = at - chunk.end
-                if 0 <= start <= len(held) - RECORD_HEAD:
-                    length = int.from_bytes(held[start + 1 : start + RECORD_HEAD], "little")
-                    record = held[start : start + RECORD_HEAD + length]
-                else:
-                    record = self._index_record(at)
-                found[channel] = index_entries(record, channel)
-                if len(record) != RECORD_HEAD + 6 + found[channel].nbytes:
-                    return None  # padding is allowed, but so would a broken count look
-        except DamageError:
-            return None
-        return found
+        last = chunk.index_bytes - RECORD_HEAD
+        places = [(channel, at - chunk.end) for channel, at in index.items()]
+        if all(0 <= at <= last for _, at in places):
+            return self._bytes.read(chunk.end, chunk.index_bytes), places
+        records = [self._index_record(at) for at in index.values()]
+        starts = itertools.accumulate((len(record) for record in records), initial=0)
+        return b"".join(records), list(zip(index, starts, strict=False))
 
     def _index_entries(self, offset: int, channel: int) -> Int64Array:
         """Return a message index as (log time, offset), shape (N, 2)."""
@@ -283,7 +359,7 @@ class McapPart:
     def _walk(self, contents: _Contents, start: int, end: int) -> bool:
         """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
         position = start
-        run = _Run()
+        run = _MessageRun()
         closed = False
         while position + RECORD_HEAD <= end:
             head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
@@ -339,7 +415,8 @@ class McapPart:
         channel = int.from_bytes(self._bytes.peek(position + RECORD_HEAD, 2), "little")
         self._index_entries(position, channel)
         chunk = contents.chunks[-1]
-        contents.chunks[-1] = replace(chunk, index={**(chunk.index or {}), channel: position})
+        index_bytes = after - chunk.end
+        contents.chunks[-1] = replace(chunk, index={**(chunk.index or {}), channel: position}, index_bytes=index_bytes)
 
     def _distrust_last_index(self, contents: _Contents) -> None:
         """Forget the index of the last chunk: where the file breaks off behind it, some of it may be missing."""
@@ -380,8 +457,7 @@ class McapPart:
 
     def _declare_and_count(self, chunk: Chunk) -> None:
         try:
-            head = self._bytes.read(chunk.offset, chunk.data_offset - chunk.offset)
-            data = self._load(chunk, head)
+            data = self._load(chunk)
         except DamageError as error:
             self._note_lost(chunk, str(error))
             return
@@ -463,7 +539,15 @@ class McapPart:
         ] = None
 
 
-class _Run:
+class _ChunkRun:
+    """A run of chunks to read: its plan, and the chunks of its group, each with the number of bytes in all chunks before it."""
+
+    def __init__(self, plan: Run, members: list[tuple[int, Chunk]]) -> None:
+        self.plan, self.members = plan, members
+        self.bases = np.array([base for base, _ in members], np.int64)
+
+
+class _MessageRun:
     """Messages outside chunks that follow one another: read together, as if they were a chunk."""
 
     def __init__(self) -> None:
@@ -485,39 +569,11 @@ class _Run:
         self._start = self._end = 0
 
 
-def _indexed(data: memoryview, index: dict[int, Int64Array] | None, wanted: frozenset[int]) -> Messages | None:
-    """Return the wanted messages by a chunk's index; None where that is missing or contradicts the records."""
-    if index is None:
-        return None
-    index = {channel: entries for channel, entries in index.items() if channel in wanted}
-    channels = np.repeat(np.array(list(index), np.int64), [len(of) for of in index.values()])
-    entries = np.concatenate([np.empty((0, 2), np.int64), *index.values()])
-    offsets = entries[:, 1]
-    if len(offsets) and not 0 <= offsets.min() <= offsets.max() <= len(data) - RECORD_HEAD - MESSAGE_HEAD:
-        return None
-    messages = Messages(data, channels, offsets)
-    return messages.sorted() if messages.are(channels, entries[:, 0]) else None
-
-
-def _walked(data: memoryview, wanted: frozenset[int]) -> Messages:
-    """Return the wanted messages by walking the records."""
+def _wanted_messages(data: memoryview, wanted: frozenset[int]) -> Int64Array:
+    """Return where the wanted messages begin, by walking the records."""
     offsets = message_offsets(data, record_offsets(data))
     channels = gathered(data, offsets + RECORD_HEAD, "u2") if len(offsets) else offsets
-    chosen = np.isin(channels, sorted(wanted))
-    return Messages(data, channels[chosen], offsets[chosen]).sorted()
-
-
-def _pieces(
-    chunk: Chunk, index: dict[int, Int64Array] | None, wanted: frozenset[int]
-) -> tuple[Int64Array, Int64Array] | None:
-    """Return where in a chunk the wanted messages begin and end; None where they are all of it, or that is not known."""
-    if not index or index.keys() <= wanted:
-        return None
-    offsets = np.concatenate([entries[:, 1] for entries in index.values()])
-    chosen = np.repeat([channel in wanted for channel in index], [len(entries) for entries in index.values()])
-    order = np.argsort(offsets)
-    offsets, chosen = np.clip(offsets[order], 0, chunk.data_bytes), chosen[order]
-    return offsets[chosen], np.append(offsets[1:], chunk.data_bytes)[chosen]
+    return offsets[np.isin(channels, sorted(wanted))]
 
 
 def _parse_summary(section: memoryview) -> _Contents:

@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.formats.chunk_runs import Entries
 from tcpipe.formats.log_part import DamageError, Int64Array, MessageBlock, blocks_by_channel, gathered
 
 MAGIC = b"\x89MCAP0\r\n"
-CHUNK_CRC = slice(33, 37)
-"""Where in a chunk's record its CRC lies."""
+CHUNK_CRC = 33
+"""Where in a chunk's record its CRC begins (uint32)."""
 RECORD_HEAD = 9
 """Bytes of opcode and length."""
 MESSAGE_HEAD = 22
@@ -77,6 +78,11 @@ class Chunk:
     headless: bool = False
 
     @property
+    def size(self) -> int:
+        """Bytes of the chunk's records; of compressed ones, what the chunk claims."""
+        return self.uncompressed_bytes if self.compression else self.data_bytes
+
+    @property
     def end(self) -> int:
         """Byte after the chunk's record."""
         return self.data_offset + self.data_bytes
@@ -118,11 +124,12 @@ class Fields:
 
     def pairs(self, size: int) -> dict[int, int]:
         """Return a map of ``size`` bytes from channel to number."""
-        found = {}
-        for _ in range(size // 10):
-            channel, value = self.take("HQ")
-            found[channel] = value
-        return found
+        whole = size - size % 10
+        if self._position + whole > len(self._content):
+            raise DamageError("a record ends before its fields do")
+        found = self._content[self._position : self._position + whole]
+        self._position += whole
+        return dict(struct.iter_unpack("<HQ", found))
 
     def text(self) -> str:
         """Return a text; bytes that are no UTF-8 are kept visible, so that different names stay different."""
@@ -186,50 +193,83 @@ def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:
     return np.frombuffer(record, "<i8", size // 8, RECORD_HEAD + 6).reshape(-1, 2)
 
 
-class Messages:
-    """Messages inside a chunk's records, by channel: ``channels`` and ``offsets`` have shape (N,)."""
+def index_messages(
+    data: bytes, records: Int64Array, ends: Int64Array, channels: Int64Array
+) -> tuple[NDArray[np.bool_], Int64Array, Int64Array, Int64Array]:
+    """Read several message indexes at once.
 
-    def __init__(self, data: memoryview, channels: Int64Array, offsets: Int64Array) -> None:
-        count = max(len(data) - _MESSAGE.itemsize + 1, 0)
-        windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
-        self._channels, self._offsets, self._bytes = channels, offsets, len(data)
-        self._heads: NDArray[np.void] = windows[offsets].view(_MESSAGE)
+    Parameters
+    ----------
+    data
+        Bytes that hold them.
+    records, ends, channels
+        Of each index, shape (R,), where it begins, before which byte it must end, and of which channel it should be.
 
-    def are(self, channels: Int64Array, log_time_ns: Int64Array) -> bool:
-        """Return whether there really are messages of these channels and log times, whole."""
-        heads, left = self._heads, self._bytes - self._offsets - RECORD_HEAD
-        lengths = heads["length"]
-        return bool(
-            (
-                (heads["opcode"] == OP_MESSAGE)
-                & (heads["channel"] == channels)
-                & (heads["log_time_ns"] == log_time_ns)
-                & (lengths >= MESSAGE_HEAD)
-                & (lengths <= left)
-            ).all()
+    Returns
+    -------
+    right
+        Which of the indexes are what they should be, shape (R,).
+    record, log_time_ns, offset
+        Of each message of those, shape (N,), the number of its index, its log time and its offset in the chunk.
+    """
+    whole = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
+    right, size = np.zeros(len(records), np.bool_), np.zeros(len(records), np.int64)
+    if len(whole):
+        at = records[whole]
+        size[whole] = gathered(data, at + RECORD_HEAD + 2, "u4")
+        right[whole] = (
+            (np.frombuffer(data, np.uint8)[at] == OP_MESSAGE_INDEX)
+            & (gathered(data, at + 1, "i8") == size[whole] + 6)  # padding is allowed, but so would a broken count look
+            & (gathered(data, at + RECORD_HEAD, "u2") == channels[whole])
+            & (size[whole] % 16 == 0)
+            & (at + RECORD_HEAD + 6 + size[whole] <= ends[whole])
         )
+    counts = np.where(right, size // 16, 0)
+    record = np.repeat(np.arange(len(records)), counts)
+    within = np.arange(len(record)) - np.repeat(np.cumsum(counts) - counts, counts)
+    places = records[record] + (RECORD_HEAD + 6) + 16 * within
+    if not len(places):
+        return right, record, places, places
+    return right, record, gathered(data, places, "i8"), gathered(data, places + 8, "i8")
 
-    def sorted(self) -> Messages:
-        """Return them with each channel's in one piece, by rising offset."""
-        channels, offsets = self._channels, self._offsets
-        again = channels[1:] == channels[:-1]
-        if not ((channels[1:] > channels[:-1]) | (again & (offsets[1:] > offsets[:-1]))).all():
-            order = np.lexsort((offsets, channels))
-            self._channels, self._offsets, self._heads = channels[order], offsets[order], self._heads[order]
-        return self
 
-    def blocks(self, data: memoryview, base: int) -> list[MessageBlock]:
-        """Return one block a channel; they must be sorted. ``base`` is the number of bytes before these records."""
-        heads = self._heads
-        return blocks_by_channel(
-            data,
-            self._channels,
-            self._offsets + (RECORD_HEAD + MESSAGE_HEAD),
-            heads["length"] - MESSAGE_HEAD,
-            log_time_ns=heads["log_time_ns"].astype(np.int64),
-            publish_time_ns=heads["publish_time_ns"].astype(np.int64),
-            ordinals=self._offsets + base,
-        )
+def message_heads(data: memoryview, offsets: Int64Array) -> NDArray[np.void]:
+    """Return the heads of the messages that begin at ``offsets``; each must lie within the data."""
+    count = max(len(data) - _MESSAGE.itemsize + 1, 0)
+    windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
+    return windows[offsets].view(_MESSAGE)
+
+
+def borne_out(heads: NDArray[np.void], entries: Entries) -> NDArray[np.bool_]:
+    """Return at which index entries there really is a message of that channel and log time that ends before the next, shape (N,)."""
+    lengths = heads["length"]
+    found: NDArray[np.bool_] = (
+        (heads["opcode"] == OP_MESSAGE)
+        & (heads["channel"] == entries.channel)
+        & (heads["log_time_ns"] == entries.log_time_ns)
+        & (lengths >= MESSAGE_HEAD)
+        & (lengths <= entries.end - entries.offset - RECORD_HEAD)
+    )
+    return found
+
+
+def message_blocks(
+    data: memoryview, offsets: Int64Array, heads: NDArray[np.void], ordinals: Int64Array
+) -> list[MessageBlock]:
+    """Return messages as one block a channel; ``offsets``, ``heads`` and ``ordinals`` have shape (N,)."""
+    channels = heads["channel"]
+    if (channels[1:] < channels[:-1]).any():
+        order = np.argsort(channels, kind="stable")
+        offsets, heads, ordinals = offsets[order], heads[order], ordinals[order]
+    return blocks_by_channel(
+        data,
+        heads["channel"],
+        offsets + (RECORD_HEAD + MESSAGE_HEAD),
+        heads["length"] - MESSAGE_HEAD,
+        log_time_ns=heads["log_time_ns"].astype(np.int64),
+        publish_time_ns=heads["publish_time_ns"].astype(np.int64),
+        ordinals=ordinals,
+    )
 
 
 def record_offsets(data: bytes | memoryview) -> Int64Array:
