@@ -42,8 +42,8 @@ class BatchRules:
 class Batches:
     """Batches of one split; iterating again is the next epoch, with its own shuffle.
 
-    Each batch is ``(patches, labels)``, or ``(patches, labels, weights)`` with ``weights``, which is what Keras takes as it is; with
-    ``features``, patches are replaced by ``(patches, features)``.
+    Each batch is ``(patches, labels)``, or ``(patches, labels, weights)`` with ``weights``, a weight for each label; with ``features``,
+    patches are replaced by ``(patches, features)``.
     """
 
     def __init__(self, split: Split, rules: BatchRules) -> None:
@@ -74,7 +74,8 @@ class Batches:
 
     def forever(self) -> Iterator[Batch]:
         """Iterate over epoch after epoch without an end; Keras wants ``steps_per_epoch=len(batches)`` with it."""
-        return itertools.chain.from_iterable(self.epoch(number) for number in itertools.count())
+        for number in itertools.count():  # a generator: Keras takes no other iterator
+            yield from self.epoch(number)
 
     def epoch(self, number: int) -> Iterator[Batch]:
         """Iterate over one epoch; the same number gives the same batches."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,12 @@ CACHED_PIECES = 64
 """Pieces kept for reading at random from a split that is not in memory."""
 
 
+@cache
+def sample_bytes(layers: tuple[str, ...], patch_px: int) -> int:
+    """Return what the stored layers of a sample take [byte]."""
+    return sum(np.dtype(layer_dtype(layer)).itemsize for layer in layers) * patch_px**2
+
+
 class StoredPixels:
     """Layers of N samples; ``rows`` says where each lies in the order of the files, (N,)."""
 
@@ -34,22 +41,22 @@ class StoredPixels:
         """Leave pixels behind when a loader's worker process receives them."""
         return {**self.__dict__, "_memory": {}, "_pieces": OrderedDict()}
 
-    def fit(self, layers: Sequence[str]) -> bool:
+    def fit(self, layers: tuple[str, ...]) -> bool:
         """Return whether the layers are kept in memory."""
-        per_pixel = sum(np.dtype(layer_dtype(layer)).itemsize for layer in layers)
-        return len(self.rows) * self.files.patch_px**2 * per_pixel <= IN_MEMORY_BYTES
+        return len(self.rows) * sample_bytes(layers, self.files.patch_px) <= IN_MEMORY_BYTES
 
-    def in_memory(self, layers: Sequence[str]) -> Pixels:
-        """Return the layers of all samples, read once and kept, each of shape (N, px, px)."""
+    def in_memory(self, layers: tuple[str, ...]) -> Pixels:
+        """Return the layers of all samples, and others that were asked for before, read once and kept, each of shape (N, px, px)."""
         absent = [layer for layer in layers if layer not in self._memory]
         if absent:
             self._memory.update(self._read(self.rows, absent))
-        return {layer: self._memory[layer] for layer in layers}
+        return self._memory
 
-    def gather(self, at: Ints, layers: Sequence[str]) -> Pixels:
+    def gather(self, at: Ints, layers: tuple[str, ...]) -> Pixels:
         """Return the layers of the samples ``at``, each of shape (B, px, px)."""
         if self.fit(layers):
-            return {layer: pixels[at] for layer, pixels in self.in_memory(layers).items()}
+            memory = self.in_memory(layers)
+            return {layer: memory[layer][at] for layer in layers}
         return self._read(self.rows[at], layers)
 
     def pieces_of(self, at: Ints) -> Ints:

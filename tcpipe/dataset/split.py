@@ -15,7 +15,7 @@ from tcpipe.dataset.batches import Batches, BatchRules
 from tcpipe.dataset.pixels import StoredPixels
 from tcpipe.dataset.tensor import TensorForm, tensor_form
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_files import read_samples
+from tcpipe.formats.dataset_files import read_samples, sample_columns
 from tcpipe.tables.bits import Quality
 
 if TYPE_CHECKING:
@@ -39,10 +39,12 @@ class SampleColumns:
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Return one column, nulls as NaN or None, shape (N,)."""
         if name not in self._read:
-            whole = read_samples(self.directory, [name])
-            if name not in whole.column_names:
-                raise DatasetError(f"{self.directory}: its samples have no column {name!r}")
-            self._read[name] = whole.column(name).take(pa.array(self.rows)).to_numpy()
+            there = sample_columns(self.directory)
+            if name not in there:
+                raise DatasetError(
+                    f"{self.directory}: its samples have no column {name!r}; there are {', '.join(there)}"
+                )
+            self._read[name] = read_samples(self.directory, [name]).column(name).take(pa.array(self.rows)).to_numpy()
         return self._read[name]
 
     def table(self) -> pa.Table:
@@ -130,14 +132,10 @@ class Split:
 
     @property
     def weights(self) -> Floats:
-        """Inverse variance of each label over its mean, float32, shape (N, 2): how much it says of the ground."""
+        """Inverse variance of each label over its mean, float32, shape (N, 2): how much it says of the ground; 0 where it is not known."""
         if self._weights is None:
             std = np.column_stack([self.column(name) for name in ("power_std_watt", "velocity_std_mps")])
-            if len(std):
-                std = np.maximum(std, np.maximum(_MIN_STD * np.median(std, axis=0), np.finfo(np.float32).tiny))
-                self._weights = (std**-2 / np.mean(std**-2, axis=0)).astype(np.float32)
-            else:
-                self._weights = std.astype(np.float32)
+            self._weights = np.column_stack([_inverse_variance(column) for column in std.T]).astype(np.float32)
         return self._weights
 
     @property
@@ -221,7 +219,7 @@ class Split:
         Parameters
         ----------
         size
-            Samples in a batch.
+            Samples in a batch, 1 or more.
         shuffle, seed
             Another order every epoch, drawn from the seed; from disk, samples are shuffled within pools of shuffled chunks.
         mirror
@@ -236,6 +234,11 @@ class Split:
             Decode chunk by chunk instead of keeping the split in memory; None decides by its size.
 
         """
+        if size < 1:
+            raise DatasetError(f"batches of {size} samples: wanted 1 or more")
+        textual = [name for name in features if self.column(name).dtype.kind not in "biuf"]
+        if textual:
+            raise DatasetError(f"features {', '.join(textual)}: wanted columns of numbers")
         disk = not self.view.stored.fit(self.view.form.layers) if from_disk is None else from_disk
         return Batches(self, BatchRules(size, shuffle, seed, mirror, weights, tuple(features), drop_last, disk))
 
@@ -253,3 +256,13 @@ class Split:
         if self.view.stored.fit(layers):
             return self.view.form.form(self.view.stored.in_memory(layers), self.view.at[indices])
         return self.view.form.form(self.layers(indices), np.arange(len(indices)))
+
+
+def _inverse_variance(std: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return weights with a mean of 1 from standard deviations, shape (N,); 0 where one is not finite."""
+    known = np.isfinite(std)
+    if not known.any():
+        return np.zeros(std.shape)
+    least = max(_MIN_STD * float(np.median(std[known])), float(np.finfo(np.float32).tiny))
+    weights = np.where(known, np.maximum(np.where(known, std, 1.0), least) ** -2, 0.0)
+    return weights / weights.mean()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,20 +22,20 @@ ONE_HOT = "terrain_one_hot"
 _BYTES = np.arange(256, dtype=np.uint8)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class TensorForm:
     """Channels in their order: ``ortho``, ``terrain``, ``height`` as in the paper, or `ONE_HOT`."""
 
     channels: tuple[str, ...]
     class_count: int
 
-    @property
+    @cached_property
     def layers(self) -> tuple[str, ...]:
         """Stored layers that are needed."""
         needed = {"terrain" if channel == ONE_HOT else channel for channel in self.channels}
         return tuple(layer for layer in LAYERS if layer in needed)
 
-    @property
+    @cached_property
     def depth(self) -> int:
         """Length of the tensor's last axis."""
         return sum(self.class_count if channel == ONE_HOT else 1 for channel in self.channels)

@@ -1,3 +1,4 @@
+import inspect
 import itertools
 import pickle
 
@@ -7,9 +8,11 @@ from synthetic_store import box, region_file, small_store
 
 from tcpipe.dataset import batches as batches_module
 from tcpipe.dataset import open_dataset, pixels
+from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.recipe import Recipe
+from tcpipe.terrain.layers import LAYERS, paper_tensor
 
 
 @pytest.fixture(scope="module")
@@ -179,6 +182,7 @@ def test_every_epoch_has_its_own_order_and_the_same_seed_the_same(path, from_dis
 def test_what_keras_wants_never_ends(path):
     train = open_dataset(path)["train"]
     batches = train.batches(100, shuffle=True, weights=True)
+    assert inspect.isgenerator(batches.forever())  # Keras takes no other iterator
     found = list(itertools.islice(batches.forever(), 2 * len(batches)))
     assert [len(labels) for _, labels, _ in found] == [100, 100, 21] * 2
     assert found[0][2].shape == (100, 2)
@@ -189,6 +193,58 @@ def test_weights_are_inverse_variances(path):
     std = train.column("power_std_watt")
     assert train.weights.mean() == pytest.approx(1)
     np.testing.assert_allclose(train.weights[:, 0] * std**2, np.mean(train.weights[:, 0] * std**2), rtol=1e-5)
+
+
+def test_a_label_whose_error_is_not_known_weighs_nothing(path):
+    train = open_dataset(path)["train"]
+    std = train._columns["power_std_watt"].copy()
+    train._columns._read["power_std_watt"] = np.where(np.arange(len(std)) == 3, np.nan, std)
+    assert np.isfinite(train.weights).all()
+    assert np.flatnonzero(train.weights[:, 0] == 0).tolist() == [3]
+    assert train.take([3]).weights[0, 0] == 0
+
+
+def test_batches_that_cannot_be_are_refused_in_a_line(path):
+    train = open_dataset(path)["train"]
+    with pytest.raises(DatasetError, match="batches of 0 samples: wanted 1 or more"):
+        train.batches(0)
+    with pytest.raises(DatasetError, match="features terrain_name: wanted columns of numbers"):
+        train.batches(8, features=["slope_rad", "terrain_name"])
+    with pytest.raises(DatasetError, match="no column 'slope'"):
+        train.batches(8, features=["slope"])
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 255])
+def test_every_stored_value_becomes_what_the_layers_say(count):
+    """All bytes of ortho and terrain, all heights, mirrored or not, in one pass or channel by channel: bit for bit the same."""
+    rng = np.random.default_rng(0)
+    pixels = {
+        "ortho": np.tile(np.arange(256, dtype=np.uint8), 256).reshape(-1, 16, 16),
+        "terrain": rng.integers(0, count + 1, 65536).astype(np.uint8).reshape(-1, 16, 16),
+        "height": np.arange(65536, dtype=np.uint16).reshape(-1, 16, 16),
+    }
+    rows, mirrored = rng.permutation(256), rng.random(256) < 0.5
+    wanted = paper_tensor(*(pixels[layer] for layer in LAYERS), count)[rows]
+    wanted[mirrored] = wanted[mirrored, ::-1]
+    np.testing.assert_array_equal(tensor_form(LAYERS, LAYERS, count).form(pixels, rows, mirrored), wanted)
+    apart = tensor_form(("height", "ortho", "terrain"), LAYERS, count).form(pixels, rows, mirrored)
+    np.testing.assert_array_equal(apart, wanted[..., [2, 0, 1]])
+
+
+def test_pixels_without_data_are_0_in_every_channel():
+    stored = {
+        "ortho": np.array([0, 255], np.uint8),
+        "terrain": np.array([0, 7], np.uint8),
+        "height": np.array([65535, 400], np.uint16),
+    }
+    pixels = {layer: np.full((1, 2, 2), values[0], values.dtype) for layer, values in stored.items()}
+    for layer, values in stored.items():
+        pixels[layer][0, 1] = values[1]
+    for channels in (LAYERS, ("ortho", "height", "terrain")):
+        found = tensor_form(channels, LAYERS, 7).form(pixels, np.array([0]))
+        assert not found[0, 0].any()
+        order = [LAYERS.index(channel) for channel in channels]
+        np.testing.assert_array_equal(found[0, 1, 0], np.array([1, 1, 0.2], np.float32)[order])
 
 
 def test_a_mirrored_patch_is_reversed_across_and_its_cross_slope_changes_sign(path):
