@@ -1,7 +1,8 @@
 """Where every metre of a track went: the stretches that are kept, and the reason of each interval that is not.
 
-The odometer is the horizontal length of the estimated track: Hermite arcs inside its pieces, straight lines across its holes. Each interval
-between two rows belongs to one entry, so the ledger's sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
+The odometer is the horizontal length of the estimated track: Hermite arcs inside its pieces, straight lines across its holes. Where an
+estimate jumps to another place nobody drove: such a step counts as long as its speed makes it. Each interval between two rows belongs to
+one entry, so the ledger's sum is the odometer (docs/explanation/rulings.md, Marked, not deleted).
 """
 
 from __future__ import annotations
@@ -32,6 +33,26 @@ def interval_reason(dropped_by: NDArray[np.uint32], piece: NDArray[np.int64]) ->
     return np.where(piece[:-1] == piece[1:], lowest, int(DropReason.GAP)).astype(np.uint32)
 
 
+JUMP_M = 1.0
+"""A step that differs by more than this from what its velocity explains is no driving [m]."""
+
+
+def unexplained_m(
+    stamp_ns: NDArray[np.int64],
+    position_m: NDArray[np.float64],
+    velocity_mps: NDArray[np.float64],
+    piece: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Return how far each interval's step lies horizontally off what the velocity explains, [m], shape (N - 1,); 0 across holes.
+
+    Parameters are `interval_length_m`'s.
+    """
+    step_s = np.diff(stamp_ns).astype(np.float64) * 1e-9
+    explained = 0.5 * (velocity_mps[1:, :2] + velocity_mps[:-1, :2]) * step_s[:, None]
+    off = np.diff(position_m[:, :2], axis=0) - explained
+    return np.where(piece[:-1] == piece[1:], np.hypot(off[:, 0], off[:, 1]), 0.0)
+
+
 def interval_length_m(
     stamp_ns: NDArray[np.int64],
     position_m: NDArray[np.float64],
@@ -51,7 +72,9 @@ def interval_length_m(
     for first, last in piece_spans(piece):
         rows = slice(first, last + 1)
         length[first:last] = np.diff(polyline(stamp_ns[rows], position_m[rows], velocity_mps[rows]).length_m)
-    return length
+    speed_mps = np.hypot(velocity_mps[:, 0], velocity_mps[:, 1])
+    driven = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * np.diff(stamp_ns).astype(np.float64) * 1e-9
+    return np.where(unexplained_m(stamp_ns, position_m, velocity_mps, piece) > JUMP_M, driven, length)
 
 
 def interval_duration_s(stamp_ns: NDArray[np.int64], epoch: NDArray[np.integer[Any]]) -> NDArray[np.float64]:

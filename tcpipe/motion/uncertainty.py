@@ -81,8 +81,12 @@ def chord_ahead_std_m(
     chord_m: float,
     slowest_mps: float,
     smoothed: bool,
+    told_s: Sequence[float],
+    told_std_m: Floats,
 ) -> Floats:
     """Return for each row the displacement error over the next chord at the row's speed, [m], shape (N,).
+
+    As the smoother tells it (`between_durations_m`), elsewhere as the row's deviations allow (`displacement_std_m`).
 
     Parameters
     ----------
@@ -90,15 +94,18 @@ def chord_ahead_std_m(
     position_std_m : [m], shape (N,), of the position along the direction of travel.
     chord_m : [m].
     slowest_mps : [m/s], rows slower than this are taken as this fast.
+    told_s, told_std_m : [s], L durations, and [m], shape (N, L), the displacement error over them, NaN where it is not told.
     """
     _, high = piece_bounds(rows.piece)
     duration_s = chord_m / np.maximum(np.abs(rows.velocity_mps), slowest_mps)
     row = np.arange(len(duration_s))
     end = np.minimum(row + np.ceil(duration_s / rows.period_s).astype(np.int64), high)
-    return displacement_std_m(
+    told = between_durations_m(duration_s, told_s=told_s, told_std_m=told_std_m)
+    modelled = displacement_std_m(
         velocity_std_mps=velocity_std_mps,
         duration_s=duration_s,
         start_std_m=position_std_m,
         end_std_m=position_std_m[end],
         smoothed=smoothed,
     )
+    return np.where(np.isnan(told), modelled, told)

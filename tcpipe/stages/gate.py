@@ -6,8 +6,8 @@ import numpy as np
 
 from tcpipe.motion import masks
 from tcpipe.motion.pieces import Mask, MotionRows, piece_of_rows
-from tcpipe.motion.uncertainty import along_std_m, chord_ahead_std_m
 from tcpipe.recipe import GateConfig
+from tcpipe.stages.gate_gaps import find_gaps
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, with_findings
@@ -30,7 +30,8 @@ def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | No
         piece=piece_of_rows(integers(table, "stamp_ns"), integers(table, "epoch"), period_ns=1e9 * period_s),
         period_s=period_s,
     )
-    found = {DropReason.GAP: _gap(track, rows, chord_m, config), **_motion(rows, config)}
+    gaps = find_gaps(track, rows, chord_m=chord_m, config=config)
+    found = {DropReason.GAP: gaps.rows, **_motion(rows, config)}
     limit_mps = config.max_velocity_mps or max_velocity_mps
     slowest = limit_mps and config.full_speed_fraction * limit_mps
     if slowest is not None and config.require_full_speed:
@@ -39,12 +40,14 @@ def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | No
     facts = {
         "rows": table.num_rows,
         "rows_kept": int((dropped_by == 0).sum()),
+        "gap_rows": gaps.counts(),
         "rows_dropped": {str(reason.name).lower(): int((dropped_by & reason != 0).sum()) for reason in DropReason},
         "max_velocity_mps": limit_mps,
         "full_speed_mps": slowest,
     }
     gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
-    return GatedTrack(gated, with_findings(track.info, "gate", _warnings(rows, dropped_by, limit_mps, config), facts))
+    warnings = (*gaps.warnings, *_warnings(rows, dropped_by, limit_mps, config))
+    return GatedTrack(gated, with_findings(track.info, "gate", warnings, facts))
 
 
 def _motion(rows: MotionRows, config: GateConfig) -> dict[DropReason, Mask]:
@@ -84,23 +87,6 @@ def _accelerating(rows: MotionRows, halted: Mask, config: GateConfig) -> Mask:
     )
     beside = masks.ramps(rows, slope, halted, above_mps2=config.ramp_acceleration_mps2, min_s=config.min_event_s)
     return changed | (lasting & np.isnan(rows.commanded_mps)) | beside
-
-
-def _gap(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Mask:
-    """Mark rows without power in a run that has power, and moving rows whose next chord would not be known well enough."""
-    table, power = track.table, floats(track.table, "power_watt")
-    course = np.arctan2(floats(table, "north_velocity_mps"), floats(table, "east_velocity_mps"))
-    relative_m = chord_ahead_std_m(
-        rows,
-        velocity_std_mps=floats(table, "forward_velocity_std_mps"),
-        position_std_m=along_std_m(floats(table, "x_std_m"), floats(table, "y_std_m"), course),
-        chord_m=chord_m,
-        slowest_mps=config.turning_velocity_mps,
-        smoothed=track.info.estimator == "smoother",
-    )
-    moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
-    without_power = np.isnan(power) & bool(np.isfinite(power).any())
-    return without_power | (moving & (relative_m > config.max_relative_position_std_m))
 
 
 def _warnings(rows: MotionRows, dropped_by: Mask, limit_mps: float | None, config: GateConfig) -> tuple[str, ...]:

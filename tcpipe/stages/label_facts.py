@@ -70,7 +70,7 @@ def _budget(
 def label_warnings(facts: Mapping[str, Any]) -> tuple[str, ...]:
     """Return what a person should look at."""
     warnings = []
-    if facts["quality"]["low_power_rate"]:
+    if facts["quality"]["low_power_rate"] and facts["segments_without_power"] < facts["segments"]:
         rates = [
             rail[s]["rate_hz"] for epoch in facts["rails"].values() for rail in epoch for s in ("voltage", "current")
         ]

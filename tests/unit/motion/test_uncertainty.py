@@ -81,5 +81,8 @@ def test_the_chord_ahead_sees_a_jump_before_it_comes():
         chord_m=1.0,
         slowest_mps=0.1,
         smoothed=False,
+        told_s=(0.5, 2.0),
+        told_std_m=np.where(np.arange(count)[:, None] == 120, [0.2, 0.8], np.nan),
     )
-    assert np.flatnonzero(got > 0.1).tolist() == list(range(80, 100))
+    assert np.flatnonzero(got > 0.1).tolist() == [*range(80, 100), 120]
+    assert got[120] == pytest.approx(0.4)  # a power of time between what is told of half and of two seconds

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from made_tracks import make_track, stamps, straight_track
 
-from tcpipe.recipe import GateConfig
+from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.gate import gate_track
+from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
 
 T = np.arange(0, 60, 0.05)
@@ -89,6 +90,23 @@ def test_a_power_gap_is_a_gap_and_a_run_without_power_is_none():
         np.isnan(power).tolist()
     )
     assert not rows_of(gate(straight_track(np.full(len(T), 0.9))), DropReason.GAP).any()
+    rare = gate(straight_track(np.full(len(T), 0.9), power_watt=np.where(T > 50, 150.0, np.nan)))
+    assert "there is none on 83% of the moving track" in rare.info.findings.warnings[0]
+
+
+def test_a_jump_is_a_gap_and_not_driven():
+    """Fixes that move to another place by 1000 km: rows beside it are a gap, and the ledger holds what was driven."""
+    track = straight_track(np.full(len(T), 0.9))
+    position = np.column_stack([track.table[f"{axis}_m"].to_numpy() for axis in "xyz"])
+    position[600:, 1] += 1e6
+    velocity = np.tile([0.9, 0.0, 0.0], (len(T), 1))
+    gated = gate(make_track(position, velocity))
+    assert np.flatnonzero(rows_of(gated, DropReason.GAP)).tolist() == [599, 600]
+    assert gated.info.findings.facts["gate"]["gap_rows"] == {"without_power": 0, "uncertain": 0, "jumps": 2}
+    assert "jumps 1 times, the furthest by 1000000.0 m" in gated.info.findings.warnings[0]
+    segments = segment_track(gated, SegmentConfig())
+    assert sum(segments.ledger_m.values()) == pytest.approx(0.9 * T[-1], rel=1e-6)
+    assert segments.table.num_rows == 52
 
 
 def test_relative_not_absolute_position_error_makes_a_gap():
@@ -97,6 +115,7 @@ def test_relative_not_absolute_position_error_makes_a_gap():
     assert not rows_of(far_off, DropReason.GAP).any()
     unsure = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.12))
     assert rows_of(unsure, DropReason.GAP).all()
+    assert "is not known to 0.1 m (gate.max_relative_position_std_m)" in unsure.info.findings.warnings[0]
 
 
 def test_rows_and_reasons_are_counted():

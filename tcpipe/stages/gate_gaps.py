@@ -1,0 +1,86 @@
+"""Where a track bears no segment: without power, where the next metre would not be known well enough, and where it jumps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
+from tcpipe.motion.ledger import JUMP_M, unexplained_m
+from tcpipe.motion.pieces import Floats, Mask, MotionRows
+from tcpipe.motion.uncertainty import along_std_m, chord_ahead_std_m
+from tcpipe.recipe import GateConfig
+from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.levels import TRACK, Track
+
+_DISPLACEMENTS = [c.name for c in TRACK.columns if c.name.startswith("displacement_std_")]
+_WORTH_SAYING = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Gaps:
+    """Rows in a gap by cause, and what a person should know of them."""
+
+    without_power: Mask
+    uncertain: Mask
+    jumps: Mask
+    warnings: tuple[str, ...]
+
+    @property
+    def rows(self) -> Mask:
+        """All of them."""
+        return self.without_power | self.uncertain | self.jumps
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of rows by cause; a row may have several."""
+        return {name: int(getattr(self, name).sum()) for name in ("without_power", "uncertain", "jumps")}
+
+
+def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig) -> Gaps:
+    """Return the rows without power in a run that has power, moving rows whose next chord is uncertain, and rows beside a jump."""
+    power = floats(track.table, "power_watt")
+    without_power = np.isnan(power) & bool(np.isfinite(power).any())
+    moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
+    uncertain = moving & (_chord_std_m(track, rows, chord_m, config) > config.max_relative_position_std_m)
+    off_m = _unexplained_m(track, rows)
+    jumps = np.zeros(len(moving), dtype=np.bool_)
+    steps = np.flatnonzero(off_m > config.max_relative_position_std_m)
+    jumps[steps] = jumps[steps + 1] = True
+    warnings = []
+    if moving.any() and (share := without_power[moving].mean()) > _WORTH_SAYING:
+        warnings.append(f"power: there is none on {share:.0%} of the moving track, which therefore has no segments")
+    if moving.any() and (share := uncertain[moving].mean()) > _WORTH_SAYING:
+        limit = f"{config.max_relative_position_std_m} m (gate.max_relative_position_std_m)"
+        warnings.append(
+            f"on {share:.0%} of the moving track the distance over {chord_m:g} m is not known to {limit}: no segments there"
+        )
+    if far := int((off_m > JUMP_M).sum()):
+        at_ns = integers(track.table, "stamp_ns")[int(np.argmax(off_m))]
+        warnings.append(
+            f"the position jumps {far} times, the furthest by {off_m.max():.1f} m at {at_ns} ns, which no speed explains (a GNSS that "
+            "changed its base, datum or receiver?): nothing is cut across, and the jump is not counted as driven"
+        )
+    return Gaps(without_power, uncertain, jumps, tuple(warnings))
+
+
+def _chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:
+    table = track.table
+    course = np.arctan2(floats(table, "north_velocity_mps"), floats(table, "east_velocity_mps"))
+    return chord_ahead_std_m(
+        rows,
+        velocity_std_mps=floats(table, "forward_velocity_std_mps"),
+        position_std_m=along_std_m(floats(table, "x_std_m"), floats(table, "y_std_m"), course),
+        chord_m=chord_m,
+        slowest_mps=config.turning_velocity_mps,
+        smoothed=track.info.estimator == "smoother",
+        told_s=DISPLACEMENT_LAGS_S,
+        told_std_m=np.column_stack([floats(table, name) for name in _DISPLACEMENTS]),
+    )
+
+
+def _unexplained_m(track: Track, rows: MotionRows) -> Floats:
+    table = track.table
+    position_m = np.column_stack([floats(table, f"{axis}_m") for axis in "xyz"])
+    velocity_mps = np.column_stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    return np.append(unexplained_m(integers(table, "stamp_ns"), position_m, velocity_mps, rows.piece), 0.0)
