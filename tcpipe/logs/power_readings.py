@@ -23,6 +23,8 @@ from tcpipe.logs.profiles import Robot
 
 _OF_USUAL_VOLTAGE = (0.2, 3.0)
 """A battery's voltage stays within these shares of its median."""
+_FEWEST_ROWS = 20
+"""Fewer rows say nothing against the sign of their type."""
 
 CurrentSign = Literal["auto", "drawn_positive", "drawn_negative"]
 
@@ -159,7 +161,7 @@ def _sign(
     sign, one_sided = sign_by_mean(whole, np.gradient(time_s) if len(time_s) > 1 else np.ones_like(time_s))
     share = f"{100 * abs(one_sided):.0f} % of the charge moved"
     if all(source.sign for source in sources):
-        if sign >= 0:
+        if sign >= 0 or time_s.size < _FEWEST_ROWS:
             return 1, [], {"current_sign": "drawn_positive (message type)"}
         why = f"power refused: the current is negative, {share} flows back; there will be no energy"
         cure = (
