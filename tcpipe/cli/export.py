@@ -3,26 +3,60 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from tcpipe.cli.options import msgdef_option
+from tcpipe.cli.options import json_option, msgdef_option
+
+if TYPE_CHECKING:
+    from tcpipe.pipeline.export import Exported
 
 
 @click.command(short_help="Topics of a log as Parquet")
 @click.argument("log", metavar="LOG")
+@click.argument("names", nargs=-1, metavar="[TOPIC]...")
 @click.argument("out", metavar="OUT")
-@click.option("--topics", multiple=True, metavar="NAME", help="Only these topics; repeatable (default: all).")
+@click.option("--topics", multiple=True, metavar="NAME[,NAME]", help="Only these topics; repeatable (default: all).")
 @msgdef_option
-def export(log: str, out: str, *, topics: tuple[str, ...], msgdef: str | None) -> int:
-    """Write topics of LOG to OUT as Parquet, one file a topic, one row a message, columns by dotted field name."""
+@json_option
+def export(
+    log: str, out: str, *, names: tuple[str, ...], topics: tuple[str, ...], msgdef: str | None, as_json: bool
+) -> int:
+    """Write topics of LOG to OUT as Parquet, one file a topic, one row a message, columns by dotted field name.
+
+    Units of columns and the definition of the message stand in the files' metadata. What OUT holds already of the same
+    log is left alone.
+    """
+    from tcpipe.cli.output import print_json
     from tcpipe.pipeline.export import export as run
 
-    exported = run(log, Path(out), topics=topics, message_definitions=Path(msgdef) if msgdef else None)
-    for name, path, rows in exported.files:
-        click.echo(f"{rows:>9} messages  {name}  {path}")
-    for damage in exported.damage:
-        click.echo(f"damage: {damage}", err=True)
-    for remark in exported.remarks:
-        click.echo(f"remark: {remark}", err=True)
-    return 3 if exported.damage else 0
+    exported = run(log, Path(out), topics=(*topics, *names), message_definitions=Path(msgdef) if msgdef else None)
+    exit_code = 3 if exported.damage else 0
+    if as_json:
+        print_json({**_as_json(exported), "log": log, "out": out, "exit_code": exit_code})
+    else:
+        _print(exported, log, out)
+    return exit_code
+
+
+def _as_json(exported: Exported) -> dict[str, Any]:
+    files = [{"topic": of.topic, "type": of.type_name, "path": of.path, "messages": of.rows} for of in exported.topics]
+    return {"status": exported.status, "topics": files, "damage": exported.damage, "remarks": exported.remarks}
+
+
+def _print(exported: Exported, log: str, out: str) -> None:
+    from tcpipe.cli.output import say
+    from tcpipe.errors import plain_line
+
+    if exported.status == "unchanged":
+        count = len(exported.topics)
+        say(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
+    else:
+        for of in exported.topics:
+            say(f"{of.rows:>9} messages  {of.topic}  {of.path}")
+        if not exported.topics:
+            say(f"nothing to export: {log} holds no topic")
+    for kind in ("damage", "remarks"):
+        for line in getattr(exported, kind):
+            click.echo(plain_line(f"{kind.rstrip('s')}: {line}"), err=True)

@@ -7,7 +7,9 @@ proves it for the others; columns are strided views of the bytes. What is too ir
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.formats.arrow_values import IrregularColumns, arrow_type, scalars, texts
 from tcpipe.formats.log_part import MessageBlock, gathered
 from tcpipe.formats.ros_types import MessageType, RowError
+from tcpipe.logs.units import field_units
 from tcpipe.logs.wire_cursors import Walked, walk
 from tcpipe.logs.wire_layout import (
     Dialect,
@@ -64,9 +67,21 @@ _Int64 = NDArray[np.int64]
 
 
 def arrow_schema(message: Record) -> pa.Schema:
-    """Return the schema of a topic's table: both times, then the message's fields by dotted name."""
-    fields = [pa.field(name, arrow_type(of)) for name, of in flat_fields(message)]
-    return pa.schema([pa.field(LOG_TIME, pa.int64()), pa.field(PUBLISH_TIME, pa.int64()), *fields])
+    """Return the schema of a topic's table: both times, then the message's fields by dotted name.
+
+    The metadata of a field says its ``unit`` where that is known; of an array of messages, ``units`` of their fields as JSON.
+    """
+    units = {LOG_TIME: "ns", PUBLISH_TIME: "ns", **field_units(message)}
+    types = {LOG_TIME: pa.int64(), PUBLISH_TIME: pa.int64()}
+    types |= {name: arrow_type(of) for name, of in flat_fields(message)}
+    return pa.schema([pa.field(name, of, metadata=_unit_metadata(name, units)) for name, of in types.items()])
+
+
+def _unit_metadata(name: str, units: Mapping[str, str]) -> dict[str, str] | None:
+    if name in units:
+        return {"unit": units[name]}
+    inner = {path.removeprefix(f"{name}."): unit for path, unit in units.items() if path.startswith(f"{name}.")}
+    return {"units": json.dumps(inner)} if inner else None
 
 
 class TopicTable:
@@ -74,6 +89,7 @@ class TopicTable:
 
     def __init__(self, message_type: MessageType, encoding: str) -> None:
         self.schema = arrow_schema(message_type.wire)
+        self._fields = pa.schema(list(self.schema)[2:])
         self.undecodable: dict[str, int] = {}
         self.replaced_texts = 0
         self.late = 0
@@ -199,8 +215,7 @@ class TopicTable:
 
     def _flush(self) -> None:
         for length, group in self._groups.items():
-            rows = np.concatenate([part for part, _ in group])
-            payloads = np.concatenate([part for _, part in group]) if len(group) > 1 else group[0][1]
+            rows, payloads = (np.concatenate(parts) if len(group) > 1 else parts[0] for parts in zip(*group, strict=True))
             self._decode(length, rows, payloads)
         self._groups = {}
         self._gathered_bytes = 0
@@ -210,11 +225,12 @@ class TopicTable:
         known = self._layouts.setdefault(length, [])
         for layout in known:
             fits = same_shape(layout, payloads)
+            if fits.all():
+                self._keep(layout, rows, payloads)
+                return
             if fits.any():
                 self._keep(layout, rows[fits], payloads[fits])
                 rows, payloads = rows[~fits], payloads[~fits]
-            if not len(rows):
-                return
         misses = 0
         while len(rows):
             worthwhile = len(rows) >= MIN_GROUP or self._seen < MIN_GROUP
@@ -239,11 +255,11 @@ class TopicTable:
 
     def _keep(self, layout: Layout, rows: _Int64, payloads: NDArray[np.void]) -> None:
         columns = [self._column(node, of, payloads) for node, of in _flat_nodes(layout.root, self._wire)]
-        self._parts.append((rows, pa.Table.from_arrays(columns, schema=pa.schema(list(self.schema)[2:]))))
+        self._add_part(rows, columns)
 
     def _column(self, node: Node, of: WireType, payloads: NDArray[np.void], repeats: _Repeats = ()) -> pa.Array:
         """Build one column; inside ``repeats`` it has an element for each repetition of each message."""
-        count = len(payloads) * int(np.prod([n for n, _ in repeats], dtype=np.int64))
+        count = math.prod((len(payloads), *(n for n, _ in repeats)))
         match node:
             case ScalarAt():
                 return scalars(strided(payloads, node.offset, node.dtype, repeats).ravel())
@@ -329,7 +345,7 @@ class TopicTable:
 
     def _add_part(self, rows: _Int64, columns: list[pa.Array]) -> None:
         if len(rows):
-            self._parts.append((rows, pa.Table.from_arrays(columns, schema=pa.schema(list(self.schema)[2:]))))
+            self._parts.append((rows, pa.Table.from_arrays(columns, schema=self._fields)))
 
 
 def _contiguous(table: pa.Table) -> pa.Table:

@@ -20,9 +20,10 @@ from tcpipe.formats.arrow_columns import TopicTable
 from tcpipe.formats.bag_log import BagPart
 from tcpipe.formats.log_part import Channel, LogPart, MessageBlock
 from tcpipe.formats.mcap_log import McapPart
-from tcpipe.formats.object_storage import is_url, staged
+from tcpipe.formats.object_storage import copied, is_url
 from tcpipe.formats.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.rosbag2_log import (
+    METADATA,
     STORAGE_SUFFIXES,
     ZSTD_MAGIC,
     MessageDecompressing,
@@ -69,17 +70,13 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
     LogError
         The path is no log: one line with what was found there and what was wanted.
     """
-    stack = ExitStack()
-    try:
+    with ExitStack() as stack:
         if is_url(path):
-            path = staged(str(path), Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tcpipe-"))))
+            path = stack.enter_context(copied(str(path), wanted=belongs_to_a_log))
         path = Path(path)
         _refuse_what_is_no_file(path)
         opened = _open_directory(path, stack) if path.is_dir() else _open_file(path, stack)
-        return Log(path, opened, TypeLibrary(message_definitions), stack)
-    except BaseException:
-        stack.close()
-        raise
+        return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
 
 
 def _refuse_what_is_no_file(path: Path) -> None:
@@ -87,6 +84,11 @@ def _refuse_what_is_no_file(path: Path) -> None:
         raise LogError(f"{path}: there is no such file or directory")
     if not path.is_file() and not path.is_dir():
         raise LogError(f"{path}: it is a pipe or a device; {_WANTED}")
+
+
+def belongs_to_a_log(name: str) -> bool:
+    """Return whether a file of this name is a log or part of one."""
+    return name.lower().endswith((*LOG_SUFFIXES, ".db3-wal")) or name == METADATA
 
 
 def find_logs(path: Path) -> list[Path]:
@@ -168,6 +170,12 @@ class Log:
         """Size of the log's files together."""
         return sum(file.stat().st_size for file in self._files)
 
+    @property
+    def size_and_time(self) -> list[list[int]]:
+        """Size [byte] and modification time [ns] of each file, by name: what tells whether a log is still the same."""
+        found = [file.stat() for file in sorted(self._files, key=lambda file: file.name)]
+        return [[stat.st_size, stat.st_mtime_ns] for stat in found]
+
     def sha256(self) -> str:
         """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name."""
         digest = hashlib.sha256()
@@ -176,6 +184,21 @@ class Log:
                 while block := stream.read(_HASH_BYTES):
                     digest.update(block)
         return digest.hexdigest()
+
+    def definition(self, topic: str) -> tuple[str, str]:
+        """Return the text of a topic's message definition, and where it is from: ``log``, or ``given`` or ``bundled`` in its stead.
+
+        Both are empty where the type is not known.
+        """
+        found = self._resolved(self._channel_of[topic])
+        if isinstance(found, DefinitionError):
+            return self.topics[topic].definition, ""
+        text = (
+            self.topics[topic].definition
+            if found.source == "log"
+            else found.text(ros1=self.topics[topic].encoding == "ros1")
+        )
+        return text, found.source
 
     def table(self, topic: str) -> pa.Table:
         """Return one topic's messages; `LogError` where the topic is unknown or cannot be decoded."""

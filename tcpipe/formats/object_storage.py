@@ -5,15 +5,45 @@ The home of obstore. Credentials, region and endpoint come from the environment,
 
 from __future__ import annotations
 
+import errno
 import os
 import re
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+from urllib.parse import unquote
 
 from tcpipe.errors import LogError
 
-_URL = re.compile(r"[a-z][a-z0-9+.-]*://")
+if TYPE_CHECKING:
+    from obstore.store import ObjectStore
+
+_URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24
+_PERCENT_ENCODED = ("file", "http", "https")
+"""Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
+_RETRIES: dict[str, Any] = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_UNKNOWN = ("169.254.169.254", "Account must be specified")
+"""What is said where no credentials are set: a cloud machine's own are asked for, in vain."""
+_CREDENTIALS = {
+    "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for what is public; AWS_REGION; AWS_ENDPOINT_URL",
+    "gs": "GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for what is public",
+    "az": "AZURE_STORAGE_ACCOUNT_NAME and AZURE_STORAGE_ACCOUNT_KEY, or AZURE_SKIP_SIGNATURE=true for what is public",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class RemoteFile:
+    """An object: its name in the store, size [byte] and modification time [ns]."""
+
+    name: str
+    size_bytes: int
+    modified_ns: int
 
 
 def is_url(text: str | Path) -> bool:
@@ -21,76 +51,130 @@ def is_url(text: str | Path) -> bool:
     return _URL.match(str(text)) is not None
 
 
-def staged(url: str, directory: Path) -> Path:
-    """Copy a log, or every object below a prefix, into ``directory``, and return where it lies there.
+@contextmanager
+def copied(url: str, *, wanted: Callable[[str], bool]) -> Iterator[Path]:
+    """Copy an object, or what is wanted below a prefix, to a temporary directory, and yield where it lies until the block ends.
 
     Parameters
     ----------
     url
         An object (``s3://bucket/drives/run.mcap``), or a prefix (``s3://bucket/drives/bag_directory``).
-    directory
-        An existing local directory. Names and modification times are kept.
+    wanted
+        Whether an object of this name is copied where a prefix was given.
 
     Raises
     ------
     LogError
-        There is no such object, or it cannot be read.
+        There is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the copy's path.
     """
     import obstore  # noqa: PLC0415  most runs stay on this machine
-    from obstore.exceptions import BaseError  # noqa: PLC0415
 
-    address, name = _parted(url)
-    try:
-        store = obstore.store.from_url(address)
-        found = [obstore.head(store, name)] if _is_object(store, name) else list(_below(store, name))
+    def copy(store: ObjectStore, file: RemoteFile, to: Path) -> None:
+        with to.open("wb") as target:
+            for piece in obstore.get(store, file.name).stream(min_chunk_size=_PIECE_BYTES):
+                target.write(piece)
+
+    with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
+        place = _laid_out(url, Path(directory), wanted, copy)
+        try:
+            yield place
+        except LogError as error:
+            raise type(error)(*(problem.replace(str(place), url.rstrip("/")) for problem in error.problems)) from None
+
+
+def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
+    """Lay out what `copied` would copy as files of the right names, sizes and times that hold nothing and take no room.
+
+    Raises
+    ------
+    LogError
+        There is no such object, or the store cannot be read.
+    """
+
+    def hole(_: ObjectStore, file: RemoteFile, to: Path) -> None:
+        with to.open("wb") as target:
+            target.truncate(file.size_bytes)
+
+    return _laid_out(url, directory, wanted, hole)
+
+
+def _laid_out(
+    url: str, directory: Path, wanted: Callable[[str], bool], lay: Callable[[ObjectStore, RemoteFile, Path], None]
+) -> Path:
+    with _told(url):
+        store, name = _opened(url)
+        found = list(_found(store, name, wanted))
         if not found:
-            raise LogError(f"{url}: there is no such object, and none below it")
-        for meta in found:
-            _copy(store, meta, directory)
-    except (BaseError, OSError, ValueError) as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise LogError(f"{url}: it cannot be read ({reason})") from None
+            raise LogError(f"{url}: there is no such object, and no log below it")
+        for file in found:
+            to = _place(file, directory)
+            lay(store, file, to)
+            os.utime(to, ns=(file.modified_ns, file.modified_ns))
     return directory / name if name else directory
 
 
-def _parted(url: str) -> tuple[str, str]:
-    """Return the address of the store, and the name of the object or prefix in it."""
-    scheme, _, rest = url.partition("://")
-    container, slash, name = rest.rstrip("/").rpartition("/")
-    if not slash or (not container and scheme != "file"):
-        return f"{scheme}://{rest.rstrip('/')}", ""
-    return f"{scheme}://{container or '/'}", name
+@contextmanager
+def _told(url: str) -> Iterator[None]:
+    """Turn what goes wrong into one line."""
+    from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
 
-
-def _is_object(store: object, name: str) -> bool:
-    import obstore  # noqa: PLC0415
-
-    if not name:
-        return False
     try:
-        obstore.head(store, name)
-    except (FileNotFoundError, IsADirectoryError):
-        return False
-    return True
+        yield
+    except (BaseError, OSError, ValueError) as error:
+        reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        reason = reason.partition(": <?xml")[0]
+        if isinstance(error, OSError) and error.errno in _NO_ROOM:
+            reason = "no room for a copy here; TMPDIR names a place that has some"
+        scheme = url.partition("://")[0].lower()
+        denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in reason for of in _UNKNOWN)
+        if denied and scheme in _CREDENTIALS:
+            reason = f"the store wants credentials; set {_CREDENTIALS[scheme]}"
+        raise LogError(f"{url}: it cannot be read ({reason})") from None
 
 
-def _below(store: object, prefix: str) -> Iterator[dict[str, object]]:
+def _opened(url: str) -> tuple[ObjectStore, str]:
+    """Return the store, and the name of the object or prefix in it."""
     import obstore  # noqa: PLC0415
 
-    for listed in obstore.list(store, prefix=prefix or None):
-        yield from listed
+    scheme, _, rest = url.partition("://")
+    scheme, rest = scheme.lower(), rest.rstrip("/")
+    if scheme == "file":
+        container, _, name = rest.rpartition("/")
+        container = container or "/"
+    elif scheme in ("http", "https"):
+        container, _, name = rest.rpartition("/") if "/" in rest else (rest, "", "")
+    else:
+        container, _, name = rest.partition("/")
+    name = unquote(name) if scheme in _PERCENT_ENCODED else name
+    options: dict[str, Any] = {} if scheme == "file" else {"retry_config": _RETRIES}
+    if scheme != "file":  # who names an endpoint without TLS means it
+        options["client_options"] = {"allow_http": True, "connect_timeout": timedelta(seconds=5)}
+    return obstore.store.from_url(f"{scheme}://{container}", **options), name
 
 
-def _copy(store: object, meta: dict[str, object], directory: Path) -> None:
+def _found(store: ObjectStore, name: str, wanted: Callable[[str], bool]) -> Iterator[RemoteFile]:
+    """Yield the object of a name; where there is none, what is wanted below it."""
     import obstore  # noqa: PLC0415
 
-    name = PurePosixPath(str(meta["path"]))
+    if name:
+        try:
+            yield _remote_file(obstore.head(store, name))
+        except (FileNotFoundError, IsADirectoryError):
+            pass
+        else:
+            return
+    for listed in obstore.list(store, prefix=name or None):
+        yield from (_remote_file(meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name))
+
+
+def _remote_file(meta: Any) -> RemoteFile:
+    return RemoteFile(str(meta["path"]), int(meta["size"]), round(meta["last_modified"].timestamp() * 1e6) * 1000)
+
+
+def _place(file: RemoteFile, directory: Path) -> Path:
+    name = PurePosixPath(file.name)
     if name.is_absolute() or ".." in name.parts:
-        raise LogError(f"{name}: an object of this name is not copied")
-    copy = directory / name
-    copy.parent.mkdir(parents=True, exist_ok=True)
-    with copy.open("wb") as file:
-        for piece in obstore.get(store, str(meta["path"])).stream(min_chunk_size=_PIECE_BYTES):
-            file.write(piece)
-    modified = meta["last_modified"].timestamp()  # type: ignore[attr-defined]
-    os.utime(copy, (modified, modified))
+        raise LogError(f"{file.name}: an object of this name is not copied")
+    place = directory / name
+    place.parent.mkdir(parents=True, exist_ok=True)
+    return place

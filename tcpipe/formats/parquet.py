@@ -17,6 +17,7 @@ from tcpipe.formats.atomic import atomic_file
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
+EMPTY_MEMBER = "structure_needs_at_least_one_member"
 
 
 def write_table(table: pa.Table, path: Path, *, rows_per_group: int = ROWS_PER_GROUP) -> None:
@@ -43,6 +44,25 @@ def parquet_rows(
         ) as writer,
     ):
         yield lambda table: writer.write_table(table.combine_chunks(), row_group_size=rows_per_group)
+
+
+def storable(table: pa.Table) -> pa.Table:
+    """Return the table as Parquet can hold it: messages without fields, in arrays, get the member ROS 2 gives them on the wire, null."""
+    for at, field in enumerate(table.schema):
+        wanted = _with_a_member(field.type)
+        if wanted != field.type:
+            table = table.set_column(at, field.with_type(wanted), pa.array(table.column(at).to_pylist(), wanted))
+    return table
+
+
+def _with_a_member(of: pa.DataType) -> pa.DataType:
+    """Return the type with a member in every struct that has none."""
+    if pa.types.is_struct(of):
+        fields = [field.with_type(_with_a_member(field.type)) for field in of]
+        return pa.struct(fields or [pa.field(EMPTY_MEMBER, pa.uint8())])
+    if pa.types.is_fixed_size_list(of):
+        return pa.list_(_with_a_member(of.value_type), of.list_size)
+    return pa.list_(_with_a_member(of.value_type)) if pa.types.is_list(of) else of
 
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:

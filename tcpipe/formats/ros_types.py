@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal
 
 from rosbags.interfaces import Nodetype
 from rosbags.serde import SerdeError
@@ -36,6 +36,8 @@ from tcpipe.logs.wire_types import (
     fixed_elements,
     record,
 )
+
+Source = Literal["log", "given", "bundled"]
 
 _Definitions = dict[str, tuple[Any, list[tuple[str, Any]]]]
 
@@ -70,10 +72,13 @@ class RowError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class MessageType:
-    """A type ready for decoding: its fields, where its definition came from, and the row-by-row decoder."""
+    """A type ready for decoding: its fields, and the row-by-row decoder.
+
+    ``source`` is where its definition comes from: ``log``, ``given`` (by the user's directory) or ``bundled``.
+    """
 
     wire: Record
-    source: str
+    source: Source
     definitions: _Definitions
 
     def row_decoder(self, encoding: str) -> Callable[[bytes], dict[str, Any]]:
@@ -91,6 +96,12 @@ class MessageType:
             return dict(_flat_values(message, self.wire, ""))
 
         return decode
+
+    def text(self, *, ros1: bool) -> str:
+        """Return the definition as text, without comments: for where the log holds none."""
+        store = Typestore()
+        store.register(self.definitions)
+        return store.generate_msgdef(self.wire.name, ros_version=1 if ros1 else 2)[0]
 
 
 class TypeLibrary:
@@ -120,10 +131,7 @@ class TypeLibrary:
         return found
 
     def _resolve(self, type_name: str, definition: str, schema_encoding: str, *, ros1: bool) -> MessageType:
-        if definition.strip():
-            known, source = _parsed(type_name, definition, schema_encoding), "log"
-        else:
-            known, source = {}, "bundled"
+        known, source = self._known(type_name, definition, schema_encoding)
         fallback = functools.partial(self._fallback, ros1=ros1)
         if type_name not in known and fallback(type_name) is None:
             where = (
@@ -139,6 +147,18 @@ class TypeLibrary:
             what = f"holds {elements} texts or messages in arrays of fixed length, more than {MAX_FIXED_ELEMENTS}"
             raise DefinitionError(f"type {type_name} {what}")
         return MessageType(wire, source, definitions)
+
+    def _known(self, type_name: str, definition: str, schema_encoding: str) -> tuple[_Definitions, Source]:
+        """Return what the log defines; nothing where it defines nothing, or cannot be parsed and the user gives the type."""
+        given: Source = "given" if type_name in self._own else "bundled"
+        if not definition.strip():
+            return {}, given
+        try:
+            return _parsed(type_name, definition, schema_encoding), "log"
+        except DefinitionError:
+            if given == "given":
+                return {}, given
+            raise
 
     def _fallback(self, type_name: str, *, ros1: bool) -> Any | None:
         for known in (self._own, _bundled_by_tcpipe()):

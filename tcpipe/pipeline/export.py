@@ -4,25 +4,44 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, Literal
 
 import pyarrow as pa
 
+from tcpipe import __version__
 from tcpipe.errors import LogError
-from tcpipe.formats.log_file import open_log
-from tcpipe.formats.parquet import parquet_rows
-from tcpipe.logs.topics import Topic
+from tcpipe.formats.json_files import read_json, write_json
+from tcpipe.formats.log_file import Log, open_log
+from tcpipe.formats.parquet import parquet_rows, storable
+from tcpipe.logs.power_sources import bare_unit
+from tcpipe.pipeline.log_sources import definitions_key
 from tcpipe.tables.levels import with_metadata
+
+INDEX = "export.json"
+"""What a directory of exported topics holds, and of which log: a second call finds it done."""
+_LONGEST_STEM = 200
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedTopic:
+    """One topic's file."""
+
+    topic: str
+    type_name: str
+    path: Path
+    rows: int
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
-    """Files written: (topic, path, rows), what the log had lost, and what else is worth saying of it."""
+    """The files, what the log had lost, and what else is worth saying of it; ``unchanged`` where all was there already."""
 
-    files: tuple[tuple[str, Path, int], ...]
+    status: Literal["done", "unchanged"]
+    topics: tuple[ExportedTopic, ...]
     damage: tuple[str, ...]
     remarks: tuple[str, ...]
 
@@ -35,35 +54,138 @@ def export(
     message_definitions: Path | None = None,
     threads: int = 1,
 ) -> Exported:
-    """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, definition in the metadata.
+    """Write each topic to ``out/<topic>.parquet``: one row a message, columns by dotted field name, units and definition in the metadata.
 
-    The log is read and written piece by piece: memory does not grow with it.
+    The log is read once and written piece by piece: memory does not grow with it. What ``out`` holds already of the same log is left
+    alone.
+
+    Parameters
+    ----------
+    log_path
+        A log of any container, or the URL of one.
+    out
+        A directory; it is made where it does not exist.
+    topics
+        Names of topics; none given means all. One text may name several, divided by commas.
+    message_definitions
+        A directory of .msg or .idl files for types that the log does not define.
+    threads
+        How many threads read and decompress.
 
     Raises
     ------
     LogError
-        When the log cannot be read, or a topic is not in it (all missing topics at once).
+        The log cannot be read, none of the topics can, one is not in it (all missing topics at once), or a file belongs to another log.
 
     """
-    with open_log(log_path, message_definitions=message_definitions) as log, ExitStack() as files:
-        missing = [topic for topic in topics if topic not in log.topics]
-        if missing:
-            there = ", ".join(sorted(log.topics)) or "none"
-            raise LogError(*(f"{log_path}: topic {topic} is not in this log; there are: {there}" for topic in missing))
-        wanted = list(topics) or sorted(log.topics)
-        paths = _paths(out, wanted)
-        writers: dict[str, Callable[[pa.Table], None]] = {}
-        rows = dict.fromkeys(wanted, 0)
-        for tables in log.batches(wanted, threads=threads):
+    with open_log(log_path, message_definitions=message_definitions) as log:
+        wanted = _wanted(log, log_path, topics)
+        made_from = _identity(log, log_path, message_definitions)
+        paths = _paths(out, sorted(log.topics))
+        index = _index(out)
+        _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
+        known = {name for name in wanted if _is_there(index["topics"].get(name), made_from, out)}
+        if wanted and known == set(wanted):
+            return _exported("unchanged", index["topics"], wanted, out)
+        written = _write(log, {name: paths[name] for name in wanted}, threads)
+        if wanted and not any(entry["file"] for entry in written.values()):
+            raise LogError(f"{log_path}: nothing to export: no topic can be read", *map(str, log.damage))
+        damage = [str(damage) for damage in log.damage if damage.is_loss]
+        said = {"made_from": made_from, "damage": damage, "remarks": log.remarks}
+        entries = {name: {**said, **entry} for name, entry in written.items()}
+    write_json(out / INDEX, {**index, "topics": {**index["topics"], **entries}})
+    return _exported("done", entries, wanted, out)
+
+
+def _wanted(log: Log, log_path: Path | str, topics: Sequence[str]) -> list[str]:
+    """Return the topics asked for, each once, or all; a text that is no topic's name is taken for several with commas between."""
+    split = [part.strip() for text in topics for part in ([text] if text in log.topics else text.split(","))]
+    missing = [name for name in split if name not in log.topics]
+    if missing:
+        there = ", ".join(sorted(log.topics)) or "none"
+        raise LogError(*(f"{log_path}: topic {name} is not in this log; there are: {there}" for name in missing))
+    return list(dict.fromkeys(split)) if topics else sorted(log.topics)
+
+
+def _identity(log: Log, log_path: Path | str, message_definitions: Path | None) -> dict[str, Any]:
+    """Return what an export depends on, in JSON values."""
+    return {
+        "log": str(log_path) if "://" in str(log_path) else str(Path(log_path).resolve()),
+        "size_and_time": log.size_and_time,
+        "message_definitions": definitions_key(message_definitions),
+        "tcpipe_version": __version__,
+    }
+
+
+def _index(out: Path) -> dict[str, Any]:
+    found = read_json(out / INDEX) if (out / INDEX).is_file() else {}
+    return {**found, "topics": dict(found.get("topics", {}))}
+
+
+def _refuse_others_files(index: Mapping[str, Any], made_from: Mapping[str, Any], paths: Mapping[str, Path]) -> None:
+    others = {
+        entry["file"]: entry["made_from"]["log"]
+        for entry in index["topics"].values()
+        if entry["made_from"]["log"] != made_from["log"]
+    }
+    taken = sorted({others[path.name] for path in paths.values() if path.name in others})
+    if taken:
+        out = next(iter(paths.values())).parent
+        raise LogError(f"{out}: holds the same topics of {', '.join(taken)}; give another directory")
+
+
+def _is_there(entry: Mapping[str, Any] | None, made_from: Mapping[str, Any], out: Path) -> bool:
+    if entry is None or entry["made_from"] != made_from:
+        return False
+    path = None if entry["file"] is None else out / entry["file"]
+    return path is None or (path.is_file() and path.stat().st_size == entry["bytes"])
+
+
+def _exported(
+    status: Literal["done", "unchanged"], entries: Mapping[str, Any], wanted: Sequence[str], out: Path
+) -> Exported:
+    files = tuple(
+        ExportedTopic(name, entries[name]["type"], out / entries[name]["file"], entries[name]["rows"])
+        for name in wanted
+        if entries[name]["file"] is not None
+    )
+    damage = dict.fromkeys(line for name in wanted for line in entries[name]["damage"])
+    remarks = dict.fromkeys(line for name in wanted for line in entries[name]["remarks"])
+    return Exported(status, files, tuple(damage), tuple(remarks))
+
+
+def _write(log: Log, paths: Mapping[str, Path], threads: int) -> dict[str, dict[str, Any]]:
+    """Write the topics in one pass; return what stands in the index of each."""
+    rows = dict.fromkeys(paths, 0)
+    writers: dict[str, Callable[[pa.Table], None]] = {}
+    with ExitStack() as files:
+        for tables in log.batches(list(paths), threads=threads):
             for name, table in tables.items():
                 if name not in writers:
-                    described = with_metadata(table[:0], _description(log.topics[name]))
-                    writers[name] = files.enter_context(parquet_rows(paths[name], described.schema))
-                writers[name](table)
+                    writers[name] = files.enter_context(parquet_rows(paths[name], _schema(log, name, table)))
+                writers[name](storable(table))
                 rows[name] += table.num_rows
-        damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
-        remarks = tuple(log.remarks)
-    return Exported(tuple((name, paths[name], rows[name]) for name in wanted if name in writers), damage, remarks)
+    none: dict[str, Any] = {"file": None, "bytes": 0}
+    return {
+        name: {
+            **({"file": path.name, "bytes": path.stat().st_size} if name in writers else none),
+            "type": log.topics[name].type_name,
+            "rows": rows[name],
+        }
+        for name, path in paths.items()
+    }
+
+
+def _schema(log: Log, name: str, table: pa.Table) -> pa.Schema:
+    """Return the schema of a topic's file: the table's, with the topic, its type and definition."""
+    topic, (definition, source) = log.topics[name], log.definition(name)
+    schema = storable(table[:0]).schema
+    unit = bare_unit(topic.type_name, name)
+    if unit is not None:
+        at = schema.get_field_index("data")
+        schema = schema.set(at, schema.field(at).with_metadata({"unit": unit}))
+    described = {"topic": name, "type": topic.type_name, "definition": definition, "definition_from": source}
+    return with_metadata(schema.empty_table(), described).schema
 
 
 def _paths(out: Path, topics: Sequence[str]) -> dict[str, Path]:
@@ -71,13 +193,9 @@ def _paths(out: Path, topics: Sequence[str]) -> dict[str, Path]:
     paths: dict[str, Path] = {}
     taken: set[str] = set()
     for topic in topics:
-        stem = re.sub(r"[^A-Za-z0-9_.-]+", "_", topic.strip("/")) or "topic"
+        stem = re.sub(r"[^A-Za-z0-9_.-]+|^\.", "_", topic.strip("/"))[:_LONGEST_STEM] or "topic"
         names = (stem if number == 1 else f"{stem}-{number}" for number in itertools.count(1))
         name = next(name for name in names if name.lower() not in taken)
         taken.add(name.lower())
         paths[topic] = out / f"{name}.parquet"
     return paths
-
-
-def _description(topic: Topic) -> dict[str, str]:
-    return {"topic": topic.name, "type": topic.type_name, "definition": topic.definition}

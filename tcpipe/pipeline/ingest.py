@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 import tempfile
 import traceback
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import closing
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,7 +18,7 @@ from tcpipe.formats.joined_log import open_logs
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, read_key, recipe_id
 from tcpipe.logs.profiles import ROBOTS, Robot
-from tcpipe.pipeline.log_sources import LogSource, definitions_key, find_sources, in_turns, with_hashes
+from tcpipe.pipeline.log_sources import LogSource, definitions_key, find_sources, in_turns, on_this_machine, with_hashes
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store, open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GatedTrack, LabelledSegments, Streams, Track
@@ -99,7 +99,7 @@ def ingest(
     ----------
     logs
         ``.mcap``, ``.bag``, ``.db3``, ROS 2 bag directories, or folders searched downward; or URLs of such (``s3://…``), which are
-        copied to this machine while they are read.
+        copied to this machine, one by one, while they are read.
     recipe
         A `Recipe`, a path to one, or None for the one that rules here (``TCPIPE_RECIPE``, nearest tcpipe.toml, defaults).
     robot
@@ -123,7 +123,7 @@ def ingest(
     robot = robot or ruling.robot
     if robot is not None and robot not in ROBOTS:
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(ROBOTS))}")
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as staging:
+    with tempfile.TemporaryDirectory(prefix="tcpipe-") as staging, _gone_if_empty(Path(store)):
         found = find_sources(logs, as_one=as_one, staging=Path(staging))
         house = open_store(store, create=True)
         if on_found:
@@ -147,6 +147,18 @@ def ingest(
         return IngestSummary(house.root, tuple(results[index] for index in range(len(sources))))
 
 
+@contextmanager
+def _gone_if_empty(store: Path) -> Iterator[None]:
+    """Remove directories that were made for the store when nothing came into it."""
+    made = [path for path in (store, *store.absolute().parents) if not path.exists()]
+    try:
+        yield
+    finally:
+        for path in (store / "runs", *made) if made else ():
+            with suppress(OSError):
+                path.rmdir()
+
+
 def ingest_one(task: IngestTask) -> IngestResult:
     """Ingest one run; every error becomes its result, so that one log never costs the others."""
     name = task.source.name
@@ -168,27 +180,36 @@ def ingest_one(task: IngestTask) -> IngestResult:
 
 def _naming(source: LogSource, problems: tuple[str, ...]) -> tuple[str, ...]:
     """Return the problems with the log's name in the first, unless a file of it is named there."""
-    if any(plain_line(str(path)) in problems[0] for path in source.paths):
+    if any(plain_line(origin) in problems[0] for origin in source.origins):
         return problems
     return (f"{source.name}: {problems[0]}", *problems[1:])
 
 
 def _ingest(task: IngestTask) -> IngestResult:
     store, source = Store(task.store), task.source
-    with open_logs(source.paths, message_definitions=task.message_definitions) as log:
-        sha256 = source.sha256 or log.sha256()
-        with store.claimed_run(source.stem, sha256) as run_id:
-            same_as = _twin(store, run_id, source)
-            finished = None if task.force else _finished(store, run_id, task)
-            if finished is not None:
-                return _result(source, _retagged(store, run_id, task), finished, sha256, same_as=same_as)
-            logger.info("%s: reading", source.name)
-            streams, damage, remarks = _streams(store, run_id, log, task)
-            known = {"sha256": sha256, "damage": damage, "remarks": remarks, "tags": _tags(store, run_id, task)}
-            known["message_definitions"] = definitions_key(task.message_definitions)
-            store.write_run_json(run_id, _run_json(log, streams, source, known))
-            run = _fuse_and_label(store, run_id, streams, known, task)
+    with ExitStack() as stack:
+        opened = None if source.sha256 else _opened(task, stack)
+        sha256 = str(opened[1].sha256() if opened else source.sha256)
+        run_id = stack.enter_context(store.claimed_run(source.stem, sha256))
+        same_as = _twin(store, run_id, source)
+        finished = None if task.force else _finished(store, run_id, task)
+        if finished is not None:
+            return _result(source, _retagged(store, run_id, task), finished, sha256, same_as=same_as)
+        task, log = opened or _opened(task, stack)
+        logger.info("%s: reading", source.name)
+        streams, damage, remarks = _streams(store, run_id, log, task)
+        known = {"sha256": sha256, "damage": damage, "remarks": remarks, "tags": _tags(store, run_id, task)}
+        known["message_definitions"] = definitions_key(task.message_definitions)
+        store.write_run_json(run_id, _run_json(log, streams, source, known))
+        run = _fuse_and_label(store, run_id, streams, known, task)
     return _result(source, "done", run, sha256, same_as=same_as)
+
+
+def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, Any]:
+    """Return the task with the log's files on this machine, and the log, both until ``stack`` ends."""
+    source = stack.enter_context(on_this_machine(task.source))
+    log = stack.enter_context(open_logs(source.paths, message_definitions=task.message_definitions))
+    return replace(task, source=source), log
 
 
 def _fuse_and_label(

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import LogError, TcpipeError
 from tcpipe.formats.json_files import plain, read_json
-from tcpipe.formats.log_file import find_logs, open_log
-from tcpipe.formats.object_storage import is_url, staged
+from tcpipe.formats.log_file import belongs_to_a_log, find_logs, open_log
+from tcpipe.formats.object_storage import copied, is_url
 from tcpipe.pipeline.log_inspection import inspect_log
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store, is_store, run_at
@@ -40,8 +39,8 @@ def inspect(
     """
     how = {"robot": robot or recipe.robot, "full": full, "message_definitions": message_definitions}
     if is_url(path):
-        with tempfile.TemporaryDirectory(prefix="tcpipe-") as staging:
-            return {**_logs_at(staged(str(path), Path(staging)), recipe, **how), "path": str(path)}
+        with copied(str(path), wanted=belongs_to_a_log) as copy:
+            return _named(_logs_at(copy, recipe, **how), str(copy), str(path).rstrip("/"))
     path = Path(path)
     if (path / "dataset.json").is_file():
         return {**read_json(path / "dataset.json"), "kind": "dataset", "path": str(path)}
@@ -62,6 +61,16 @@ def _logs_at(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
     if len(logs) == 1:
         return _one(logs[0], recipe, **how)
     return {"kind": "logs", "path": str(path), "logs": [_one_of(entry, recipe, **how) for entry in logs]}
+
+
+def _named(found: dict[str, Any], copy: str, url: str) -> dict[str, Any]:
+    """Return what was found in a copy with the URL in the place of the copy's path."""
+    texts: dict[str, Any] = {key: value.replace(copy, url) for key, value in found.items() if isinstance(value, str)}
+    if "problems" in found:
+        texts["problems"] = [line.replace(copy, url) for line in found["problems"]]
+    if "logs" in found:
+        texts["logs"] = [_named(log, copy, url) for log in found["logs"]]
+    return {**found, **texts}
 
 
 def _logs(path: Path) -> list[Path]:

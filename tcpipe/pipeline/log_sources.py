@@ -5,15 +5,16 @@ from __future__ import annotations
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import LogError, TcpipeError, plain_line
 from tcpipe.formats.joined_log import open_logs
-from tcpipe.formats.log_file import LOG_SUFFIXES, find_logs
-from tcpipe.formats.object_storage import is_url, staged
+from tcpipe.formats.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs
+from tcpipe.formats.object_storage import copied, is_url, stand_ins
 
 _LONGEST_STEM_BYTES = 200
 
@@ -27,7 +28,7 @@ class LogSource:
     sha256: str | None = None
     """None where it has yet to be computed."""
     urls: tuple[str, ...] = ()
-    """Where the log was copied from, if it lay in object storage."""
+    """Where the files lie, if one lies in object storage; ``paths`` then are stand-ins until `on_this_machine` has copied them."""
 
     @property
     def name(self) -> str:
@@ -60,7 +61,7 @@ class LogSource:
 def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> list[LogSource]:
     """Return the logs at or below the given paths, each once, in the order given; `LogError` where there is none.
 
-    With ``as_one`` they are all parts of one. What lies in object storage is copied to ``staging`` first.
+    With ``as_one`` they are all parts of one. For what lies in object storage there are stand-ins in ``staging``.
     """
     paths: dict[Path, None] = {}
     urls: dict[Path, str] = {}
@@ -68,9 +69,9 @@ def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> 
     for number, entry in enumerate(logs):
         try:
             if is_url(entry):
-                copies = _staged(str(entry), staging / str(number))
-                urls.update(copies)
-                paths.update(dict.fromkeys(copies))
+                remote = _remote(str(entry), staging / str(number))
+                urls.update(remote)
+                paths.update(dict.fromkeys(remote))
             else:
                 paths.update(dict.fromkeys(_real(path) for path in find_logs(Path(entry))))
         except LogError as error:
@@ -96,11 +97,25 @@ def definitions_key(directory: Path | None) -> str:
     return digest.hexdigest()[:8]
 
 
-def _staged(url: str, directory: Path) -> dict[Path, str]:
-    """Copy what a URL names; return the logs in it, and the URL of each."""
+def _remote(url: str, directory: Path) -> dict[Path, str]:
+    """Return stand-ins for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
-    copy = staged(url, directory)
-    return {_real(path): "/".join((url.rstrip("/"), *path.relative_to(copy).parts)) for path in find_logs(copy)}
+    place = stand_ins(url, directory, wanted=belongs_to_a_log)
+    return {_real(path): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)}
+
+
+@contextmanager
+def on_this_machine(source: LogSource) -> Iterator[LogSource]:
+    """Yield the source with its files here: what lies in object storage is copied, and the copy removed in the end."""
+    if not source.urls:
+        yield source
+        return
+    with ExitStack() as stack:
+        paths = [
+            stack.enter_context(copied(origin, wanted=belongs_to_a_log)) if is_url(origin) else Path(origin)
+            for origin in source.urls
+        ]
+        yield replace(source, paths=tuple(paths))
 
 
 def with_hashes(sources: Sequence[LogSource], remembered: Mapping[str, Any]) -> list[LogSource]:
@@ -142,6 +157,8 @@ def _remembered(source: LogSource, remembered: Mapping[str, Any]) -> LogSource:
 
 
 def _hashed(source: LogSource) -> LogSource:
+    if source.urls:  # it is hashed when it is copied
+        return source
     try:
         with open_logs(source.paths) as log:
             return replace(source, sha256=log.sha256())

@@ -1,17 +1,35 @@
 """Logs behind a URL: copied, read as any other, refused in one line."""
 
-import os
+import resource
 
 import pytest
 from random_messages import assert_same, expected_columns, random_messages, write_mcap, write_rosbag2
+from storage_server import FORBIDDEN, object_store
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_file import open_log
-from tcpipe.formats.object_storage import is_url, staged
-
-pytest.importorskip("obstore", reason="obstore is not installed")
+from tcpipe.formats.log_file import belongs_to_a_log, open_log
+from tcpipe.formats.object_storage import copied, is_url, stand_ins
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.recipe import Recipe
 
 MESSAGES = random_messages(1, count=10, types=("std_msgs/msg/ColorRGBA",))
+
+
+@pytest.fixture
+def bucket(tmp_path, monkeypatch):
+    """A bucket with a log, a bag directory and what is neither, over HTTP; what was fetched of it."""
+    root = tmp_path / "store" / "drives"
+    (root / "field").mkdir(parents=True)
+    write_mcap(root / "field" / "my run.mcap", MESSAGES)
+    write_rosbag2(root / "field" / "bag", MESSAGES)
+    (root / "field" / "video.mp4").write_bytes(bytes(1000))
+    (root / "junk.bag").write_bytes(b"nonsense")
+    with object_store(tmp_path / "store") as (environment, fetched):
+        for name in ("HTTP_PROXY", "http_proxy"):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        yield root, fetched
 
 
 def test_what_is_a_url():
@@ -21,43 +39,78 @@ def test_what_is_a_url():
     assert not is_url("C:\\run.mcap")
 
 
-def test_a_log_behind_a_url_is_read_as_any_other(tmp_path):
-    path = write_mcap(tmp_path / "run.mcap", MESSAGES)
-    with open_log(path.as_uri()) as log:
+def test_a_log_behind_a_url_is_read_as_any_other(bucket):
+    with open_log("s3://drives/field/my run.mcap") as log:
         copy = log.path
         assert_same(log.table("/ColorRGBA"), expected_columns(MESSAGES, "/ColorRGBA"))
-        assert copy != path
-        assert copy.name == "run.mcap"
+        assert copy.name == "my run.mcap"
+        assert copy.read_bytes() == (bucket[0] / "field" / "my run.mcap").read_bytes()
+        assert copy.stat().st_mtime == 1_600_000_000
     assert not copy.exists()
 
 
-def test_a_prefix_is_a_bag_directory(tmp_path):
-    (tmp_path / "drives").mkdir()
-    bag = write_rosbag2(tmp_path / "drives" / "bag", MESSAGES)
-    with open_log(bag.as_uri()) as log:
+def test_a_prefix_is_a_bag_directory(bucket):
+    with open_log("s3://drives/field/bag/") as log:
         assert log.container == "rosbag2"
         assert_same(log.table("/ColorRGBA"), expected_columns(MESSAGES, "/ColorRGBA"))
 
 
-def test_names_and_times_are_kept(tmp_path):
-    path = write_mcap(tmp_path / "run.mcap", MESSAGES)
-    os.utime(path, (1_600_000_000, 1_600_000_000))
+def test_only_what_belongs_to_a_log_is_copied(bucket):
+    found = inspect("s3://drives", recipe=Recipe())
+    assert [entry["path"] for entry in found["logs"]] == [
+        "s3://drives/field/bag",
+        "s3://drives/field/my run.mcap",
+        "s3://drives/junk.bag",
+    ]
+    assert found["logs"][2]["problems"][0].startswith("s3://drives/junk.bag: not a log")
+    assert sorted(bucket[1]) == ["field/bag/bag.db3", "field/bag/metadata.yaml", "field/my run.mcap", "junk.bag"]
+
+
+def test_stand_ins_cost_nothing(bucket, tmp_path):
     (tmp_path / "here").mkdir()
-    copy = staged(path.as_uri(), tmp_path / "here")
-    assert copy == tmp_path / "here" / "run.mcap"
-    assert copy.stat().st_mtime == 1_600_000_000
-    assert copy.read_bytes() == path.read_bytes()
+    place = stand_ins("s3://drives/field", tmp_path / "here", wanted=belongs_to_a_log)
+    stand_in = place / "my run.mcap"
+    assert stand_in.stat().st_size == (bucket[0] / "field" / "my run.mcap").stat().st_size
+    assert stand_in.stat().st_mtime == 1_600_000_000
+    assert not any(stand_in.read_bytes())
+    assert bucket[1] == []
 
 
 @pytest.mark.parametrize("name", ["nowhere.mcap", "no/such/directory/run.mcap"])
-def test_what_is_not_there_is_refused_in_one_line(tmp_path, name):
+@pytest.mark.parametrize("store", ["file", "s3"])
+def test_what_is_not_there_is_refused_in_one_line(bucket, store, name):
+    url = f"{bucket[0].as_uri()}/{name}" if store == "file" else f"s3://drives/{name}"
     with pytest.raises(LogError) as refused:
-        open_log(f"{tmp_path.as_uri()}/{name}")
+        open_log(url)
     (problem,) = refused.value.problems
     assert name in problem
     assert "\n" not in problem
 
 
-def test_a_scheme_that_nobody_knows_is_refused(tmp_path):
-    with pytest.raises(LogError, match=r"gopher://host/run\.mcap: it cannot be read"):
-        open_log("gopher://host/run.mcap")
+def test_a_store_that_wants_credentials_is_told_in_one_line(bucket):
+    with pytest.raises(LogError) as refused:
+        open_log(f"s3://{FORBIDDEN}/run.mcap")
+    (problem,) = refused.value.problems
+    assert problem.startswith(f"s3://{FORBIDDEN}/run.mcap: it cannot be read (the store wants credentials; set AWS_")
+
+
+def test_a_copy_that_does_not_fit_is_told_in_one_line(bucket):
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (500, before[1]))
+    try:
+        with pytest.raises(LogError, match="no room for a copy here; TMPDIR"):
+            open_log("s3://drives/field/my run.mcap")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_file_whose_url_is_percent_encoded(tmp_path):
+    path = write_mcap(tmp_path / "a b%20c.mcap", MESSAGES)
+    with copied(path.as_uri(), wanted=belongs_to_a_log) as copy:
+        assert copy.name == path.name
+
+
+@pytest.mark.parametrize("url", ["gopher://host/run.mcap", "s3://", "s3:///run.mcap"])
+def test_a_url_that_leads_nowhere_is_refused(url):
+    with pytest.raises(LogError, match=f"{url}: it cannot be read"):
+        open_log(url)

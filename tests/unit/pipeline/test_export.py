@@ -1,0 +1,150 @@
+"""Topics as Parquet: units and definitions in the metadata, nothing done twice, nothing of another log overwritten."""
+
+import json
+
+import pyarrow.parquet as pq
+import pytest
+from mcap.writer import Writer
+from random_messages import ROS1, Message, random_messages, write_bag, write_mcap
+
+from tcpipe.errors import LogError
+from tcpipe.pipeline.export import export
+
+TYPES = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/BatteryState", "nav_msgs/msg/Path")
+
+
+def renamed(messages, *topics):
+    return [Message(topic, m.type_name, m.log_time_ns, m.payload, m.value) for m in messages for topic in topics]
+
+
+def described(path):
+    schema = pq.read_schema(path)
+    return schema, json.loads(schema.metadata[b"tcpipe"])
+
+
+@pytest.fixture
+def log(tmp_path):
+    return write_mcap(tmp_path / "a.mcap", random_messages(1, count=20, types=TYPES))
+
+
+def test_units_and_definition_stand_in_the_file(tmp_path, log):
+    files = {of.topic: of.path for of in export(log, tmp_path / "out").topics}
+    schema, about = described(files["/Imu"])
+    assert (about["topic"], about["type"], about["definition_from"]) == ("/Imu", "sensor_msgs/msg/Imu", "log")
+    assert "float64[9] angular_velocity_covariance" in about["definition"]
+    units = {"log_time_ns": b"ns", "angular_velocity.z": b"rad/s", "linear_acceleration_covariance": b"m2/s4"}
+    assert {name: schema.field(name).metadata[b"unit"] for name in units} == units
+    assert schema.field("header.frame_id").metadata in (None, {})
+    schema, _ = described(files["/Path"])
+    assert json.loads(schema.field("poses").metadata[b"units"])["pose.position.x"] == "m"
+
+
+@pytest.mark.parametrize("ros1", [True, False])
+def test_a_definition_that_the_log_lacks_is_told_all_the_same(tmp_path, ros1):
+    kinds = ("sensor_msgs/msg/BatteryState",)
+    if ros1:
+        messages = random_messages(2, count=5, types=kinds, store=ROS1)
+        path = write_mcap(tmp_path / "a.mcap", messages, store=ROS1, define=False)
+    else:
+        path = write_mcap(tmp_path / "a.mcap", random_messages(2, count=5, types=kinds), define=False)
+    (of,) = export(path, tmp_path / "out").topics
+    _, about = described(of.path)
+    assert about["definition_from"] == "bundled"
+    assert "float32 voltage" in about["definition"]
+
+
+def test_a_bare_number_is_told_by_the_name_of_its_topic(tmp_path):
+    messages = random_messages(3, count=5, types=("std_msgs/msg/Float64",))
+    path = write_mcap(tmp_path / "a.mcap", renamed(messages, "/battery/voltage", "/battery/current", "/depth"))
+    units = {of.topic: described(of.path)[0].field("data").metadata for of in export(path, tmp_path / "out").topics}
+    assert units == {"/battery/voltage": {b"unit": b"V"}, "/battery/current": {b"unit": b"A"}, "/depth": None}
+
+
+def test_a_second_call_finds_everything_done(tmp_path, log):
+    out = tmp_path / "out"
+    first = export(log, out)
+    before = {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.iterdir()}
+    assert export(log, out).status == "unchanged"
+    assert export(log, out, topics=["/Imu"]).status == "unchanged"
+    assert {path: (path.stat().st_mtime_ns, path.read_bytes()) for path in out.iterdir()} == before
+    lost = first.topics[0].path
+    lost.unlink()
+    again = export(log, out)
+    assert (again.status, again.topics) == ("done", first.topics)
+    assert lost.read_bytes() == before[lost][1]
+
+
+def test_topics_are_added_to_what_is_there(tmp_path, log):
+    out = tmp_path / "out"
+    assert [of.topic for of in export(log, out, topics=["/Imu"]).topics] == ["/Imu"]
+    assert [of.topic for of in export(log, out, topics=["/Path, /BatteryState"]).topics] == ["/Path", "/BatteryState"]
+    assert export(log, out).status == "unchanged"
+
+
+def test_a_log_that_has_changed_is_exported_again(tmp_path, log):
+    export(log, tmp_path / "out")
+    write_mcap(log, random_messages(2, count=30, types=TYPES))
+    again = export(log, tmp_path / "out")
+    assert (again.status, {of.rows for of in again.topics}) == ("done", {30})
+
+
+def test_files_of_another_log_are_not_overwritten(tmp_path, log):
+    export(log, tmp_path / "out", topics=["/Imu"])
+    other = write_mcap(tmp_path / "b.mcap", random_messages(2, count=30, types=TYPES))
+    export(other, tmp_path / "out", topics=["/Path"])
+    with pytest.raises(LogError, match=r"holds the same topics of .*a\.mcap; give another directory"):
+        export(other, tmp_path / "out")
+
+
+def test_what_is_damaged_is_said_again_by_the_second_call(tmp_path):
+    path = write_mcap(tmp_path / "a.mcap", random_messages(4, count=200, types=TYPES), chunk_bytes=2048)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    first = export(path, tmp_path / "out")
+    second = export(path, tmp_path / "out")
+    assert (first.status, second.status) == ("done", "unchanged")
+    assert second.damage == first.damage != ()
+
+
+def of_one_message(path, type_name, definition, payload):
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="test")
+        schema = writer.register_schema(type_name, "ros2msg", definition.encode())
+        writer.add_message(writer.register_channel("/x", "cdr", schema), 1, payload, 1)
+        writer.finish()
+    return path
+
+
+def test_topics_of_which_none_can_be_read_are_an_error(tmp_path):
+    path = of_one_message(tmp_path / "a.mcap", "acme_msgs/msg/Thing", "", b"\0\1\0\0")
+    with pytest.raises(LogError, match="no topic can be read") as refused:
+        export(path, tmp_path / "out")
+    assert "type acme_msgs/msg/Thing is unknown" in refused.value.problems[1]
+    assert not (tmp_path / "out").exists()
+
+
+def test_names_that_make_one_file_name_get_files_of_their_own(tmp_path):
+    messages = random_messages(5, count=5, types=("std_msgs/msg/ColorRGBA",))
+    path = write_mcap(tmp_path / "a.mcap", renamed(messages, "/a/b", "a/b", "/A_b", "/" + 300 * "x", "/.x"))
+    files = {of.topic: of.path.name for of in export(path, tmp_path / "out").topics}
+    names = ["A_b.parquet", "_x.parquet", "a_b-2.parquet", "a_b-3.parquet", 200 * "x" + ".parquet"]
+    assert sorted(files.values()) == names
+    alone = export(path, tmp_path / "other", topics=["a/b"]).topics
+    assert [of.path.name for of in alone] == [files["a/b"]]
+
+
+def test_messages_without_fields_inside_arrays(tmp_path):
+    definition = "Nothing[2] pair\nNothing[] some\nfloat32 x\n" + "=" * 80 + "\nMSG: acme/Nothing\n"
+    payload = b"\0\1\0\0" + b"\0\0" + b"\0\0" + b"\3\0\0\0" + b"\0\0\0" + b"\0" + b"\0\0\x80\x3f"
+    path = of_one_message(tmp_path / "a.mcap", "acme/Both", definition, payload)
+    (of,) = export(path, tmp_path / "out").topics
+    (row,) = pq.read_table(of.path).to_pylist()
+    nothing = {"structure_needs_at_least_one_member": None}
+    assert (row["pair"], row["some"], row["x"]) == ([nothing] * 2, [nothing] * 3, 1.0)
+
+
+def test_a_bag_says_its_definitions_too(tmp_path):
+    messages = random_messages(7, count=5, types=("sensor_msgs/msg/Imu",), store=ROS1)
+    (of,) = export(write_bag(tmp_path / "a.bag", messages), tmp_path / "out").topics
+    _, about = described(of.path)
+    assert "geometry_msgs/Quaternion orientation" in about["definition"]
