@@ -18,6 +18,7 @@ from tcpipe.cli.add_map import add_map
 from tcpipe.cli.build_dataset import build_dataset
 from tcpipe.cli.demo import demo
 from tcpipe.cli.diff import diff
+from tcpipe.cli.evaluate import evaluate
 from tcpipe.cli.explain import explain
 from tcpipe.cli.export import export
 from tcpipe.cli.ingest import ingest
@@ -64,6 +65,7 @@ for command in (
     add_map,
     build_dataset,
     train,
+    evaluate,
     report,
     export,
     explain,

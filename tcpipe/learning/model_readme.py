@@ -38,5 +38,5 @@ def model_readme(card: ModelCard) -> str:
         velocity=card.label_velocity, robot=card.robot, width=card.architecture.width,
         config=card.training["config"], told=card.training, dataset=card.dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.seen.ranges["slope_rad"]),
-        relief=" to ".join(f"{value:.2f} m" for value in card.seen.ranges["relief_m"]),
+        relief=" to ".join(f"{value:.2f} m" for value in card.seen.ranges.get("relief_m", ())) or "not looked at",
     )  # fmt: skip

@@ -162,16 +162,18 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
 def what_was_seen(split: Split) -> Seen:
     """Return classes and ranges of what a split holds."""
     pixel_classes: set[int] = set()
-    relief = [np.inf, -np.inf]
+    reliefs_m: list[float] = []
     for first in range(0, len(split), _READ_TOGETHER):
         layers = split.layers(np.arange(first, min(first + _READ_TOGETHER, len(split))))
         if "terrain" in layers:
             pixel_classes |= set(np.flatnonzero(np.bincount(layers["terrain"].ravel())).tolist())
         if "height" in layers:
             spans_m = (layers["height"].max(axis=(1, 2)) - layers["height"].min(axis=(1, 2))) * HEIGHT_STEP_M
-            relief = [min(relief[0], float(spans_m.min())), max(relief[1], float(spans_m.max()))]
+            reliefs_m += [float(spans_m.min()), float(spans_m.max())]
     ranges = {name: _range(split.column(name)) for name in ("slope_rad", "cross_slope_rad")}
-    return Seen(_class_counts(split), tuple(sorted(pixel_classes)), {**ranges, "relief_m": (relief[0], relief[1])})
+    if reliefs_m:
+        ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))
+    return Seen(_class_counts(split), tuple(sorted(pixel_classes)), ranges)
 
 
 def _range(values: Any) -> tuple[float, float]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_card, read_samples, rows_in_files
+from tcpipe.report.balance import balance_sections
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import (
     SPLIT_COLOURS,
@@ -64,6 +65,7 @@ def dataset_report(directory: Path) -> str:
                 "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card["ledger_m"])
             ),
             *_removal_sections(card),
+            *balance_sections(card),
             _audit_section(card),
             *_table_sections(card),
         ],

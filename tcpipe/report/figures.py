@@ -43,8 +43,8 @@ _STYLE: dict[Any, Any] = {
 
 
 @contextmanager
-def _figure(width: float, height: float) -> Iterator[tuple[Figure, list[str]]]:
-    """Yield a figure and a list that receives its SVG text."""
+def figure_svg(width: float, height: float) -> Iterator[tuple[Figure, list[str]]]:
+    """Yield a figure in the house's style and a list that receives its SVG text."""
     out: list[str] = []
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
@@ -86,7 +86,7 @@ def path_on_map(
     """
     left, right, bottom, top = extent_m or (x_m.min(), x_m.max(), y_m.min(), y_m.max())
     height = 0.7 + 5.3 * np.clip((top - bottom) / max(right - left, 1e-9), 0.2, 1.1)
-    with _figure(8.2, float(height)) as (figure, out):
+    with figure_svg(8.2, float(height)) as (figure, out):
         axes = figure.add_subplot()
         if backdrop is not None:
             axes.imshow(backdrop, extent=extent_m, cmap="gray", vmin=0, vmax=255, alpha=0.85, interpolation="nearest")
@@ -110,7 +110,7 @@ def path_on_map(
 
 def over_distance(distance_m: Array, series: Mapping[str, tuple[Array, str]], kept: Array) -> str:
     """Draw series (label → values, colour) over the distance driven, one panel each; what is not kept is shaded."""
-    with _figure(8.2, 1.7 * len(series) + 0.3) as (figure, out):
+    with figure_svg(8.2, 1.7 * len(series) + 0.3) as (figure, out):
         panels = np.atleast_1d(figure.subplots(len(series), 1, sharex=True))
         distance, keep = _thin(distance_m, kept)
         for axes, (label, (values, colour)) in zip(panels, series.items(), strict=True):
@@ -128,7 +128,7 @@ def ledger_bars(ledger_m: Mapping[str, float]) -> str:
     """Draw where every metre went: kept first, then each loss, the largest first."""
     losses = sorted((item for item in ledger_m.items() if item[0] != "kept" and item[1] > 0), key=lambda item: -item[1])
     entries = [("kept", ledger_m.get("kept", 0.0)), *losses]
-    with _figure(8.2, 0.32 * len(entries) + 0.7) as (figure, out):
+    with figure_svg(8.2, 0.32 * len(entries) + 0.7) as (figure, out):
         axes = figure.add_subplot()
         names = [name.replace("_", " ") for name, _ in entries]
         values = np.array([metres for _, metres in entries])
@@ -144,7 +144,7 @@ def ledger_bars(ledger_m: Mapping[str, float]) -> str:
 
 def histograms(values: Mapping[str, Array]) -> str:
     """Draw one histogram a label."""
-    with _figure(8.2, 2.1) as (figure, out):
+    with figure_svg(8.2, 2.1) as (figure, out):
         for axes, (label, data) in zip(np.atleast_1d(figure.subplots(1, len(values))), values.items(), strict=True):
             finite = data[np.isfinite(data)]
             if len(finite):
@@ -158,7 +158,7 @@ def against_slope(
     slope_rad: Array, series: Mapping[str, Array], class_ids: Array, class_names: Mapping[int, str]
 ) -> str:
     """Draw each series against the slope, coloured by terrain class as in the patches; id 0 is unknown."""
-    with _figure(8.2, 2.9) as (figure, out):
+    with figure_svg(8.2, 2.9) as (figure, out):
         panels = np.atleast_1d(figure.subplots(1, len(series)))
         for axes, (label, data) in zip(panels, series.items(), strict=True):
             for number in np.unique(class_ids).tolist():
@@ -177,7 +177,7 @@ def patch_gallery(layers: Mapping[str, Array], titles: Sequence[str]) -> str:
 
     Orthophotos share one contrast, classes one colour each; a height patch spans its own relief.
     """
-    with _figure(8.2, 1.05 * len(layers) + 0.5) as (figure, out):
+    with figure_svg(8.2, 1.05 * len(layers) + 0.5) as (figure, out):
         panels = figure.subplots(len(layers), len(titles), squeeze=False)
         for row, (name, stack) in zip(panels, layers.items(), strict=True):
             look = _layer_look(name, stack)

@@ -22,13 +22,15 @@ class Number:
 
 @dataclass(frozen=True, slots=True)
 class Section:
-    """A heading with a sentence, a picture (SVG text) and a table, each optional."""
+    """A heading with a sentence, pictures (SVG text) and a table, each optional."""
 
     title: str
     text: str = ""
     svg: str = ""
     header: Sequence[str] = field(default_factory=tuple)
     rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
+    figures_from: int | None = None
+    """First column of figures that are written out already: these stand to the right, as numbers do."""
 
 
 def render_page(

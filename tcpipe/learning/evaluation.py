@@ -1,0 +1,238 @@
+"""``tcpipe evaluate``: the paper's section V for any model and dataset, tables I to V, with the labels' own noise beside them."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tcpipe import __version__
+from tcpipe.dataset import Dataset, open_dataset
+from tcpipe.errors import DatasetError
+from tcpipe.formats.json_files import plain
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.metrics import ALL, LEAST, Errors, combined, errors, errors_by_class, label_floor, mean_of_draws
+from tcpipe.learning.models import Model, load_model
+from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs
+from tcpipe.learning.training import Variant, dataset_checksum, train
+from tcpipe.logs.profiles import GENERIC, ROBOTS
+
+logger = logging.getLogger("tcpipe")
+
+KIND = "tcpipe evaluation"
+SPLITS = ("test", "unseen")
+NETWORKS = "networks"
+"""Folder of the networks that an evaluation trains: baselines, and the ablation anew."""
+
+INPUT_SETS = (("O", "C", "H"), ("C", "H"), ("O", "H"), ("O", "C"), ("O",), ("C",), ("H",))
+"""Layers that are left, in the order of table III."""
+
+LETTERS = {"O": "ortho", "C": "terrain", "H": "height"}
+
+OURS, GRASS_ONLY, PER_CLASS, EXPECTED = (
+    "ours",
+    "Wei & Isler, grass only",
+    "Wei & Isler, a net per class",
+    "expected time",
+)
+
+_FEWEST = 20
+"""Samples of a class in train that a network of its own needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateConfig:
+    """How much is evaluated."""
+
+    draws: int = 5
+    """Draws of noise that each ablated input set is the mean of."""
+    baselines: bool = True
+    """Train the networks of Wei & Isler."""
+    retrain: bool = False
+    """Train a network for each input set of the ablation, too."""
+    seed: int = 0
+    """Of the noise."""
+    plotted: int = 21
+    """Patches a class in the pictures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Everything that was found, as JSON values, and what the pictures show."""
+
+    values: dict[str, Any]
+    plots: Mapping[str, Mapping[str, Any]]
+
+
+Sets = dict[str, Measured]
+Trained = Callable[[str, Variant], Model]
+
+
+def evaluate(model: str | Path, dataset: str | Path, out: Path, config: EvaluateConfig) -> Evaluation:
+    """Measure a model on a dataset; networks that it needs beside it are trained into ``out`` and kept there.
+
+    Raises
+    ------
+    ModelError, DatasetError
+        The model is none or does not fit the dataset, or there is nothing to evaluate on.
+
+    """
+    ours, data = load_model(model), open_dataset(dataset)
+    check_fit(ours.card, data, str(model))
+    names = {entry.id: entry.name for entry in ours.classes.classes}
+    sets = {name: found for name in SPLITS if len((found := measured(data[name], names)).split)}
+    said = {name: predicted_costs(ours, found.split) for name, found in sets.items()}
+    for name, found in sets.items():
+        logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
+    fitting = FitConfig(**ours.card.training["config"])
+
+    def trained(name: str, variant: Variant) -> Model:
+        place = out / NETWORKS / name
+        train(dataset, place, config=fitting, variant=variant)
+        return load_model(place)
+
+    values = {
+        "kind": KIND,
+        "schema_version": 1,
+        "tcpipe_version": __version__,
+        "model": {"name": ours.name, "checksum": ours.checksum, "training": ours.card.training},
+        "dataset": {"name": data.card["name"], "sha256": dataset_checksum(data.card), "samples": data.card["splits"]},
+        "config": asdict(config),
+        "splits": {name: _split_values(found, said[name]) for name, found in sets.items()},
+        "ablation": list(_ablation(ours, sets, config, trained)),
+        "energy": _energy(ours, data, sets, said, trained if config.baselines else None),
+        "time": _time(ours, sets, said),
+        "repeatability": data.card.get("repeatability"),
+        "warnings": _warnings(ours, data, sets),
+    }
+    plots = {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()}
+    return Evaluation(plain(values), plots)
+
+
+def _split_values(found: Measured, said: Mapping[str, Any]) -> dict[str, Any]:
+    """Return tables I and II of one split, and what its labels' deviations allow."""
+    counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
+    return {
+        "samples": len(found.split),
+        "classes": counts,
+        "errors": errors_by_class(said, found.costs, found.class_ids, found.names),
+        "label_floor": label_floor(found.deviations, found.costs, found.class_ids, found.names),
+    }
+
+
+def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained) -> Iterator[dict[str, Any]]:
+    """Yield table III, row by row: the trained network with layers replaced by noise, and networks that never had them."""
+    for number, letters in enumerate(_input_sets(ours)):
+        left = tuple(LETTERS[letter] for letter in letters)
+        noise = [channel for channel in ours.channels if channel not in left]
+        logger.info("ablation: {%s}", ",".join(letters))
+        row: dict[str, Any] = {"layers": list(letters), "how": "noise"}
+        for at, (name, found) in enumerate(sets.items()):
+            draws = [
+                _all_errors(
+                    predicted_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found
+                )
+                for draw in range(config.draws if noise else 1)
+            ]
+            row[name] = {quantity: mean_of_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
+        yield row
+        if config.retrain and noise:
+            anew = trained("ablation_" + "".join(letters), Variant(channels=left))
+            yield {
+                "layers": list(letters),
+                "how": "retrained",
+                **{name: _all_errors(predicted_costs(anew, found.split), found) for name, found in sets.items()},
+            }
+
+
+def _input_sets(ours: Model) -> list[tuple[str, ...]]:
+    """Return the paper's input sets, as far as the model has their layers."""
+    has = {letter for letter, layer in LETTERS.items() if layer in ours.channels}
+    found = [tuple(letter for letter in letters if letter in has) for letters in INPUT_SETS]
+    return list(dict.fromkeys(letters for letters in found if letters))
+
+
+def _all_errors(said: Mapping[str, Any], found: Measured) -> dict[str, Errors]:
+    by_class = errors_by_class(said, found.costs, found.class_ids, found.names)
+    return {quantity: by_class[quantity][ALL] for quantity in by_class}
+
+
+def _energy(
+    ours: Model, data: Dataset, sets: Sets, said: Mapping[str, Mapping[str, Any]], trained: Trained | None
+) -> dict[str, Any]:
+    """Return table IV: E by this model, by a height-only network of grass, and by one a class."""
+    found: dict[str, Any] = {OURS: {name: _all_errors(said[name], part)["E"] for name, part in sets.items()}}
+    if trained is None or "height" not in data.card["layers"]:
+        return found
+    counts = ours.card.seen.class_counts
+    grass = next((entry.id for entry in ours.classes.classes if entry.name == "grass" and counts.get(entry.id)), None)
+    networks: dict[int, Model] = {}
+    for class_id in (class_id for class_id, count in counts.items() if count >= _FEWEST):
+        try:
+            variant = Variant(channels=("height",), classes=(class_id,), energy_only=True)
+            networks[class_id] = trained(f"wei_isler_class_{class_id}", variant)
+        except DatasetError as error:
+            logger.info("no network for class %d alone: %s", class_id, error.problems[0])
+    if grass in networks:
+        said_by_grass = {name: predicted_costs(networks[grass], part.split) for name, part in sets.items()}
+        found[GRASS_ONLY] = {name: _all_errors(said_by_grass[name], part)["E"] for name, part in sets.items()}
+    if networks:
+        found[PER_CLASS] = {name: _by_own_network(networks, part) for name, part in sets.items()}
+    return found
+
+
+def _by_own_network(networks: Mapping[int, Model], found: Measured) -> Errors:
+    """Return the errors of E with each class's samples predicted by its own network; classes without one are not counted."""
+    parts = []
+    for class_id, network in networks.items():
+        here = np.flatnonzero(found.class_ids == class_id)
+        if len(here):
+            energy = predicted_costs(network, found.split.take(here))["E"]
+            parts.append(errors(energy, found.costs["E"][here], LEAST["E"]))
+    return combined(parts)
+
+
+def _time(ours: Model, sets: Sets, said: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return table V: T by this model, and T_e = d / v_e at the robot's greatest speed."""
+    fastest = ROBOTS.get(ours.robot, GENERIC).max_velocity_mps
+    found: dict[str, Any] = {OURS: {name: _all_errors(said[name], part)["T"] for name, part in sets.items()}}
+    if fastest is not None:
+        expected = {name: {"T": np.full(len(part.split), ours.chord_m / fastest)} for name, part in sets.items()}
+        found[EXPECTED] = {name: _all_errors(expected[name], part)["T"] for name, part in sets.items()}
+    return found
+
+
+def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
+    """Return what a reader of the figures should know."""
+    lines = []
+    if "unseen" not in sets:
+        lines.append(
+            "the dataset has no unseen samples: it was built without a --split region, or nothing lies outside it"
+        )
+    for name, found in sets.items():
+        for class_id, called in found.names.items():
+            count = int((found.class_ids == class_id).sum())
+            if class_id not in ours.class_counts:
+                lines.append(f"{called}: {count} samples of {name}, none in training: the model never saw this class")
+    if dataset_checksum(data.card) != ours.card.dataset["sha256"]:
+        lines.append(
+            f"the model was trained on another dataset ({ours.card.dataset['name']}, {ours.card.dataset['sha256'][:12]}): "
+            "its test samples here may have been trained on there"
+        )
+    return lines
+
+
+def _plotted(found: Measured, said: Mapping[str, Any], count: int) -> dict[str, Any]:
+    """Return measured and predicted E and T of the first samples of every class (the rows stand in random order)."""
+    rows = [np.flatnonzero(found.class_ids == class_id)[:count] for class_id in found.names]
+    at = np.concatenate(rows)
+    names = [name for name, here in zip(found.names.values(), rows, strict=True) for _ in here]
+    return {
+        "class": names,
+        **{f"{key}_measured": found.costs[key][at] for key in ("E", "T")},
+        **{f"{key}_predicted": said[key][at] for key in ("E", "T")},
+    }

@@ -1,0 +1,192 @@
+"""The page of an evaluation: every table of the paper beside its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tcpipe.learning import paper_tables as paper
+from tcpipe.learning.evaluation import SPLITS, Evaluation
+from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
+from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.prediction_figures import predictions_by_patch
+
+FLOORS = {"label_floor": "label noise alone", "simulation_floor": "a predictor that knows the simulator"}
+"""What an error can hardly be less than, and what the page calls it."""
+
+MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
+_DIGITS = {"w": 2, "v": 3, "T": 3, "E": 2}
+_CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"}
+
+
+def evaluation_page(
+    found: Evaluation, *, title: str, lead: str, before: Sequence[Section] = (), warnings: Sequence[str] = ()
+) -> str:
+    """Return the HTML page; ``before`` and ``warnings`` come first."""
+    values = found.values
+    sections = [*before, *_by_class(values), _ablation(values), _energy(values), _time(values), *_pictures(found)]
+    return render_page(
+        title=title,
+        lead=lead,
+        numbers=[
+            Number(
+                _figure(part["errors"][quantity][ALL], "mape_percent", quantity) + " %", f"MAPE of {quantity}, {name}"
+            )
+            for name, part in values["splits"].items()
+            for quantity in ("E", "T")
+        ],
+        warnings=[*warnings, *values["warnings"]],
+        sections=[section for section in sections if section.rows or section.svg or section.text],
+    )
+
+
+def evaluation_rows(values: Mapping[str, Any]) -> list[tuple[Any, ...]]:
+    """Return every figure as one row: table, split, what, quantity, unit, class, count, RMSE, MAPE [%], count of the MAPE."""
+    found = [*_rows_by_class(values), *_rows_of_ablation(values), *_rows_compared(values)]
+    return [(*keys[:4], UNITS[keys[3]], keys[4], *(error[name] for name in COLUMNS[6:])) for keys, error in found]
+
+
+_Row = tuple[tuple[str, str, str, str, str], Mapping[str, Any]]
+
+
+def _rows_by_class(values: Mapping[str, Any]) -> Iterator[_Row]:
+    for split, part in values["splits"].items():
+        for what in ("errors", *(floor for floor in FLOORS if floor in part)):
+            for quantity, by_class in part[what].items():
+                for name, error in by_class.items():
+                    yield ("by class", split, what, quantity, name), error
+
+
+def _rows_of_ablation(values: Mapping[str, Any]) -> Iterator[_Row]:
+    for row in values["ablation"]:
+        for split in values["splits"]:
+            for quantity, error in row[split].items():
+                yield ("ablation", split, f"{'+'.join(row['layers'])} {row['how']}", quantity, ALL), error
+
+
+def _rows_compared(values: Mapping[str, Any]) -> Iterator[_Row]:
+    for table, quantity in (("energy", "E"), ("time", "T")):
+        for what, by_split in values[table].items():
+            for split, error in by_split.items():
+                yield (table, split, what, quantity, ALL), error
+
+
+COLUMNS = ("table", "split", "what", "quantity", "unit", "class", "count", "rmse", "mape_percent", "mape_count")
+"""Of `evaluation_rows`."""
+
+
+def _figure(error: Mapping[str, Any] | None, measure: str, quantity: str) -> str:
+    value = None if error is None else error[measure]
+    return "–" if value is None else f"{value:.{2 if measure == 'mape_percent' else _DIGITS[quantity]}f}"
+
+
+def _paper_figure(value: float | None) -> str:
+    return "–" if value is None else f"{value:.2f}"
+
+
+def _unit(measure: str, quantity: str) -> str:
+    return "%" if measure == "mape_percent" else UNITS[quantity]
+
+
+def _by_class(values: Mapping[str, Any]) -> list[Section]:
+    """Return tables I and II."""
+    sections = []
+    for number, name in zip(("I", "II"), SPLITS, strict=True):
+        if name not in values["splits"]:
+            continue
+        part = values["splits"][name]
+        classes = [*part["classes"], ALL]
+        rows = []
+        for quantity in QUANTITIES:
+            for measure, called in MEASURES.items():
+                ours = [_figure(part["errors"][quantity].get(entry), measure, quantity) for entry in classes]
+                rows.append((f"{quantity}, {called} [{_unit(measure, quantity)}]", "here", *ours))
+                told = dict(zip(paper.CLASSES, paper.BY_CLASS[name, quantity, measure], strict=True))
+                rows.append(("", "the paper", *(_paper_figure(told.get(entry)) for entry in classes)))
+                for floor, said in (
+                    ("label_floor", "label noise alone"),
+                    ("simulation_floor", "simulation's own floor"),
+                ):
+                    if floor in part:
+                        noise = [_figure(part[floor][quantity].get(entry), measure, quantity) for entry in classes]
+                        rows.append(("", said, *noise))
+        header = (
+            "",
+            "",
+            *(f"{entry} ({part['classes'][entry]})" for entry in part["classes"]),
+            f"all ({part['samples']})",
+        )
+        sections.append(
+            Section(f"Table {number}: {_CALLED[name]}", _TEXT[name], header=header, rows=rows, figures_from=2)
+        )
+    return sections
+
+
+_TEXT = {
+    "test": "Label noise alone is what a perfect prediction would show for the labels' own standard deviations.",
+    "unseen": "The paper calls it validation; nothing was tuned or stopped by it.",
+}
+
+
+def _ablation(values: Mapping[str, Any]) -> Section:
+    """Return table III."""
+    splits = list(values["splits"])
+    rows = []
+    for row in values["ablation"]:
+        key = tuple(row["layers"])
+        called, how = "{" + ", ".join(key) + "}", "retrained" if row["how"] == "retrained" else "here"
+        for split in splits:
+            figures = [_figure(row[split][quantity], measure, quantity) for quantity, measure in paper.ABLATION_COLUMNS]
+            rows.append((called, split, how, *figures))
+            if row["how"] == "noise" and key in paper.ABLATION:
+                told = paper.ABLATION[key][SPLITS.index(split)]
+                rows.append(("", "", "the paper", *(_paper_figure(value) for value in told)))
+    header = ("layers", "", "", *(f"{q} {MEASURES[m]} [{_unit(m, q)}]" for q, m in paper.ABLATION_COLUMNS))
+    draws = values["config"]["draws"]
+    text = f"Layers that are not named are replaced by noise in the trained network; mean of {draws} draws. Retrained: a network that never had them."
+    return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
+
+
+def _compared(title: str, text: str, found: Mapping[str, Any], told: Mapping[str, Any], quantity: str) -> Section:
+    splits = list(next(iter(found.values()), {}))
+    rows = []
+    for what, by_split in found.items():
+        cells = [_figure(by_split[split], measure, quantity) for split in splits for measure in MEASURES]
+        rows.append((what, "here", *cells))
+        if what in told:
+            values = [value for split in splits for value in told[what][SPLITS.index(split)]]
+            rows.append(("", "the paper", *(_paper_figure(value) for value in values)))
+    header = (
+        "",
+        "",
+        *(f"{split}, {called} [{_unit(m, quantity)}]" for split in splits for m, called in MEASURES.items()),
+    )
+    return Section(title, text, header=header, rows=rows, figures_from=2)
+
+
+def _energy(values: Mapping[str, Any]) -> Section:
+    text = "Wei and Isler predict E from heights alone: one network of grass, or one for every class."
+    return _compared("Table IV: energy against Wei and Isler", text, values["energy"], paper.ENERGY, "E")
+
+
+def _time(values: Mapping[str, Any]) -> Section:
+    text = "The expected time is d / v at the robot's greatest speed."
+    return _compared("Table V: time against the expected time", text, values["time"], paper.TIME, "T")
+
+
+def _pictures(found: Evaluation) -> list[Section]:
+    """Return the paper's pictures: E of test samples and T of the unseen area, each with its error."""
+    sections = []
+    for split, quantity, label in (("test", "E", "energy E [J]"), ("unseen", "T", "time T [s]")):
+        if split in found.plots:
+            plot = found.plots[split]
+            svg = predictions_by_patch(
+                np.asarray(plot[f"{quantity}_measured"]),
+                np.asarray(plot[f"{quantity}_predicted"]),
+                plot["class"],
+                label=label,
+            )
+            sections.append(Section(f"{label}, {split}: measured and predicted", svg=svg))
+    return sections

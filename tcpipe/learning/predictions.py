@@ -1,0 +1,120 @@
+"""What a model says of a split beside what was measured there, whole or with layers replaced by noise."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.dataset import Dataset, Split
+from tcpipe.errors import DatasetError, ModelError
+from tcpipe.learning.metrics import Array, costs
+from tcpipe.learning.model_card import ModelCard
+from tcpipe.learning.models import Model
+from tcpipe.learning.training import class_table
+
+_TOGETHER = 1024
+_UNKNOWN = (0, "unknown")
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The labelled samples of a split: w, v, T, E, their deviations, and terrain classes."""
+
+    split: Split
+    costs: Mapping[str, Array]
+    deviations: Mapping[str, Array]
+    class_ids: NDArray[np.int64]
+    names: Mapping[int, str]
+    """Of the classes that occur, by id."""
+
+
+def measured(split: Split, names: Mapping[int, str]) -> Measured:
+    """Return what was measured; samples without a label are left out.
+
+    Parameters
+    ----------
+    split
+        Of a dataset.
+    names
+        Of its classes, by id.
+
+    """
+    with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column("energy_joule").astype(np.float64))
+    chosen = split.take(with_label)
+    labels = chosen.labels.astype(np.float64)
+    plain = {name: chosen.column(name).astype(np.float64) for name in (
+        "duration_s", "energy_joule", "power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule", "terrain_class",
+    )}  # fmt: skip
+    class_ids = np.nan_to_num(plain["terrain_class"], nan=_UNKNOWN[0]).astype(np.int64)
+    known = dict([_UNKNOWN, *names.items()])
+    return Measured(
+        chosen,
+        {"w": labels[:, 0], "v": labels[:, 1], "T": plain["duration_s"], "E": plain["energy_joule"]},
+        {
+            "w": plain["power_std_watt"],
+            "v": plain["velocity_std_mps"],
+            "T": plain["duration_std_s"],
+            "E": plain["energy_std_joule"],
+        },
+        class_ids,
+        {class_id: known.get(class_id, str(class_id)) for class_id in np.unique(class_ids).tolist()},
+    )
+
+
+def predicted_costs(
+    model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)
+) -> dict[str, Array]:
+    """Return what a model says of w, v, T, E of every sample, shape (N,) each; of E alone where it predicts nothing else.
+
+    Parameters
+    ----------
+    model, split
+        Of the same channels.
+    noise
+        Channels that are replaced by noise, uniform in [0, 1], each pixel on its own (section V-C).
+    seed
+        Of that noise.
+
+    """
+    chosen = split.with_channels(*model.channels)
+    rng = np.random.default_rng(list(seed))
+    replaced = [model.channels.index(name) for name in noise]
+    parts = [np.empty((0, len(model.card.outputs)), np.float32)]
+    for patches in _patches(chosen):
+        for channel in replaced:
+            patches[..., channel] = rng.random(patches.shape[:3], np.float32)
+        parts.append(model.predict(patches))
+    said = np.concatenate(parts).astype(np.float64)
+    return {"E": said[:, 0]} if said.shape[1] == 1 else costs(said[:, 0], said[:, 1], model.chord_m)
+
+
+def _patches(split: Split) -> Iterator[NDArray[np.float32]]:
+    for first in range(0, len(split), _TOGETHER):
+        yield split.batch(np.arange(first, min(first + _TOGETHER, len(split))))[0].copy()
+
+
+def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
+    """Raise an error with every reason for which a model cannot be asked about a dataset."""
+    told = data.card
+    problems = [f"classes: in the model {clause}" for clause in card.classes.differences(class_table(told))]
+    same = (
+        ("patch_px", card.architecture.patch_px, told["patch_px"]),
+        ("patch_m", card.patch_m, told["patch_m"]),
+        ("segment.chord_m", card.chord_m, told["recipe"]["segment"]["chord_m"]),
+        ("label.velocity", card.label_velocity, told["label"]["velocity"]),
+        ("robot", card.robot, ", ".join(told["robots"])),
+    )
+    problems += [
+        f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
+    ]
+    absent = [channel for channel in card.channels if channel not in told["layers"]]
+    problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
+    if problems:
+        raise ModelError(*(f"{name} does not fit {data.path}: {problem}" for problem in problems))
+    if not len(data["test"]) and not len(data["unseen"]):
+        raise DatasetError(
+            f"{data.path}: no samples in split test nor unseen: nothing to evaluate on; build it with a --split"
+        )

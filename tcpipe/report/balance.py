@@ -1,0 +1,74 @@
+"""What a dataset covers, how much of it is independent, and how well its labels repeat themselves: sections of its page."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from tcpipe.balance.cells import SLOPE_NAMES
+from tcpipe.report.page import Section
+
+_UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
+
+
+def balance_sections(card: Mapping[str, Any]) -> Iterator[Section]:
+    """Yield the sections; nothing for a dataset of before."""
+    balance = card.get("balance")
+    if balance:
+        yield _cells(balance)
+        yield _repeatability(balance)
+
+
+def _cells(balance: Mapping[str, Any]) -> Section:
+    seen = {row["slope"] for row in balance["by_class_and_slope"]}
+    slopes = [name for name in SLOPE_NAMES if name in seen]
+    by_class: dict[str, dict[str, str]] = {}
+    for row in balance["by_class_and_slope"]:
+        by_class.setdefault(row["class"] or "any", {})[row["slope"]] = _cell_text(row)
+    rare = sum(row["rare"] for row in balance["by_class_and_slope"])
+    text = (
+        f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_alike(balance)}). "
+        f"{rare} of {len(balance['by_class_and_slope'])} cells are worth fewer than {balance['enough_effective']:g} and marked with *; "
+        "– is ground of the map that nobody drove. drive-next.geojson holds where to drive for them; open it in a GIS."
+    )
+    rows = [(name, *(cells.get(slope, "") for slope in slopes)) for name, cells in by_class.items()]
+    return Section("Balance of class and slope", text, header=("class", *slopes), rows=rows)
+
+
+def _cell_text(row: Mapping[str, Any]) -> str:
+    count = sum(row["samples"].values())
+    if not count:
+        return "–"
+    worth = "" if row["effective"] is None else f" ({row['effective']:.0f})"
+    return f"{count}{worth}{'*' if row['rare'] else ''}"
+
+
+def _alike(balance: Mapping[str, Any]) -> str:
+    found = [
+        f"{_name(label)} over {entry['length_m']:.1f} m, {100 * entry['share']:.0f} % of its variance"
+        for label, entry in balance["correlation"].items()
+        if entry is not None
+    ]
+    return "; ".join(found) or "how far cannot be told from so few"
+
+
+def _repeatability(balance: Mapping[str, Any]) -> Section:
+    rows = []
+    for label, entry in balance["repeatability"].items():
+        unit = _UNITS[label.rsplit("_", 1)[1]]
+        if entry is not None:
+            ends = (entry["std_low"], entry["std_high"])
+            interval = "too few places" if None in ends else f"{ends[0]:.3g} to {ends[1]:.3g}"
+            rows.append((_name(label), f"{entry['std']:.3g} {unit}", interval, entry["pairs"], entry["places"],
+                         f"{100 * (1 - min(entry['share_of_variance'], 1.0)):.1f} %"))  # fmt: skip
+    text = (
+        "Places that were driven again in the same direction: no model can predict a single label better than it repeats itself."
+        if rows
+        else "No place was driven twice in the same direction; do so to learn how well a label repeats itself."
+    )
+    header = ("label", "repeats to (standard deviation)", "95 % interval", "pairs", "places", "variance to explain")
+    return Section("Repeatability: no model can beat this", text, header=header if rows else (), rows=rows)
+
+
+def _name(label: str) -> str:
+    return label.rsplit("_", 1)[0].replace("_", " ")

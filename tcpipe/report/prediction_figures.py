@@ -1,0 +1,54 @@
+"""The paper's pictures of predictions (its figures 5 to 8): some patches of every class, measured and predicted, and their error."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tcpipe.report.figures import FAINT, INK, Array, figure_svg
+
+MEASURED = "#b3202a"
+PREDICTED = "#2a6fb0"
+
+
+def predictions_by_patch(measured: Array, predicted: Array, classes: Sequence[str], *, label: str) -> str:
+    """Draw measured and predicted values over the patch number, and below it the absolute percentage error.
+
+    Parameters
+    ----------
+    measured, predicted
+        Shape (N,), sorted by class.
+    classes
+        Name of each patch's class, shape (N,).
+    label
+        Of the values, with unit.
+
+    """
+    number = np.arange(1, len(measured) + 1)
+    with figure_svg(8.2, 3.9) as (figure, out):
+        values, error = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+        values.plot(number, measured, color=MEASURED, lw=1.1, label="measured")
+        values.plot(number, predicted, color=PREDICTED, lw=1.1, label="predicted")
+        values.set_ylabel(label)
+        values.legend(loc="lower right", bbox_to_anchor=(1.0, 1.05), ncols=2, frameon=False, borderaxespad=0.0)
+        error.plot(number, 100.0 * np.abs(predicted - measured) / np.abs(measured), color=INK, lw=1.1)
+        error.set_ylabel("absolute error [%]")
+        error.set_ylim(0.0, 50.0)
+        error.set_xlabel("patch number")
+        for shade, name in enumerate(dict.fromkeys(classes)):
+            here = number[[entry == name for entry in classes]]
+            first, last = here[0] - 0.5, here[-1] + 0.5
+            for axes in (values, error):
+                axes.axvspan(first, last, color=FAINT if shade % 2 == 0 else "#ffffff", alpha=0.18, lw=0)
+            values.text(
+                (first + last) / 2,
+                1.02,
+                name,
+                transform=values.get_xaxis_transform(),
+                ha="center",
+                va="bottom",
+                fontsize=8,
+            )
+        values.set_xlim(0.5, len(number) + 0.5)
+    return out[0]
