@@ -35,7 +35,15 @@ from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.seals import sealed_page, write_sealed
 from tcpipe.formats.zarr_arrays import Compression
-from tcpipe.pipeline.dataset_card import CARD_COLUMNS, CardFacts, dataset_card, is_whole, map_to_json
+from tcpipe.pipeline.dataset_balance import BALANCE_COLUMNS, DRIVE_NEXT, measure_balance
+from tcpipe.pipeline.dataset_card import (
+    CARD_COLUMNS,
+    VELOCITY_COLUMN,
+    CardFacts,
+    dataset_card,
+    is_whole,
+    map_to_json,
+)
 from tcpipe.pipeline.dataset_content import Content, gather_content
 from tcpipe.pipeline.dataset_inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset_segments import KEPT
@@ -221,6 +229,16 @@ def _build(
     shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
     shutil.rmtree(spool)
     write_overview(directory / OVERVIEW, map_overview(content.sources[0]))
+    balance = measure_balance(
+        read_samples(directory, BALANCE_COLUMNS),
+        content.samples.centres_xy_m(),
+        content.sources,
+        velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
+        chord_m=recipe.segment.chord_m,
+        regions=regions,
+        buffer_m=content.drawn.buffer_m,
+    )
+    write_json(directory / DRIVE_NEXT, balance.drive_next)
     files = file_checksums(directory)
     write_json(directory / CROISSANT, _croissant(files, recipe))
     facts = CardFacts(
@@ -241,6 +259,7 @@ def _build(
         ],
         ledger_m=content.ledger_m,
         removal=content.removal.to_json(),
+        balance=balance.facts,
         warnings=content.warnings,
         shards=shards,
         checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},

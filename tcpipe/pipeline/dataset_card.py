@@ -48,6 +48,7 @@ class CardFacts:
     maps: Sequence[Mapping[str, Any]]
     ledger_m: Mapping[str, float]
     removal: Mapping[str, Any]
+    balance: Mapping[str, Any]
     warnings: Sequence[str]
     shards: Sequence[Mapping[str, Any]]
     checksums: Mapping[str, tuple[int, str]]
@@ -95,6 +96,7 @@ def dataset_card(samples: pa.Table, recipe: Recipe, facts: CardFacts) -> dict[st
         },
         "ledger_m": dict(facts.ledger_m),
         "removal": dict(facts.removal),
+        "balance": dict(facts.balance),
         "runs": [{**run, "samples": _count(samples, "run_id", run["run_id"])} for run in facts.runs],
         "maps": list(facts.maps),
         "warnings": list(facts.warnings),

@@ -84,6 +84,11 @@ class SampleTable:
         found: list[str] = self.segments.column("segment_id").take(rows).to_pylist()
         return found
 
+    def centres_xy_m(self) -> NDArray[np.float64]:
+        """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
+        centres: NDArray[np.float64] = self.patches.footprint_xy_m[self.patch].mean(axis=1)
+        return centres
+
     def splits(self) -> NDArray[np.str_]:
         """Return the split of every sample, shape (N,)."""
         return self.assigned.split[self.patch]

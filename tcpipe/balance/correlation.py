@@ -1,0 +1,117 @@
+"""How alike the labels of near samples are, and to how many independent ones a set of samples is worth (ADR 20).
+
+What is alike is not the label but its residual: what is left of it when class and slope have explained what they can. Its
+semivariogram γ(h), half the mean squared difference of residuals h apart, is fitted by c0 + c1 (1 - exp(-h / L)) (Cressie, *Statistics for
+Spatial Data*, 1993, sections 2.4 and 2.6): L is the correlation length, c1 / (c0 + c1) the share of variance that neighbours have in
+common. The mean of n samples then has the variance of the mean of
+
+    n_eff = n² / Σij ρ(hij) = n / (1 + (n - 1) m),   ρ(h) = c1 / (c0 + c1) exp(-h / L) for i ≠ j, ρ = 1 for i = j,
+
+independent ones, m being the mean of ρ over all pairs of two (Bayley and Hammersley, "The effective number of independent
+observations in an autocorrelated time series", 1946; Cressie 1993, section 1.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.spatial.distance import pdist
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_LAGS = (0.0, 0.5, 1.5, 2.5, 3.5, 4.5, 6.0, 8.0, 11.0, 15.0, 20.0, 28.0, 40.0)
+"""Borders between the distances whose pairs are taken together, in chords."""
+_LENGTHS = np.geomspace(0.25, 40.0, 120)
+"""Correlation lengths that are tried, in chords."""
+_FEWEST_PAIRS = 30
+_FEWEST_FITTED = 12
+"""Below so many samples a class is described by its mean, not by a parabola over slope."""
+_STRETCH, _MOST = 200, 4000
+"""The semivariogram is made from whole stretches of so many samples, and from so many samples at most."""
+_MOST_IN_CELL = 2000
+"""Mean correlations are over the pairs of so many samples at most, the first ones: rows are in random order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Correlation:
+    """Correlation of residuals at distance h: ``share`` · exp(-h / ``length_m``)."""
+
+    length_m: float
+    share: float
+    """From 0 to 1."""
+    pairs: int
+    """Pairs of samples that it was estimated from."""
+
+
+def residuals(values: Floats, terrain_class: Ints, slope_rad: Floats) -> Floats:
+    """Return what a parabola over slope, one a class, leaves of a label, shape (N,)."""
+    left = np.empty(len(values))
+    for kind in np.unique(terrain_class):
+        rows = np.flatnonzero(terrain_class == kind)
+        powers = 3 if len(rows) >= _FEWEST_FITTED else 1
+        design = np.vander(slope_rad[rows], powers, increasing=True)
+        left[rows] = values[rows] - design @ np.linalg.lstsq(design, values[rows])[0]
+    return left
+
+
+def correlation(residual: Floats, xy_m: Floats, run: Ints, start_ns: Ints, *, chord_m: float) -> Correlation | None:
+    """Return how residuals are correlated over distance; None where too few samples are near each other to say.
+
+    Parameters
+    ----------
+    residual
+        Of `residuals`, shape (N,).
+    xy_m
+        Centres of the footprints [m], shape (N, 2).
+    run, start_ns
+        Number of each sample's run, and its start [ns], shape (N,).
+    chord_m
+        Segment length [m].
+
+    """
+    rows = _stretches(run, start_ns)
+    apart = pdist(xy_m[rows]) / chord_m
+    half_squares = pdist(residual[rows, None], "sqeuclidean") / 2.0
+    bins = np.digitize(apart, _LAGS) - 1
+    size = len(_LAGS)
+    pairs = np.bincount(bins, minlength=size)[: size - 1]
+    enough = pairs >= _FEWEST_PAIRS
+    if enough.sum() < 3 or not half_squares.any():
+        return None
+    lag = (np.bincount(bins, apart, size)[: size - 1][enough]) / pairs[enough]
+    gamma = np.bincount(bins, half_squares, size)[: size - 1][enough] / pairs[enough]
+    length, nugget, sill = _fit(lag, gamma, pairs[enough])
+    return Correlation(length * chord_m, sill / (nugget + sill), int(pairs.sum()))
+
+
+def _stretches(run: Ints, start_ns: Ints) -> Ints:
+    """Return rows of whole stretches of the drives, spread evenly; all rows where there are few."""
+    order = np.lexsort((start_ns, run))
+    if len(order) <= _MOST:
+        return order
+    firsts = np.linspace(0, len(order) - _STRETCH, _MOST // _STRETCH).astype(np.int64)
+    return np.unique(np.concatenate([order[first : first + _STRETCH] for first in firsts]))
+
+
+def _fit(lag: Floats, gamma: Floats, pairs: Ints) -> tuple[float, float, float]:
+    """Return length, nugget and sill of the exponential model by weighted least squares (weights of Cressie 1985: pairs / γ²)."""
+    weight = np.sqrt(pairs) / np.maximum(gamma, 1e-12 * gamma.max())
+    best = (np.inf, 0.0, 1.0, 0.0)
+    for length in _LENGTHS:
+        design = np.column_stack([np.ones(len(lag)), 1.0 - np.exp(-lag / length)])
+        (nugget, sill), misfit = nnls(design * weight[:, None], gamma * weight)
+        best = min(best, (float(misfit), float(length), float(nugget), float(sill)))
+    return best[1:]
+
+
+def effective_size(xy_m: Floats, found: Correlation) -> float:
+    """Return to how many independent samples those at ``xy_m`` [m], shape (n, 2), are worth: from 1 to n, 0 of none."""
+    count = len(xy_m)
+    if count <= 1:
+        return float(count)
+    alike = found.share * float(np.exp(-pdist(xy_m[:_MOST_IN_CELL]) / found.length_m).mean())
+    return count / (1.0 + (count - 1) * alike)
