@@ -15,6 +15,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.formats.chunk_runs import (
+    MAX_PLANNED_BYTES,
+    Entries,
+    Run,
+    by_place,
+    copy_pieces,
+    excerpt,
+    groups,
+    runs,
+)
 from tcpipe.formats.log_part import (
     MAX_CHUNK_BYTES,
     ByteSource,
@@ -39,6 +49,8 @@ _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MAX_CHUNK_HEADER = 128
 _NS = 1_000_000_000
 _TIME = struct.Struct("<II")
+_INDEX_ENTRY_BYTES = 12
+_LEAST_RECORD_BYTES = 8
 
 _Messages = tuple[Int64Array, Int64Array, Int64Array]
 """Connection, offset and log time of messages, shape (N,) each; each connection's lie in one piece."""
@@ -88,6 +100,24 @@ class _Connection:
     ends: list[int] = field(default_factory=list)
 
 
+@dataclass(frozen=True, slots=True)
+class _PlacedChunk:
+    """A chunk to read, the number of the bytes before it, its record (None where that is broken), and how much it holds [byte]."""
+
+    chunk: _Chunk
+    base: int
+    record: _Record | None
+    size: int
+
+
+class _ChunkRun:
+    """A run of chunks to read: its plan, and the chunks of its group."""
+
+    def __init__(self, plan: Run, members: list[_PlacedChunk]) -> None:
+        self.plan, self.members = plan, members
+        self.bases = np.array([member.base for member in members], np.int64)
+
+
 class BagPart:
     """One .bag file, open for reading."""
 
@@ -117,68 +147,123 @@ class BagPart:
         return "chunks of a .bag carry no checksum, unless they are bz2" if self._without_checksum else ""
 
     def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted connections, chunk by chunk."""
+        """Yield the messages of the wanted connections, chunk by chunk, or some chunks at once where little of them is wanted."""
         if any(chunk.counts is not None and wanted.isdisjoint(chunk.counts) for chunk in self._chunks):
             self._bytes.skips()
 
-        def read(piece: tuple[int, _Chunk]) -> tuple[_Chunk, list[MessageBlock], DamageError | None]:
-            index, chunk = piece
-            try:
-                return chunk, self._chunk_blocks(chunk, wanted, index * MAX_CHUNK_BYTES), None
-            except DamageError as error:
-                return chunk, [], error
+        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[tuple[_Chunk, DamageError]]]:
+            lost: list[tuple[_Chunk, DamageError]] = []
+            return list(self._run_blocks(run, wanted, lost)), lost
 
-        pieces = (
-            (index, chunk)
-            for index, chunk in enumerate(self._chunks)
-            if chunk.counts is None or not wanted.isdisjoint(chunk.counts)
-        )
-        for chunk, blocks, error in in_order(read, pieces, threads=threads):
-            if error:
+        for blocks, lost in in_order(read, self._runs(wanted), threads=threads):
+            for chunk, error in lost:
                 self._note_lost(chunk, str(error))
             yield from blocks
 
-    def _chunk_blocks(self, chunk: _Chunk, wanted: frozenset[int], base: int) -> list[MessageBlock]:
-        record = self._record(chunk.offset)
-        if record.fields.get(b"compression") != b"bz2":
-            self._without_checksum = True
-        index = self._index_of(chunk, record)
-        data = self._load(chunk, record, _pieces(record, index, wanted))
-        connections, offsets, stamps = _messages(data, chunk, index, wanted)
-        if not len(offsets):
-            return []
-        payloads = offsets + 8 + gathered(data, offsets, "u4")
-        lengths = gathered(data, payloads - 4, "u4")
-        return blocks_by_channel(
-            data,
-            connections,
-            payloads,
-            lengths,
-            log_time_ns=stamps,
-            publish_time_ns=stamps,
-            ordinals=base + offsets,
-        )
+    def _runs(self, wanted: frozenset[int]) -> Iterator[_ChunkRun]:
+        """Yield what to read at once; the indexes of some chunks are read ahead."""
+        chunks = [
+            _PlacedChunk(chunk, index * MAX_CHUNK_BYTES, record, size)
+            for index, chunk in enumerate(self._chunks)
+            if chunk.counts is None or not wanted.isdisjoint(chunk.counts)
+            for record, size in [self._chunk_record(chunk)]
+        ]
+        for group in groups(chunk.size for chunk in chunks):
+            members = chunks[group.start : group.stop]
+            sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for chunk in members], np.int64)
+            entries, sound = self._entries(members, sizes)
+            for run in runs(entries, sizes, sound, sorted(wanted)):
+                yield _ChunkRun(run, members)
 
-    def _index_of(self, chunk: _Chunk, record: _Record) -> dict[int, tuple[Int64Array, Int64Array]]:
-        """Return offset and log time of each connection's messages by the index records behind a chunk; nothing where they are broken."""
-        found: dict[int, tuple[Int64Array, Int64Array]] = {}
-        if chunk.counts is None or chunk.cut:
-            return found
-        position = record.end
+    def _chunk_record(self, chunk: _Chunk) -> tuple[_Record | None, int]:
+        """Return a chunk's record and how many bytes its records take; None and 0 where it is broken."""
         try:
-            for _ in chunk.counts:
-                connection, start, size = self._index_record(position)
-                entries = np.frombuffer(self._bytes.peek(start, size), "<u4").reshape(-1, 3)
-                stamps = entries[:, 0].astype(np.int64) * _NS + entries[:, 1]
-                offsets = entries[:, 2].astype(np.int64)
-                if (offsets[1:] < offsets[:-1]).any():
-                    order = np.argsort(offsets, kind="stable")
-                    offsets, stamps = offsets[order], stamps[order]
-                found[connection] = offsets, stamps
-                position = start + size
+            record = self._record(chunk.offset)
+            return record, record.data_bytes if _codec(record) == "none" else record.number(b"size")
         except DamageError:
-            return {}
+            return None, 0
+
+    def _run_blocks(
+        self, run: _ChunkRun, wanted: frozenset[int], lost: list[tuple[_Chunk, DamageError]]
+    ) -> Iterator[MessageBlock]:
+        """Yield the wanted messages of a run; a chunk that is lost is added to ``lost``."""
+        doubtful = list(run.plan.chunks)
+        if run.plan.entries is not None:
+            found = excerpt(
+                run.plan,
+                run.plan.entries,
+                load=lambda number: self._load(run.members[number].chunk),
+                copy=lambda number, places, to: self._copy(run.members[number].chunk, places, to),
+            )
+            lost += [(run.members[number].chunk, error) for number, error in found.lost]
+            true = _borne_out(found.data, found.offset, found.entries)
+            doubtful = np.unique(found.entries.chunk[~true]).tolist()
+            if doubtful:
+                found = found.without(doubtful)
+            of = found.entries
+            yield from _blocks(found.data, of.channel, found.offset, of.log_time_ns, run.bases[of.chunk] + of.offset)
+        for number in doubtful:
+            member = run.members[number]
+            try:
+                data = self._load(member.chunk)
+            except DamageError as error:
+                lost.append((member.chunk, error))
+            else:
+                walked = _walk_chunk(data)
+                by_connection = {number: walked.messages(number) for number in wanted & walked.offsets.keys()}
+                connections, offsets, stamps = _joined(by_connection)
+                yield from _blocks(data, connections, offsets, stamps, member.base + offsets)
+
+    def _entries(self, members: list[_PlacedChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+        """Return the messages of several chunks by the index records behind them, and of which chunks these are sound."""
+        held: list[bytes] = []
+        places: list[tuple[int, int, int]] = []
+        unsound = []
+        for number, member in enumerate(members):
+            try:
+                found = self._index_of(member)
+            except DamageError:
+                unsound.append(number)
+                continue
+            held += [entries for _, entries in found]
+            places += [(number, connection, len(entries) // _INDEX_ENTRY_BYTES) for connection, entries in found]
+        of, connections, counts = np.array(places, np.int64).reshape(-1, 3).T
+        words = np.frombuffer(b"".join(held), "<u4").reshape(-1, 3).astype(np.int64)
+        entries, sound = by_place(
+            np.repeat(of, counts),
+            np.repeat(connections, counts),
+            words[:, 2],
+            words[:, 0] * _NS + words[:, 1],
+            sizes,
+            least_bytes=_LEAST_RECORD_BYTES,
+        )
+        sound[unsound] = False
+        return entries, sound
+
+    def _index_of(self, member: _PlacedChunk) -> list[tuple[int, bytes]]:
+        """Return each connection's entries in the index behind a chunk; `DamageError` where it has none, or a broken one."""
+        counts = member.chunk.counts
+        if counts is None or member.chunk.cut or member.record is None or member.size > MAX_PLANNED_BYTES:
+            raise DamageError("only the chunk's records tell what it holds")
+        found, position = [], member.record.end
+        for _ in counts:
+            connection, start, size = self._index_record(position)
+            found.append((connection, self._bytes.peek(start, size)))
+            position = start + size
+        if {connection: len(entries) // _INDEX_ENTRY_BYTES for connection, entries in found} != counts:
+            raise DamageError("a chunk's index does not hold what the summary counts")
         return found
+
+    def _copy(self, chunk: _Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
+        """Copy pieces (start, stop, place) of a chunk; of a plain one nothing else is read."""
+        record = self._record(chunk.offset)
+        if _codec(record) != "none" or record.opcode != _OP_CHUNK:
+            copy_pieces(self._load(chunk), places, to)
+            return
+        self._without_checksum = True
+        self._bytes.read_pieces(
+            [(record.data_offset + start, to[at : at + stop - start]) for start, stop, at in places]
+        )
 
     def _index_record(self, position: int) -> tuple[int, int, int]:
         """Return the connection of an index record, and offset and size of its entries.
@@ -202,12 +287,12 @@ class BagPart:
             self._index_heads[length] = places[0], low, high, header[:low] + header[low + 4 : high] + header[high + 4 :]
         return record.number(b"conn"), record.data_offset, record.data_bytes
 
-    def _load(self, chunk: _Chunk, record: _Record, pieces: tuple[Int64Array, Int64Array] | None = None) -> memoryview:
-        """Return the records of a chunk; of one that the file's end cuts, what can still be had.
-
-        Of a plain one hardly more than ``pieces`` (starts, ends) is read from the disk.
-        """
-        codec = record.fields.get(b"compression", b"").decode(errors="replace")
+    def _load(self, chunk: _Chunk) -> memoryview:
+        """Return the records of a chunk; of one that the file's end cuts, what can still be had."""
+        record = self._record(chunk.offset)
+        codec = _codec(record)
+        if codec != "bz2":
+            self._without_checksum = True
         size = record.number(b"size")
         if record.opcode != _OP_CHUNK:
             raise DamageError("no chunk is where the index says")
@@ -217,15 +302,11 @@ class BagPart:
             what = f"the file ends inside a chunk; {len(kept)} bytes of it are read, unchecked"
             self._note(chunk.offset, what, bytes_lost=size - len(kept))
             return kept
-        if codec == "none":
-            size = self._bytes_within(record)
-            return self._bytes.mapped(record.data_offset, size, pieces)
-        return decompressed(codec, self._bytes.read_once(record.data_offset, record.data_bytes), size)
-
-    def _bytes_within(self, record: _Record) -> int:
         if record.end > self._bytes.size:
             raise DamageError("it runs past the file's end")
-        return record.data_bytes
+        if codec == "none":
+            return self._bytes.read(record.data_offset, record.data_bytes)
+        return decompressed(codec, self._bytes.read_once(record.data_offset, record.data_bytes), size)
 
     def _read_index(self) -> None:
         """Read the connections and chunk summaries at the file's end; `DamageError` when they cannot be used."""
@@ -308,7 +389,7 @@ class BagPart:
             raise DamageError("the head of a chunk contradicts what follows")
         chunk = _Chunk(position, cut=cut)
         try:
-            data = self._load(chunk, record)
+            data = self._load(chunk)
         except DamageError as error:
             self._note_lost(chunk, str(error))
             return
@@ -471,32 +552,6 @@ def _channel(connection: _Connection) -> Channel:
     )
 
 
-def _messages(
-    data: memoryview, chunk: _Chunk, index: dict[int, tuple[Int64Array, Int64Array]], wanted: frozenset[int]
-) -> _Messages:
-    """Return the wanted messages by connection, by the index where the chunk's records bear it out."""
-    counts = {connection: count for connection, count in (chunk.counts or {}).items() if connection in wanted}
-    indexed = {connection: entries for connection, entries in index.items() if connection in wanted}
-    if index and counts == {connection: len(offsets) for connection, (offsets, _) in indexed.items()}:
-        messages = _joined(indexed)
-        if _borne_out(data, *messages):
-            return messages
-    found = _walk_chunk(data)
-    return _joined({connection: found.messages(connection) for connection in wanted & found.offsets.keys()})
-
-
-def _pieces(
-    record: _Record, index: dict[int, tuple[Int64Array, Int64Array]], wanted: frozenset[int]
-) -> tuple[Int64Array, Int64Array] | None:
-    """Return where in a chunk the wanted messages begin and end; None where they are all of it, or that is not known."""
-    if not index or index.keys() <= wanted or record.fields.get(b"compression") != b"none":
-        return None
-    connections, offsets, _ = _joined(index)
-    order = np.argsort(offsets)
-    offsets, chosen = np.clip(offsets[order], 0, record.data_bytes), np.isin(connections[order], sorted(wanted))
-    return offsets[chosen], np.append(offsets[1:], record.data_bytes)[chosen]
-
-
 def _joined(by_connection: Mapping[int, tuple[Int64Array, Int64Array]]) -> _Messages:
     """Return messages of several connections, one connection after the other."""
     found = sorted(by_connection.items())
@@ -506,40 +561,60 @@ def _joined(by_connection: Mapping[int, tuple[Int64Array, Int64Array]]) -> _Mess
     return connections, offsets, stamps
 
 
-def _borne_out(data: memoryview, connections: Int64Array, offsets: Int64Array, stamps: Int64Array) -> bool:
-    """Return whether a message of the connection with that log time lies at each offset, whole.
+def _blocks(
+    data: memoryview, connections: Int64Array, offsets: Int64Array, stamps: Int64Array, ordinals: Int64Array
+) -> list[MessageBlock]:
+    """Return messages whose records begin at ``offsets`` as one block a connection; arrays have shape (N,)."""
+    if not len(offsets):
+        return []
+    if (connections[1:] < connections[:-1]).any():
+        order = np.argsort(connections, kind="stable")
+        connections, offsets, stamps, ordinals = connections[order], offsets[order], stamps[order], ordinals[order]
+    payloads = offsets + 8 + gathered(data, offsets, "u4")
+    lengths = gathered(data, payloads - 4, "u4")
+    return blocks_by_channel(
+        data, connections, payloads, lengths, log_time_ns=stamps, publish_time_ns=stamps, ordinals=ordinals
+    )
+
+
+def _borne_out(data: memoryview, offsets: Int64Array, entries: Entries) -> NDArray[np.bool_]:
+    """Return at which index entries there is a message of that connection and log time that ends before the next, shape (N,).
 
     Headers of messages agree but for connection and time, so the first is parsed and the others compared to it.
     """
-    size = len(data)
+    none = np.zeros(len(offsets), np.bool_)
     if not len(offsets):
-        return True
-    if offsets.min() < 0 or offsets.max() > size - 8:
-        return False
+        return none
+    room = entries.end - entries.offset
     length = int(gathered(data, offsets[:1], "u4")[0])
-    if length > _MAX_HEADER_BYTES or offsets.max() + length + 8 > size:
-        return False
-    windows: NDArray[np.uint8] = np.ndarray((size - length - 7, length + 8), np.uint8, data, 0, (1, 1))
-    heads = windows[offsets]
+    fits = room >= length + 8
+    if not fits[0] or length > _MAX_HEADER_BYTES:
+        return none
+    windows: NDArray[np.uint8] = np.ndarray((len(data) - length - 7, length + 8), np.uint8, data, 0, (1, 1))
+    heads = windows[np.where(fits, offsets, offsets[0])]
     header = heads[0, 4 : length + 4].tobytes()
     try:
         fields = _header_fields(header)
     except DamageError:
-        return False
-    if fields.get(b"op") != bytes([_OP_MESSAGE]) or (len(fields.get(b"conn", b"")), len(fields.get(b"time", b""))) != (
-        4,
-        8,
-    ):
-        return False
+        return none
+    sizes = len(fields.get(b"conn", b"")), len(fields.get(b"time", b""))
+    if fields.get(b"op") != bytes([_OP_MESSAGE]) or sizes != (4, 8):
+        return none
     varies = np.zeros(length + 8, np.bool_)
     conn_at, time_at = 4 + header.find(b"conn=") + 5, 4 + header.find(b"time=") + 5
     varies[conn_at : conn_at + 4] = varies[time_at : time_at + 8] = varies[length + 4 :] = True
     numbers = heads[:, conn_at : conn_at + 4].copy().view("<u4")[:, 0]
     times = heads[:, time_at : time_at + 8].copy().view("<u4").astype(np.int64)
     payload_bytes = heads[:, length + 4 :].copy().view("<u4")[:, 0]
-    return bool(
-        (numbers == connections).all()
-        and (times[:, 0] * _NS + times[:, 1] == stamps).all()
-        and (offsets + length + 8 + payload_bytes <= size).all()
-        and ((heads == heads[0]) | varies).all()
+    found: NDArray[np.bool_] = (
+        fits
+        & (numbers == entries.channel)
+        & (times[:, 0] * _NS + times[:, 1] == entries.log_time_ns)
+        & (length + 8 + payload_bytes.astype(np.int64) <= room)
+        & ((heads == heads[0]) | varies).all(axis=1)
     )
+    return found
+
+
+def _codec(record: _Record) -> str:
+    return record.fields.get(b"compression", b"").decode(errors="replace")

@@ -6,13 +6,13 @@ for all of them: what a look costs, however short, is paid once for thousands of
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.log_part import Int64Array
+from tcpipe.formats.log_part import DamageError, Int64Array
 
 GROUP_BYTES = 1 << 23
 """Chunks of about this size together are planned at once."""
@@ -56,23 +56,33 @@ class Run:
 
 @dataclass(frozen=True, slots=True)
 class Pieces:
-    """The parts of a run's chunks that hold wanted messages, laid one after the other; arrays have shape (P,).
+    """The parts of a run's chunks that hold wanted messages, laid one after the other: ``size`` bytes in all.
 
-    Bytes ``start`` to ``stop`` of a chunk lie at ``to``; the messages (in the order of their entries) at ``offset``, shape (N,).
+    ``places`` gives of each chunk, by its number, where a piece starts and stops in it, and where it is laid; ``offset`` where each
+    message then begins, in the order of their entries, shape (N,).
     """
 
-    chunk: Int64Array
-    start: Int64Array
-    stop: Int64Array
-    to: Int64Array
+    places: dict[int, list[tuple[int, int, int]]]
     offset: Int64Array
     size: int
 
-    def of(self, chunk: int) -> Iterator[tuple[int, int, int]]:
-        """Yield start, stop and place of each piece of a chunk."""
-        low, high = np.searchsorted(self.chunk, (chunk, chunk + 1)).tolist()
-        places = (self.start, self.stop, self.to)
-        yield from zip(*(values[low:high].tolist() for values in places), strict=True)
+
+@dataclass(frozen=True, slots=True)
+class Excerpt:
+    """Bytes in which a run's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,).
+
+    ``lost`` lists the chunks, by number, of which there is none, and why.
+    """
+
+    data: memoryview
+    offset: Int64Array
+    entries: Entries
+    lost: list[tuple[int, DamageError]]
+
+    def without(self, chunks: Sequence[int]) -> Excerpt:
+        """Return it without the messages of some chunks."""
+        left = ~np.isin(self.entries.chunk, chunks)
+        return Excerpt(self.data, self.offset[left], self.entries.at(left), self.lost)
 
 
 def groups(sizes: Iterable[int]) -> Iterator[range]:
@@ -151,4 +161,46 @@ def pieces(entries: Entries) -> Pieces:
     start, stop = entries.offset[at], entries.end[np.append(at[1:], len(begins)) - 1] if len(at) else at
     to = np.cumsum(stop - start) - (stop - start)
     offset = entries.offset + (to - start)[np.cumsum(begins) - 1] if len(at) else entries.offset
-    return Pieces(entries.chunk[at], start, stop, to, offset, int((stop - start).sum()))
+    places: dict[int, list[tuple[int, int, int]]] = {}
+    for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
+        places.setdefault(chunk, []).append((place[0], place[1], place[2]))
+    return Pieces(places, offset, int((stop - start).sum()))
+
+
+def excerpt(
+    run: Run,
+    entries: Entries,
+    *,
+    load: Callable[[int], memoryview],
+    copy: Callable[[int, list[tuple[int, int, int]], memoryview], None],
+) -> Excerpt:
+    """Read what a run wants.
+
+    Parameters
+    ----------
+    run, entries
+        The run, and its messages.
+    load
+        Returns all records of a chunk by its number.
+    copy
+        Copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
+    """
+    kept = pieces(entries) if run.compact else None
+    data = np.empty(kept.size if kept else 0, np.uint8).data
+    lost = []
+    for number in run.chunks:
+        try:
+            if kept:
+                copy(number, kept.places.get(number, []), data)
+            else:
+                data = load(number)
+        except DamageError as error:
+            lost.append((number, error))
+    found = Excerpt(data, kept.offset if kept else entries.offset, entries, lost)
+    return found.without([number for number, _ in lost]) if lost else found
+
+
+def copy_pieces(data: memoryview, places: list[tuple[int, int, int]], to: memoryview) -> None:
+    """Copy pieces (start, stop, place) of ``data``."""
+    for start, stop, place in places:
+        to[place : place + stop - start] = data[start:stop]

@@ -15,7 +15,7 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
-from tcpipe.formats.chunk_runs import MAX_PLANNED_BYTES, Entries, Run, by_place, groups, pieces, runs
+from tcpipe.formats.chunk_runs import MAX_PLANNED_BYTES, Entries, Run, by_place, copy_pieces, excerpt, groups, runs
 from tcpipe.formats.log_part import (
     MAX_CHUNK_BYTES,
     ByteSource,
@@ -175,14 +175,21 @@ class McapPart:
         """Yield the wanted messages of a run; a chunk that is lost is added to ``lost``."""
         doubtful = list(run.plan.chunks)
         if run.plan.entries is not None:
-            data, offsets, entries = self._excerpt(run, run.plan.entries, lost)
-            heads = message_heads(data, offsets)
-            true = borne_out(heads, entries)
-            doubtful = np.unique(entries.chunk[~true]).tolist()
+            found = excerpt(
+                run.plan,
+                run.plan.entries,
+                load=lambda number: self._load(run.members[number][1]),
+                copy=lambda number, places, to: self._copy(run.members[number][1], places, to),
+            )
+            lost += [(run.members[number][1], error) for number, error in found.lost]
+            heads = message_heads(found.data, found.offset)
+            true = borne_out(heads, found.entries)
+            doubtful = np.unique(found.entries.chunk[~true]).tolist()
             if doubtful:
-                true = ~np.isin(entries.chunk, doubtful)
-                offsets, heads, entries = offsets[true], heads[true], entries.at(true)
-            yield from message_blocks(data, offsets, heads, run.bases[entries.chunk] + entries.offset)
+                found = found.without(doubtful)
+                heads = message_heads(found.data, found.offset)
+            ordinals = run.bases[found.entries.chunk] + found.entries.offset
+            yield from message_blocks(found.data, found.offset, heads, ordinals)
         for number in doubtful:
             base, chunk = run.members[number]
             try:
@@ -193,38 +200,13 @@ class McapPart:
                 offsets = _wanted_messages(data, wanted)
                 yield from message_blocks(data, offsets, message_heads(data, offsets), offsets + base)
 
-    def _excerpt(
-        self, run: _ChunkRun, entries: Entries, lost: list[tuple[Chunk, DamageError]]
-    ) -> tuple[memoryview, Int64Array, Entries]:
-        """Return bytes in which a run's messages lie, where in them each begins, and which they are (all but those that are lost)."""
-        kept = pieces(entries) if run.plan.compact else None
-        data = np.empty(kept.size if kept else 0, np.uint8).data
-        gone = []
-        for number in run.plan.chunks:
-            _, chunk = run.members[number]
-            try:
-                if kept:
-                    self._take_pieces(chunk, kept.of(number), data)
-                else:
-                    data = self._load(chunk)
-            except DamageError as error:
-                lost.append((chunk, error))
-                gone.append(number)
-        offsets = kept.offset if kept else entries.offset
-        if gone:
-            left = ~np.isin(entries.chunk, gone)
-            return data, offsets[left], entries.at(left)
-        return data, offsets, entries
-
-    def _take_pieces(self, chunk: Chunk, wanted: Iterator[tuple[int, int, int]], to: memoryview) -> None:
+    def _copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
         """Copy pieces (start, stop, place) of a chunk; what need not be read as a whole, to check or decompress it, is not."""
         if chunk.compression or self._crc(chunk):
-            data = self._load(chunk, once=True)
-            for start, stop, place in wanted:
-                to[place : place + stop - start] = data[start:stop]
+            copy_pieces(self._load(chunk, once=True), places, to)
             return
         self._note_read(chunk, checked=False)
-        self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in wanted])
+        self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in places])
 
     def _crc(self, chunk: Chunk) -> int:
         """Return the CRC of a chunk's records; 0 where there is none."""

@@ -1,7 +1,9 @@
 """Generated logs, broken in known places: what is intact before and after comes back, the rest is counted."""
 
 import struct
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType
 from random_messages import (
@@ -15,7 +17,7 @@ from random_messages import (
 )
 from rosbags.rosbag1 import Writer as BagWriter
 
-from tcpipe.formats.bag_log import BagPart, _borne_out, _joined
+from tcpipe.formats.bag_log import BagPart, _borne_out
 from tcpipe.formats.log_file import open_log
 from tcpipe.formats.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
 
@@ -233,13 +235,17 @@ def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
 def test_the_index_of_an_intact_bag_is_used(tmp_path):
     messages = random_messages(8, count=50, types=TYPES, store=ROS1)
     part = BagPart(write_bag(tmp_path / "run.bag", messages), "run.bag")
-    chunk = part._chunks[0]
-    record = part._record(chunk.offset)
-    data = part._load(chunk, record)
-    connections, offsets, stamps_ns = _joined(part._index_of(chunk, record))
-    assert len(offsets) == len(messages)
-    assert _borne_out(data, connections, offsets, stamps_ns)
-    assert not _borne_out(data, connections, offsets, stamps_ns + 1)
-    assert not _borne_out(data, connections, offsets + 1, stamps_ns)
-    assert not _borne_out(data, 1 - connections, offsets, stamps_ns)
+    (run,) = part._runs(frozenset({0, 1}))
+    data, entries = part._load(part._chunks[0]), run.plan.entries
+    assert len(entries.offset) == len(messages)
+    assert _borne_out(data, entries.offset, entries).all()
+    for wrong in (
+        replace(entries, log_time_ns=entries.log_time_ns + 1),
+        replace(entries, channel=1 - entries.channel),
+        replace(entries, end=entries.offset + 20),
+    ):
+        assert not _borne_out(data, entries.offset, wrong).any()
+    assert not _borne_out(data, entries.offset + 1, entries).any()
+    one_wrong = replace(entries, log_time_ns=entries.log_time_ns + (np.arange(50) == 20))
+    assert np.flatnonzero(~_borne_out(data, entries.offset, one_wrong)).tolist() == [20]
     part.close()
