@@ -172,12 +172,36 @@ def _read_nav_sat_fix(columns: Columns) -> Readings:
     status = columns["status.status"].astype(np.int64)
     drops = {
         "no_fix": status < 0,
-        "not_finite": ~np.isfinite(lat + lon + alt),
+        "not_finite": ~np.isfinite(lat + lon),
         "null_island": (lat == 0) & (lon == 0),
         "outside_the_globe": _is_outside(lat, lon),
     }
-    notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0])))}
-    return _kept(columns, _gnss(lon, lat, alt, variances, status), drops, notes=notes)
+    fixed = ~np.any(list(drops.values()), axis=0)
+    alt, unmeasured = _altitude(alt, fixed)
+    variances[unmeasured, 2] = _NO_HEIGHT_M2
+    notes = {
+        "without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0]))),
+        "without_altitude": int(np.count_nonzero(unmeasured & fixed)),
+    }
+    lost = f"{notes['without_altitude']} of {np.count_nonzero(fixed)} fixes have no altitude (NaN, or one constant): heights are relative"
+    warnings = (lost,) if notes["without_altitude"] else ()
+    return _kept(columns, _gnss(lon, lat, alt, variances, status), drops, notes=notes, warnings=warnings)
+
+
+_NO_HEIGHT_M2 = 1e6
+_FEWEST_ALTITUDES = 100
+
+
+def _altitude(alt: Floats, fixed: Mask) -> tuple[Floats, Mask]:
+    """Return heights with the median of the known ones where there is none, and where that is.
+
+    NaN is sensor_msgs/NavSatFix's word for it; a receiver's own digits never stand still, so one constant is a word for it too.
+    """
+    unknown = ~np.isfinite(alt)
+    known = alt[~unknown & fixed]
+    if known.size >= _FEWEST_ALTITUDES and np.ptp(known) == 0.0:
+        unknown = np.ones_like(unknown)
+    return np.where(unknown, np.median(known) if known.size else 0.0, alt), unknown
 
 
 def _read_nmea(columns: Columns) -> Readings:

@@ -319,6 +319,13 @@ def test_fixes_at_zero_zero_are_no_places(drive, tmp_path):
     assert any("null_island" in warning for warning in labelled.info.findings.warnings)
 
 
+def test_fixes_without_altitude_still_say_where(drive, tmp_path):
+    labelled = run(drive.changed("gnss", lambda c: {"altitude": np.full_like(c["altitude"], np.nan)}), tmp_path)
+    assert labelled.info.datum is not None
+    assert any("have no altitude" in warning for warning in labelled.info.findings.warnings)
+    assert_labels_hold(labelled, drive.truth)
+
+
 def test_a_receiver_that_never_had_a_fix_leaves_a_local_frame(drive, tmp_path):
     nowhere = drive.changed("gnss", lambda c: {n: np.zeros_like(c[n]) for n in ("latitude", "longitude", "altitude")})
     labelled = run(nowhere, tmp_path)

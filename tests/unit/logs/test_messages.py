@@ -47,7 +47,7 @@ def test_fixes_are_kept_and_everything_else_is_counted_once() -> None:
     columns = nav_sat_fix()
     columns["status.status"][0] = -1
     columns["latitude"][0] = np.nan  # no fix already
-    columns["altitude"][1] = np.inf
+    columns["longitude"][1] = np.inf
     columns["latitude"][2] = columns["longitude"][2] = 0.0
     columns["longitude"][3] = 181.0
     found = read_messages(columns, "gnss", roles.NAV_SAT_FIX)
@@ -70,6 +70,21 @@ def test_a_covariance_that_says_nothing_is_null() -> None:
     assert np.isnan(found.columns["east_var_m2"]).tolist() == [True] * 8 + [False] * 4
     assert np.isnan(found.columns["up_var_m2"]).tolist() == [True] * 9 + [False] * 3
     assert found.notes["without_covariance"] == 8
+
+
+@pytest.mark.parametrize("count", [3, 200])
+def test_a_fix_without_altitude_is_a_fix(count: int) -> None:
+    """NavSatFix says it with NaN; a receiver in two dimensions repeats one height for ever."""
+    columns = {name: np.resize(values, (count, *values.shape[1:])) for name, values in nav_sat_fix().items()}
+    columns["altitude"] = 400.0 + np.zeros(count)
+    columns["altitude"][1] = np.nan
+    found = read_messages(columns, "gnss", roles.NAV_SAT_FIX)
+    assert found.row.size == count
+    assert (found.columns["alt_m"] == 400.0).all()
+    without = found.columns["up_var_m2"] > 1e5
+    assert without.sum() == (1 if count == 3 else count)
+    assert f"{without.sum()} of {count} fixes have no altitude" in found.warnings[0]
+    assert np.isfinite(found.columns["east_var_m2"]).all()
 
 
 GGA = "$GPGGA,123519,4807.038,N,01131.000,E,{},08,{},545.4,M,{},M,,"
