@@ -8,6 +8,7 @@ time (Miller 1974, Biometrika 61): it needs no model of the residuals, and a lag
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,12 +82,17 @@ def find_lag(target: Floats, regressors: Floats) -> Lag | None:
     -------
     None where too little is known, where the best lag lies at the end of the search, or where a constant explains the target.
     """
-    products = _products(target, regressors)
-    if products is None:
-        return None
-    explained = _explained(products.sum(1))
+    products = lag_products(target, regressors)
+    return None if products is None else lag_of([products])
+
+
+def lag_of(windows: Sequence[Floats]) -> Lag | None:
+    """Return the lag of several windows of time together; ``windows`` are of `lag_products`, of the same signals."""
+    products = _merged(np.concatenate(windows, axis=1))
+    whole = products.sum(1)
+    explained = _explained(whole)
     offset_s = _peak(explained)
-    left_out = [_peak(_explained(products.sum(1) - products[:, g])) for g in range(products.shape[1])]
+    left_out = [_peak(_explained(whole - products[:, g])) for g in range(products.shape[1])]
     if not np.isfinite([offset_s, *left_out]).all():
         return None
     groups = len(left_out)
@@ -94,8 +100,19 @@ def find_lag(target: Floats, regressors: Floats) -> Lag | None:
     return Lag(offset_s, std_s, float(explained.max()))
 
 
-def _products(target: Floats, regressors: Floats) -> Floats | None:
-    """Return sums of products of (regressors, 1, target) by lag and group of time, shape (L, G, k + 2, k + 2)."""
+def _merged(products: Floats) -> Floats:
+    """Return the products of fewer, longer groups of time, at most twice `_GROUPS`."""
+    together = -(-products.shape[1] // (2 * _GROUPS))
+    first = np.arange(0, products.shape[1], together)
+    merged: Floats = np.add.reduceat(products, first, axis=1)
+    return merged
+
+
+def lag_products(target: Floats, regressors: Floats) -> Floats | None:
+    """Return what `lag_of` needs of a window: sums of products of (regressors, 1, target) by lag and group of time.
+
+    Shape (L, G, k + 2, k + 2); parameters are `find_lag`'s. None where the window is too short.
+    """
     steps = round(MAX_LAG_S / GRID_S)
     rows = np.arange(steps, target.size - steps, _TARGET_ROWS)
     groups = min(_GROUPS, int(rows.size * _TARGET_ROWS * GRID_S / _MIN_GROUP_S))

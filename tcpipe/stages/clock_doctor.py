@@ -1,13 +1,15 @@
-"""What the sensors' clocks look like: constant offsets between them, for the manifest, and the recipe line that would correct each."""
+"""What the sensors' clocks look like: offsets between them and their drift, for the manifest, and the recipe line that corrects each."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
 
-from tcpipe.fusion.clock_offsets import POWER, ClockOffsets, PowerSignal, find_clock_offsets
+from tcpipe.fusion.clock_offsets import POWER, ClockOffsets, Offset, Pair, PowerSignal, find_clock_offsets
 from tcpipe.fusion.rails import power_at
 from tcpipe.stages.fuse_inputs import Inputs, rails_of
 from tcpipe.stages.fuse_sanity import longest_epoch
@@ -21,7 +23,8 @@ def clock_findings(streams: Streams, inputs: Inputs) -> Findings:
     """Return the offsets between the sensors' clocks in the longest clock epoch; nothing is corrected.
 
     Facts: every pair compared (``pairs``), the ``reference`` clock, and by role ``offset_s`` (how late its stamps are), ``std_s``,
-    ``noted`` and ``recipe`` (the lines that would correct it, the recipe's own offset included).
+    ``noted``, ``drift_s_per_h`` (None below half an hour), ``drifts`` and ``recipe`` (the lines that would correct it, the recipe's own
+    offset included).
     """
     if not inputs.measurements:
         return Findings()
@@ -31,8 +34,11 @@ def clock_findings(streams: Streams, inputs: Inputs) -> Findings:
     roles, warnings = {}, []
     for role, offset in found.offsets.items():
         entry = f"{role} = {given_s.get(role, 0.0) - offset.offset_s:.{3 if offset.std_s < _FINE_S else 2}f}"
-        roles[role] = {**asdict(offset), "recipe": f"[read.time_offset_s]\n{entry}"}
-        if offset.noted:
+        roles[role] = {**_told(offset), "recipe": f"[read.time_offset_s]\n{entry}"}
+        if offset.drifts:
+            roles[role]["recipe"] = f'[read.time]\n{role} = "log"'
+            warnings.append(_drift(found, role, offset))
+        elif offset.noted:
             warnings.append(
                 f"{role}: its stamps seem {abs(offset.offset_s):.2f} s {'late' if offset.offset_s > 0 else 'early'} against "
                 f"{found.reference} (± {2 * offset.std_s:.2f} s, by {_means(found, role)}); nothing is corrected; "
@@ -41,10 +47,24 @@ def clock_findings(streams: Streams, inputs: Inputs) -> Findings:
     facts = {
         "epoch": epoch,
         "reference": found.reference,
-        "pairs": [{**asdict(pair), "determined": pair.determined} for pair in found.pairs],
+        "pairs": [{**_told(pair), "determined": pair.determined} for pair in found.pairs],
         "offsets": roles,
     }
     return Findings(tuple(warnings), facts)
+
+
+def _told(each: Offset | Pair) -> dict[str, Any]:
+    """Return the fields by name, None for what is not known."""
+    return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in asdict(each).items()}
+
+
+def _drift(found: ClockOffsets, role: str, offset: Offset) -> str:
+    change_s = offset.drift_s_per_h * found.span_s / 3600
+    return (
+        f"{role}: its stamps drift against {found.reference} by {change_s:+.2f} s over the run "
+        f"(± {2 * offset.drift_std_s_per_h * found.span_s / 3600:.2f} s, by {_means(found, role)}): no constant offset corrects that; "
+        f'where the recorder\'s clock is the better one, write in the recipe under [read.time]: {role} = "log"'
+    )
 
 
 def _means(found: ClockOffsets, role: str) -> str:

@@ -76,5 +76,5 @@ def clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     offsets = info.findings.facts.get("clock_offsets", {}).get("offsets", {})
-    off = any(offset["noted"] for offset in offsets.values())
+    off = any(offset["noted"] or offset["drifts"] for offset in offsets.values())
     return recorder or off or streams.findings.facts.get("epochs", 1) > 1
