@@ -6,7 +6,7 @@ from typing import Literal
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option, recipe_option, store_option
+from tcpipe.cli.options import json_option, quiet_option, recipe_option, store_option, tag_values
 
 
 @click.command("build-dataset", short_help="Segments and map to a dataset")
@@ -20,6 +20,14 @@ from tcpipe.cli.options import json_option, quiet_option, recipe_option, store_o
     help="Map to sample from (default: the only one in the store); repeat it for several, the first rules where they overlap.",
 )
 @click.option("--robot", metavar="NAME", help="Only runs of this robot.")
+@click.option(
+    "--tag",
+    "tags",
+    multiple=True,
+    metavar="K=V",
+    callback=tag_values,
+    help="Only runs with this tag; repeat it for several, all of them.",
+)
 @store_option
 @recipe_option
 @click.option(
@@ -41,6 +49,7 @@ def build_dataset(
     split: str | None,
     map_name: tuple[str, ...],
     robot: str | None,
+    tags: dict[str, str],
     store: str,
     recipe: str | None,
     jobs: int,
@@ -67,6 +76,7 @@ def build_dataset(
             split=split,
             map_name=map_name,
             robot=robot,
+            tags=tags,
             recipe=ruling,
             jobs=jobs,
             file_format=file_format,

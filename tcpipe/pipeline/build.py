@@ -94,6 +94,7 @@ def build_dataset(
     split: str | Path | None = None,
     map_name: str | Sequence[str] | None = None,
     robot: str | None = None,
+    tags: Mapping[str, str] | None = None,
     recipe: Recipe | str | Path | None = None,
     jobs: int = 1,
     file_format: FileFormat = "zarr",
@@ -115,6 +116,8 @@ def build_dataset(
         Map to sample, or several, the first ruling where they overlap; None takes the only one in the store.
     robot
         Only runs of this robot; needed where the store holds several.
+    tags
+        Only runs that carry all of these tags.
     recipe
         A `Recipe`, a path to one, or None for the one that rules here.
     jobs
@@ -144,6 +147,7 @@ def build_dataset(
         ruling,
         map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
         robot=robot,
+        tags=tags,
         region=region,
         file_format=file_format,
         earlier=earlier,

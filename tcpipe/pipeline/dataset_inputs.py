@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError
@@ -42,6 +44,8 @@ class Inputs:
     map_paths: tuple[Path, ...]
     map_sha256: tuple[str, ...]
     """Over the checksums of each map's files."""
+    again: Mapping[str, NDArray[np.bool_]]
+    """By run: which of its segments another run has too."""
     digest: str
     warnings: tuple[str, ...]
 
@@ -54,11 +58,14 @@ def choose_inputs(
     robot: str | None,
     region: bytes | None,
     file_format: FileFormat,
+    tags: Mapping[str, str] | None = None,
     earlier: pa.Table | None = None,
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     names = choose_maps(store, map_names)
-    runs, warnings = choose_runs(store, recipe, robot=robot)
+    chosen, warnings = choose_runs(store, recipe, robot=robot, tags=tags or {})
+    once = each_drive_once(chosen, {run.run_id: _source(store, run)["sha256"] for run in chosen})
+    runs = once.runs
     paths = tuple(store.map_path(name) for name in names)
     map_sha256 = tuple(digest(file_checksums(path)) for path in paths)
     values = plain(asdict(recipe))
@@ -74,7 +81,7 @@ def choose_inputs(
         }
     )
     sources = tuple(run_source(store, run) for run in runs)
-    return Inputs(tuple(runs), sources, names, paths, map_sha256, fingerprint, tuple(warnings))
+    return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, (*warnings, *once.warnings))
 
 
 def earlier_splits(directory: Path) -> pa.Table:
@@ -103,8 +110,10 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names)) or (maps[0],)
 
 
-def choose_runs(store: Store, recipe: Recipe, *, robot: str | None) -> tuple[list[RunDirectory], list[str]]:
-    """Return the runs to pool, each recording once, and warnings; two robots are never pooled unasked."""
+def choose_runs(
+    store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]
+) -> tuple[list[RunDirectory], list[str]]:
+    """Return the runs to pool, those that carry all of the tags, and warnings; two robots are never pooled unasked."""
     every = store.runs()
     if not every:
         raise DatasetError(f"{store.root}: no runs in the store; ingest one: tcpipe ingest LOG")
@@ -115,16 +124,26 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None) -> tuple[lis
             f"{store.root}: {len({run.run_id for run in every})} runs in the store, none ingested with this recipe; "
             "ingest them with it (tcpipe ingest LOG), or give the recipe they were ingested with (--recipe FILE)"
         )
+    mine = _tagged(store, mine, tags)
     robots = sorted({run.robot for run in mine})
     chosen = [run for run in mine if robot is None or run.robot == robot]
     if not chosen:
         raise DatasetError(f"{store.root}: no run of robot {robot!r}; there are runs of {', '.join(robots)}")
     if robot is None and len(robots) > 1:
         raise DatasetError(f"{store.root}: runs of {len(robots)} robots ({', '.join(robots)}); name one with --robot")
-    left_out = sorted({run.run_id for run in every} - {run.run_id for run in mine})
+    left_out = sorted({run.run_id for run in every} - {run.run_id for run in every if run.manifest["ingest_key"] == key})
     warnings = [f"run {run_id}: ingested with another recipe only; left out" for run_id in left_out]
-    once, repeated = each_drive_once(chosen, {run.run_id: _source(store, run)["sha256"] for run in chosen})
-    return once, [*warnings, *repeated]
+    return chosen, warnings
+
+
+def _tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
+    """Return the runs that carry all of the tags; `DatasetError` with the tags there are where none does."""
+    chosen = [run for run in runs if tags.items() <= run.manifest.get("tags", {}).items()]
+    if not chosen:
+        wanted = " ".join(f"{key}={value}" for key, value in tags.items())
+        there = sorted({f"{key}={value}" for run in runs for key, value in run.manifest.get("tags", {}).items()})
+        raise DatasetError(f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(there) or 'none'}")
+    return chosen
 
 
 def run_source(store: Store, run: RunDirectory) -> dict[str, Any]:
