@@ -54,11 +54,57 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
 
 
 def _problem(where: str, item: Mapping[str, Any]) -> str:
-    key = ".".join(str(part) for part in item["loc"])
+    *above, last = item["loc"]
+    if last == "[key]":
+        key = ".".join(map(str, above))
+        return f"{where}: unknown key {key}; known here: {_choices(item)}"
+    key = ".".join(map(str, item["loc"]))
     if item["type"] == "unexpected_keyword_argument":
         known = ", ".join(_keys_beside(item["loc"]))
         return f"{where}: unknown key {key}; known here: {known}"
-    return f"{where}: {key} is {item['input']!r}; {item['msg']}"
+    if item["type"] == "missing":
+        return f"{where}: {'.'.join(map(str, above))} is {_plain_value(item['input'])}; wanted more values, the one at {last} is missing"
+    return f"{where}: {key} is {_plain_value(item['input'])}; wanted {_wanted(item)}"
+
+
+def _plain_value(value: Any) -> str:
+    """Return a value as TOML writes it, where it can."""
+    return repr(value) if value is None else _toml(value)
+
+
+_WANTED = {
+    "string_type": "text in quotes",
+    "float_type": "a number",
+    "float_parsing": "a number",
+    "finite_number": "a finite number",
+    "int_type": "a whole number",
+    "int_parsing": "a whole number",
+    "int_from_float": "a whole number",
+    "bool_type": "true or false",
+    "bool_parsing": "true or false",
+    "list_type": 'a list, for example ["/topic"]',
+    "tuple_type": "a list of numbers, for example [0.0, 0.0, 0.0]",
+    "dict_type": "a table of keys",
+    "dataclass_type": "a table of keys",
+    "greater_than": "more than {gt:g}",
+    "greater_than_equal": "{ge:g} or more",
+    "less_than": "less than {lt:g}",
+    "less_than_equal": "{le:g} or less",
+    "too_short": "{min_length} values or more, got {actual_length}",
+    "too_long": "{max_length} values, got {actual_length}",
+}
+"""What the checker's findings want, by their type, in our words."""
+
+
+def _wanted(item: Mapping[str, Any]) -> str:
+    if item["type"] == "literal_error":
+        return f"one of {_choices(item)}"
+    words = _WANTED.get(item["type"], "another value (docs/reference/recipe.md)")
+    return words.format(**item.get("ctx", {}))
+
+
+def _choices(item: Mapping[str, Any]) -> str:
+    return str(item["ctx"]["expected"]).replace("'", "").replace(" or ", ", ")
 
 
 def _keys_beside(location: tuple[Any, ...]) -> list[str]:

@@ -45,6 +45,43 @@ def test_every_wrong_key_is_one_problem() -> None:
     assert caught.value.exit_code == 2
 
 
+WRONG = {
+    "robot = 3": "robot is 3; wanted text in quotes",
+    'read.topics.gnsss = ["/a"]': "unknown key read.topics.gnsss; known here: gnss, imu, wheel_odometry, visual_odometry",
+    'read.topics.imu = "/a"': 'read.topics.imu is "/a"; wanted a list',
+    "read.topics.imu = [1]": "read.topics.imu.0 is 1; wanted text in quotes",
+    "read.placement.imu.xyz_m = [1, 2]": "read.placement.imu.xyz_m is [1, 2]; wanted more values",
+    "read.placement.imu.xyz_m = [1, 2, 3, 4]": "wanted 3 values, got 4",
+    'read.placement.imu.xyz_m = [1, 2, "up"]': 'read.placement.imu.xyz_m.2 is "up"; wanted a number',
+    "read.placement.imu = 3": "read.placement.imu is 3; wanted a table of keys",
+    "read.topics = 3": "read.topics is 3; wanted a table",
+    "read.placement.imu.xyz_m = 3": "read.placement.imu.xyz_m is 3; wanted a list of numbers",
+    'read.imu_units = "kg"': 'read.imu_units is "kg"; wanted one of si, deg, g, deg_g',
+    "fuse.rate_hz = -1": "fuse.rate_hz is -1; wanted more than 0",
+    "fuse.rate_hz = nan": "fuse.rate_hz is nan; wanted a finite number",
+    "fuse.rate_hz = [1]": "fuse.rate_hz is [1]; wanted a number",
+    "fuse.gate_probability = 1": "fuse.gate_probability is 1; wanted less than 1",
+    "gate.full_speed_fraction = 1.2": "wanted 1 or less",
+    'gate.keep_reversing = "maybe"': "wanted true or false",
+    "gate.keep_reversing = [1]": "wanted true or false",
+    "sample.patch_px = 1": "sample.patch_px is 1; wanted 2 or more",
+    "split.folds = 2.5": "split.folds is 2.5; wanted a whole number",
+    'split.seed = "x"': 'split.seed is "x"; wanted a whole number',
+    "split.seed = [1]": "wanted a whole number",
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_what_is_wanted_is_said_plainly(tmp_path: Path, line: str) -> None:
+    path = tmp_path / "r.toml"
+    path.write_text(line)
+    with pytest.raises(RecipeError) as caught:
+        load_recipe(path)
+    (problem,) = caught.value.problems
+    assert WRONG[line] in problem
+    assert "another value" not in problem
+
+
 @pytest.mark.parametrize(("text", "said"), [("robot = ", "not valid TOML"), (None, "cannot be read")])
 def test_unreadable_recipe_is_one_plain_line(tmp_path: Path, text: str | None, said: str) -> None:
     path = tmp_path / "r.toml"
