@@ -88,8 +88,8 @@ _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps
 
 def _read_cells(topic: Mapping[str, Any]) -> list[str]:
     """Return what reading everything found of a topic, in the order of the header."""
-    kinds = ("zero", "backward", "repeated")
-    odd = [f"{topic[f'{kind}_stamps']} {kind}" for kind in kinds if topic.get(f"{kind}_stamps")]
+    kinds = ("zero_stamps", "backward_stamps", "wrong_stamps", "repeated_stamps", "duplicates")
+    odd = [f"{topic[kind]} {kind.removesuffix('_stamps')}" for kind in kinds if topic.get(kind)]
     values = [topic.get(name) for name in ("messages_read", "gaps", "longest_gap_s", "time", "header_minus_log_s")]
     return [*map(_text, values), ", ".join(odd)]
 
@@ -97,9 +97,11 @@ def _read_cells(topic: Mapping[str, Any]) -> list[str]:
 def _print_clocks(log: Mapping[str, Any]) -> None:
     for step in log["clock_steps"]:
         say(f"clock step: {step['step_s']:+.3f} s at log time {step['log_time_ns']} ns on {', '.join(step['topics'])}")
-    for topic in log["simulated_headers"]:
-        say(f"simulated time: the headers of {topic} are not the wall clock's")
     for topic in log["topics"]:
+        if topic.get("simulated_time"):
+            say(f"simulated time: the headers of {topic['name']} are not the wall clock's")
+        for moved_s in topic.get("moved_s", ()):
+            say(f"another clock: the stamps of {topic['name']} lie {-moved_s:+.3f} s off those of most topics")
         if topic.get("time") == "log":
             say(f"log time rules on {topic['name']}: {topic['time_why']}")
 

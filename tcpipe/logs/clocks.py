@@ -28,6 +28,9 @@ LATE_NS = SECOND_NS
 APART_NS = SECOND_NS
 """Offsets closer than this are delays; topics further apart run on different clocks."""
 
+SIMULATED_NS = 10**9 * SECOND_NS
+"""Times before this (September 2001) are not the wall clock's: simulated time begins near 0."""
+
 _LASTING_NS = 10 * SECOND_NS
 _MOST_BACK = 0.2
 _TOGETHER_NS = 5 * SECOND_NS
@@ -99,6 +102,14 @@ def settle_clocks(topics: Mapping[str, TopicTimes]) -> tuple[dict[str, Timeline]
     }
     reference = [_reference_offset(drafts, epoch) for epoch in range(len(steps) + 1)]
     return {name: _timeline(topics[name], draft, reference) for name, draft in drafts.items()}, steps
+
+
+def is_simulated(times: TopicTimes) -> bool:
+    """Return whether a topic's headers count simulated time while the log counts the wall clock's."""
+    known = _is_set(times)
+    if times.header_ns is None or not known.any():
+        return False
+    return bool(np.median(times.header_ns[known]) < SIMULATED_NS < np.median(times.log_time_ns))
 
 
 def _is_set(times: TopicTimes) -> Mask:

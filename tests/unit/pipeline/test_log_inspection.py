@@ -6,7 +6,7 @@ import pytest
 
 from tcpipe.formats.log_file import open_log
 from tcpipe.formats.log_writing import MessageStream, write_mcap
-from tcpipe.pipeline import log_inspection
+from tcpipe.pipeline import log_stamps
 from tcpipe.pipeline.log_inspection import inspect_log
 from tcpipe.recipe import Recipe
 
@@ -46,7 +46,10 @@ def test_faults_that_were_put_in_are_found(tmp_path):
     assert one["gaps"] == 1
     assert one["longest_gap_s"] == pytest.approx(4.02)
     assert one["median_period_s"] == pytest.approx(0.02)
-    assert (one["zero_stamps"], one["backward_stamps"], one["repeated_stamps"]) == (1, 2, 1)
+    kinds = ("zero_stamps", "backward_stamps", "repeated_stamps", "duplicates")
+    assert [one[kind] for kind in kinds] == [1, 1, 0, 1]
+    assert one["longest_gap_at_ns"] == log_ns[1999]
+    assert topics["/stepped"]["longest_gap_s"] == pytest.approx(4.02)  # the step of its header is none
     assert one["time"] == "header"
     assert one["header_minus_log_s"] == pytest.approx(-0.003)
     assert found["clock_epochs"] == 2
@@ -61,10 +64,10 @@ def test_simulated_time_is_told_from_the_wall_clock(tmp_path):
     log_ns = START_NS + np.arange(500) * PERIOD_NS
     simulated = 5_000_000_000 + np.arange(500) * PERIOD_NS
     found, topics = inspected(tmp_path / "a.mcap", [stream("/imu", simulated, log_ns)])
-    assert found["simulated_headers"] == ["/imu"]
+    assert topics["/imu"]["simulated_time"]
     assert topics["/imu"]["time"] == "header" or "10 s" in topics["/imu"]["time_why"]
-    found, _ = inspected(tmp_path / "b.mcap", [stream("/imu", simulated, simulated)])
-    assert found["simulated_headers"] == []
+    found, topics = inspected(tmp_path / "b.mcap", [stream("/imu", simulated, simulated)])
+    assert not topics["/imu"]["simulated_time"]
     assert any("the log's own times are simulated" in line for line in found["warnings"])
 
 
@@ -76,15 +79,65 @@ def test_a_topic_of_many_messages_is_thinned_out_and_its_counts_stay_exact(monke
     table = pa.table(
         {"log_time_ns": log_ns, "header.stamp.sec": header_ns // 10**9, "header.stamp.nanosec": header_ns % 10**9}
     )
-    whole = log_inspection._TopicStamps()
+    whole = log_stamps.TopicStamps()
     whole.add(table)
-    monkeypatch.setattr(log_inspection, "_MOST_ROWS", 1000)
-    thinned = log_inspection._TopicStamps()
+    monkeypatch.setattr(log_stamps, "_MOST_ROWS", 1000)
+    thinned = log_stamps.TopicStamps()
     for start in range(0, 10_000, 777):
         thinned.add(table[start : start + 777])
     assert len(thinned.times()[0]) <= 1000
     assert np.isin(thinned.times()[0], log_ns).all()
     exact, about = whole.facts(), thinned.facts()
-    for name in ("messages_read", "longest_gap_s", "zero_stamps", "backward_stamps", "repeated_stamps", "gaps"):
+    for name in exact.keys() - {"median_period_s"}:
         assert about[name] == exact[name], name
     assert about["median_period_s"] == pytest.approx(0.02)
+
+
+def test_exact_duplicates_are_told_from_repeated_stamps(tmp_path):
+    log_ns = np.repeat(START_NS + np.arange(1000) * PERIOD_NS, 2)
+    header_ns = log_ns - 3_000_000
+    log_ns[1::2] += 1_000_000
+    found, topics = inspected(tmp_path / "a.mcap", [stream("/twice", header_ns, log_ns)])
+    assert (topics["/twice"]["duplicates"], topics["/twice"]["repeated_stamps"]) == (1000, 0)
+    assert topics["/twice"]["time"] == "header"
+    other = stream("/other", header_ns, log_ns)
+    other.columns["angular_velocity.x"] = np.arange(2000.0)
+    found, topics = inspected(tmp_path / "b.mcap", [other])
+    assert (topics["/other"]["duplicates"], topics["/other"]["repeated_stamps"]) == (0, 1000)
+    assert topics["/other"]["time"] == "log"
+    assert found["damage"] == []
+
+
+def test_a_recorder_that_stalls_is_no_gap_and_another_clock_is_told(tmp_path):
+    header_ns = START_NS + np.arange(2000) * PERIOD_NS
+    log_ns = header_ns + 3_000_000
+    log_ns[1000:1200] = log_ns[1200]  # written in a burst
+    found, topics = inspected(
+        tmp_path / "a.mcap",
+        [
+            stream("/stalled", header_ns, log_ns),
+            stream("/b", header_ns, header_ns),
+            stream("/c", header_ns - 60 * 10**9, header_ns),
+        ],
+    )
+    assert topics["/stalled"]["gaps"] == 0
+    assert topics["/c"]["moved_s"] == [pytest.approx(60.0, abs=0.01)]
+    assert topics["/b"]["moved_s"] == []
+    assert found["clock_steps"] == []
+
+
+def test_what_repeats_is_compared_in_every_kind_of_column():
+    rows = {
+        "log_time_ns": [1, 2, 3, 4, 5],
+        "publish_time_ns": [1, 2, 3, 4, 5],
+        "header.stamp.sec": [7] * 5,
+        "header.stamp.nanosec": [0] * 5,
+        "x": [float("nan")] * 5,
+        "texts": [["a"], ["a"], ["b"], ["b"], ["b"]],
+        "on": [True, True, True, False, False],
+    }
+    stamps = log_stamps.TopicStamps()
+    table = pa.table(rows)
+    for row in range(5):
+        stamps.add(table[row : row + 1])
+    assert (stamps.facts()["duplicates"], stamps.facts()["repeated_stamps"]) == (2, 2)
