@@ -130,7 +130,7 @@ def gather_content(
         Nothing comes of it: no segment, none on the map, none inside the region.
 
     """
-    pool = pool_segments(inputs.runs, directory)
+    pool = pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", pool.segments.num_rows, len(inputs.runs))
     ranks = _ranks(pool.segments, seed=recipe.split.seed)
     gnss_crs = recipe.read.gnss_crs

@@ -131,7 +131,9 @@ def choose_runs(
         raise DatasetError(f"{store.root}: no run of robot {robot!r}; there are runs of {', '.join(robots)}")
     if robot is None and len(robots) > 1:
         raise DatasetError(f"{store.root}: runs of {len(robots)} robots ({', '.join(robots)}); name one with --robot")
-    left_out = sorted({run.run_id for run in every} - {run.run_id for run in every if run.manifest["ingest_key"] == key})
+    left_out = sorted(
+        {run.run_id for run in every} - {run.run_id for run in every if run.manifest["ingest_key"] == key}
+    )
     warnings = [f"run {run_id}: ingested with another recipe only; left out" for run_id in left_out]
     return chosen, warnings
 

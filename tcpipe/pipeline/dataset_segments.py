@@ -31,8 +31,12 @@ class Pool:
     warnings: tuple[str, ...]
 
 
-def pool_segments(runs: Sequence[RunDirectory], directory: Path) -> Pool:
+def pool_segments(
+    runs: Sequence[RunDirectory], directory: Path, *, again: Mapping[str, NDArray[np.bool_]] | None = None
+) -> Pool:
     """Gather the segments that can become samples, run by run, in a file in ``directory``.
+
+    ``again`` marks, by run, the segments that another run has too, in the order of the run's file.
 
     Raises
     ------
@@ -43,7 +47,7 @@ def pool_segments(runs: Sequence[RunDirectory], directory: Path) -> Pool:
     names = dict.fromkeys(name for run in runs for name in run.manifest["ledger_m"])
     ledger_m = {name: math.fsum(run.manifest["ledger_m"].get(name, 0.0) for run in runs) for name in names}
     path, counts = directory / "segments.arrow", list[_Count]()
-    write_pieces(path, LABELLED_SEGMENTS.arrow(), _usable(runs, counts))
+    write_pieces(path, LABELLED_SEGMENTS.arrow(), _usable(runs, again or {}, counts))
     every, powered, located = (
         sum(getattr(count, name) for count in counts) for name in ("every", "powered", "located")
     )
@@ -61,22 +65,26 @@ def pool_segments(runs: Sequence[RunDirectory], directory: Path) -> Pool:
     lost_m = {
         Loss.NO_POWER: math.fsum(count.no_power_m for count in counts),
         Loss.OUTSIDE_MAP: math.fsum(count.no_place_m for count in counts),
+        Loss.RECORDED_TWICE: math.fsum(count.again_m for count in counts),
     }
     return Pool(segments, move_out(ledger_m, lost_m), tuple(_warnings(runs, counts)))
 
 
 @dataclass(frozen=True, slots=True)
 class _Count:
-    """What the segments of a run have: how many, and the metres of those that lack power, or else a place."""
+    """What the segments of a run have: how many, and the metres of those that lack power, or else a place, or else are another run's."""
 
     every: int
     powered: int
     located: int
     no_power_m: float
     no_place_m: float
+    again_m: float
 
 
-def _usable(runs: Sequence[RunDirectory], counts: list[_Count]) -> Iterator[pa.Table]:
+def _usable(
+    runs: Sequence[RunDirectory], again: Mapping[str, NDArray[np.bool_]], counts: list[_Count]
+) -> Iterator[pa.Table]:
     """Yield each run's segments that can become samples; ``counts`` gets an entry a run."""
     for run in runs:
         segments = run.segments()
@@ -84,9 +92,11 @@ def _usable(runs: Sequence[RunDirectory], counts: list[_Count]) -> Iterator[pa.T
         ends = [f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")]
         located = np.isfinite([floats(segments, end) for end in ends]).all(axis=0)
         arc_m = floats(segments, "arc_length_m")
-        lost_m = float(arc_m[~powered].sum()), float(arc_m[powered & ~located].sum())
-        counts.append(_Count(len(powered), int(powered.sum()), int(located.sum()), *lost_m))
         usable = powered & located
+        twice = usable & again.get(run.run_id, np.zeros(len(usable), np.bool_))
+        lost_m = (float(arc_m[lost].sum()) for lost in (~powered, powered & ~located, twice))
+        counts.append(_Count(len(powered), int(powered.sum()), int(located.sum()), *lost_m))
+        usable &= ~twice
         yield segments if usable.all() else segments.filter(pa.array(usable))
 
 

@@ -1,8 +1,8 @@
-"""Recordings that are in the store twice: the same file under two names, or two recordings of one drive."""
+"""Recordings that are in the store twice: one file under two names, or two recordings of one drive, whole or in part (ADR 19)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,81 +15,113 @@ from tcpipe.tables.columns import floats, integers
 _SAME_TIME_NS = 1_000_000_000
 _SAME_PLACE_M = 2.0
 _SAME_DRIVE = 0.5
-"""A run of which this share of segments begins at the time and place of another's is the same drive."""
+"""Where so large a share of two runs is together, to the second and in place, their clocks may differ by a constant."""
 
 _METRES_PER_DEG = 111_320.0
 
+Mask = NDArray[np.bool_]
+
 
 @dataclass(frozen=True, slots=True)
-class _Starts:
-    """When and where the segments of a run begin, by time: [ns], (N,), and lon, lat [deg], (N, 2)."""
+class Once:
+    """Runs of which each drive is there once: ``again`` marks, by run, the segments that an earlier one in ``runs`` has too."""
 
-    stamp_ns: NDArray[np.int64]
+    runs: tuple[RunDirectory, ...]
+    again: Mapping[str, Mask]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Way:
+    """When and where a run's segments lie, in the order of its file, which is that of time: [ns], (N,), and lon, lat [deg], (N, 2)."""
+
+    start_ns: NDArray[np.int64]
+    end_ns: NDArray[np.int64]
     lonlat_deg: NDArray[np.float64]
 
 
-def each_drive_once(
-    runs: Sequence[RunDirectory], sha256_by_run: dict[str, str]
-) -> tuple[list[RunDirectory], list[str]]:
-    """Return the runs without second recordings, and a warning for each of those; of two, the first by id stays.
+def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, str]) -> Once:
+    """Return the runs, by id, without second recordings, and a warning for each of those; of two, the first by id stays.
 
     Parameters
     ----------
     runs
-        Runs to choose from.
+        Runs to choose from, all of one recipe.
     sha256_by_run
         Hash of each run's log.
 
     """
-    kept: list[RunDirectory] = []
-    starts: list[_Starts] = []
+    kept: list[tuple[RunDirectory, _Way]] = []
+    again: dict[str, Mask] = {}
     warnings: list[str] = []
+    by_sha256: dict[str, str] = {}
     for run in sorted(runs, key=lambda run: (run.run_id, run.recipe_id)):
-        mine = _starts(run)
-        twin = _same_file(run, kept, sha256_by_run)
-        if twin is not None:
-            warnings.append(f"run {run.run_id}: the same recording as run {twin.run_id}; used once")
+        twin = by_sha256.setdefault(sha256_by_run[run.run_id], run.run_id)
+        if twin != run.run_id:
+            warnings.append(f"run {run.run_id}: the same recording as run {twin}; used once")
             continue
-        shares = [
-            _shared(mine, other) if run.robot == first.robot else 0.0 for first, other in zip(kept, starts, strict=True)
-        ]
-        most = int(np.argmax(shares)) if shares else 0
-        if shares and shares[most] >= _SAME_DRIVE:
+        mine = _way(run)
+        twice, others = np.zeros(len(mine.start_ns), np.bool_), []
+        for other, theirs in _at_that_time(mine, run, kept):
+            shared = _shared(mine, theirs)
+            twice |= shared
+            others += [other.run_id] if shared.any() else []
+        if twice.any():
+            count = "all" if twice.all() else f"{int(twice.sum())} of"
             warnings.append(
-                f"run {run.run_id}: {shares[most]:.0%} of its segments begin when and where those of run {kept[most].run_id} do: "
+                f"run {run.run_id}: {count} {len(twice)} segments lie when and where those of run {', '.join(others)} do: "
                 "the same drive; used once"
             )
+        if twice.all() and len(twice):
             continue
-        kept.append(run)
-        starts.append(mine)
-    return kept, warnings
+        again[run.run_id] = twice
+        kept.append((run, mine))
+    return Once(tuple(run for run, _ in kept), again, tuple(warnings))
 
 
-def _same_file(run: RunDirectory, kept: Sequence[RunDirectory], sha256_by_run: dict[str, str]) -> RunDirectory | None:
-    sha256 = sha256_by_run[run.run_id]
-    return next((other for other in kept if sha256_by_run[other.run_id] == sha256), None)
+def _way(run: RunDirectory) -> _Way:
+    names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
+    table = read_table(run.path / "segments.parquet", names)
+    middle = [(floats(table, f"start_{axis}_deg") + floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")]
+    return _Way(integers(table, "start_ns"), integers(table, "end_ns"), np.column_stack(middle))
 
 
-def _starts(run: RunDirectory) -> _Starts:
-    columns = ["start_ns", "start_lon_deg", "start_lat_deg"]
-    table = read_table(run.path / "segments.parquet", columns)
-    stamps = integers(table, columns[0])
-    order = np.argsort(stamps, kind="stable")
-    return _Starts(stamps[order], np.column_stack([floats(table, name) for name in columns[1:]])[order])
+def _at_that_time(
+    mine: _Way, run: RunDirectory, kept: Sequence[tuple[RunDirectory, _Way]]
+) -> Iterator[tuple[RunDirectory, _Way]]:
+    """Yield the runs of the same robot that were recorded at the same time."""
+    for other, theirs in kept:
+        if other.robot == run.robot and len(mine.start_ns) and len(theirs.start_ns):
+            apart_ns = max(mine.start_ns[0], theirs.start_ns[0]) - min(mine.end_ns[-1], theirs.end_ns[-1])
+            if apart_ns <= _SAME_TIME_NS:
+                yield other, theirs
 
 
-def _shared(mine: _Starts, other: _Starts) -> float:
-    """Return the share of ``mine`` that begins within 1 s and 2 m of a segment of ``other``."""
-    if len(mine.stamp_ns) == 0 or len(other.stamp_ns) == 0:
-        return 0.0
-    later, earlier = max(mine.stamp_ns[0], other.stamp_ns[0]), min(mine.stamp_ns[-1], other.stamp_ns[-1])
-    if later - earlier > _SAME_TIME_NS:
-        return 0.0
-    after = np.clip(np.searchsorted(other.stamp_ns, mine.stamp_ns), 1, max(len(other.stamp_ns) - 1, 1))
-    found = np.zeros(len(mine.stamp_ns), np.bool_)
-    for at in (after - 1, np.minimum(after, len(other.stamp_ns) - 1)):
-        together = np.abs(other.stamp_ns[at] - mine.stamp_ns) <= _SAME_TIME_NS
-        step_deg = other.lonlat_deg[at] - mine.lonlat_deg
+def _shared(mine: _Way, other: _Way) -> Mask:
+    """Mark the segments of ``mine`` that are ``other``'s: at one time a robot is at one place."""
+    skew_ns = 0
+    together_ns = min(mine.end_ns[-1], other.end_ns[-1]) - max(mine.start_ns[0], other.start_ns[0])
+    if together_ns >= _SAME_DRIVE * min(way.end_ns[-1] - way.start_ns[0] for way in (mine, other)):
+        loosely, apart_ns = _beside(mine, other, slack_ns=_SAME_TIME_NS)
+        if loosely.sum() >= _SAME_DRIVE * min(len(mine.start_ns), len(other.start_ns)):
+            skew_ns = int(np.median(apart_ns[loosely]))
+    return _beside(mine, other, skew_ns=skew_ns)[0]
+
+
+def _beside(mine: _Way, other: _Way, *, slack_ns: int = 0, skew_ns: int = 0) -> tuple[Mask, NDArray[np.int64]]:
+    """Mark the segments whose middle half overlaps one of the other's in time, but for the slack, and that lie within 2 m of it.
+
+    The second array says how much later than that one they are [ns], once ``skew_ns`` is taken off.
+    """
+    start_ns, quarter_ns = mine.start_ns - skew_ns, (mine.end_ns - mine.start_ns) // 4
+    first = np.searchsorted(other.end_ns, start_ns + quarter_ns - slack_ns, side="right")
+    last = np.searchsorted(other.start_ns, start_ns + 3 * quarter_ns + slack_ns, side="left") - 1
+    nearest_m, apart_ns = np.full(len(start_ns), np.inf), np.zeros(len(start_ns), np.int64)
+    for at in (first, (first + last) // 2, last):
+        there = np.clip(at, 0, len(other.start_ns) - 1)
+        step_deg = other.lonlat_deg[there] - mine.lonlat_deg
         east_m = step_deg[:, 0] * _METRES_PER_DEG * np.cos(np.radians(mine.lonlat_deg[:, 1]))
-        found |= together & (np.hypot(east_m, step_deg[:, 1] * _METRES_PER_DEG) <= _SAME_PLACE_M)
-    return float(found.mean())
+        away_m = np.hypot(east_m, step_deg[:, 1] * _METRES_PER_DEG)
+        nearer = (first <= last) & (away_m < nearest_m)
+        nearest_m[nearer], apart_ns[nearer] = away_m[nearer], (start_ns - other.start_ns[there])[nearer]
+    return nearest_m <= _SAME_PLACE_M, apart_ns

@@ -70,7 +70,7 @@ def assign_splits(
     regions
         In the same plane; without regions every sample is inside.
     holdout
-        ``sample`` draws the ceil(test_fraction · n) samples of lowest rank; ``block`` and ``run`` keep groups whole.
+        ``sample`` draws ceil(test_fraction · n) samples, of each run those of lowest rank; ``block`` and ``run`` keep groups whole.
     test_fraction
         Share of test among the inside samples, after every drop and buffer.
     block_m
@@ -95,7 +95,7 @@ def assign_splits(
     known = np.select([old[inside] == "test", old[inside] == "train"], [1, 0], UNDECIDED)
     groups = _groups(run[inside], run_names, corners_xy_m[inside], by_run=holdout == "run", block_m=block_m)
     if holdout == "sample":
-        test = draw_samples(ranks[inside], test_fraction=test_fraction, kept=known)
+        test = draw_samples(ranks[inside], run[inside], test_fraction=test_fraction, kept=known)
     else:
         chosen = draw_groups(groups, run[inside], test_fraction=test_fraction, seed=seed, kept=groups.decided(known))
         test = np.where(known == UNDECIDED, chosen[groups.member], known == 1)

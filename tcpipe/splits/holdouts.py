@@ -59,13 +59,17 @@ def blocks(centres_xy_m: Floats, *, block_m: float) -> Groups:
     return Groups(member.astype(np.int64).reshape(len(cells)), names if len(codes) else ())
 
 
-def draw_samples(ranks: NDArray[np.uint64], *, test_fraction: float, kept: Ints | None = None) -> Mask:
-    """Mark the ceil(test_fraction · n) samples of lowest rank as test.
+def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: float, kept: Ints | None = None) -> Mask:
+    """Mark ceil(test_fraction · n) samples as test: those of lowest rank of every arrival, as many as make up the share so far.
+
+    What comes later moves none of those before, and where something comes in between, every later arrival changes by one sample at most.
 
     Parameters
     ----------
     ranks
         Rank of each sample, shape (N,).
+    arrival
+        When each came: the number of its run in the order of recording, shape (N,).
     test_fraction
         Wanted share.
     kept
@@ -76,12 +80,20 @@ def draw_samples(ranks: NDArray[np.uint64], *, test_fraction: float, kept: Ints 
     Whether each sample tests, shape (N,).
 
     """
-    exact = Fraction(str(test_fraction)) * len(ranks)  # 0.2 * 35 is 7.000000000000001 in binary
+    exact = Fraction(str(test_fraction))  # 0.2 * 35 is 7.000000000000001 in binary
     kept = np.full(len(ranks), UNDECIDED) if kept is None else kept
     test: Mask = kept == 1
-    free = np.flatnonzero(kept == UNDECIDED)
-    lowest = free[np.argsort(ranks[free], kind="stable")]
-    test[lowest[: max(math.ceil(exact) - int(test.sum()), 0)]] = True
+    order = np.lexsort((ranks, arrival))
+    ends = np.append(np.flatnonzero(np.diff(arrival[order])) + 1, len(order)) if len(order) else []
+    missing, first = -int(test.sum()), 0
+    for end in ends:
+        missing += math.ceil(exact * int(end)) - math.ceil(exact * first)
+        free = order[first:end][kept[order[first:end]] == UNDECIDED]
+        chosen = free[: max(missing, 0)]
+        test[chosen] = True
+        missing, first = missing - len(chosen), int(end)
+    rest = np.flatnonzero((kept == UNDECIDED) & ~test)
+    test[rest[np.argsort(ranks[rest], kind="stable")][: max(missing, 0)]] = True
     return test
 
 

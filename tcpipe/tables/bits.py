@@ -75,3 +75,5 @@ class Loss(IntFlag):
     """A segment without a label: the run has no power source, or none over this stretch."""
     SPLIT_EXCLUDED = 1 << 24
     """The footprint lies in a region whose `split` is `exclude`."""
+    RECORDED_TWICE = 1 << 25
+    """Another run of the dataset has the same stretch of the same drive."""

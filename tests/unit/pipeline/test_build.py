@@ -108,11 +108,31 @@ def test_one_drive_recorded_twice_counts_once(store, tmp_path):
     add(store, "b", start_ns=10**18 + 300_000_000)
     result = build(store, tmp_path)
     assert result.samples == 20
-    assert (
-        "run b: 100% of its segments begin when and where those of run a do: the same drive; used once"
-        in result.warnings
-    )
+    assert "run b: all 20 segments lie when and where those of run a do: the same drive; used once" in result.warnings
     assert [run["run_id"] for run in open_dataset(tmp_path / "out").card["runs"]] == ["a"]
+
+
+@pytest.mark.parametrize(("names", "skew_ns"), [(("a", "b"), 0), (("b", "a"), 300_000_000), (("a", "b"), -900_000_000)])
+def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_path, names, skew_ns):
+    """One drive of 40 m; its second recording has the last 20 m of the first one and 10 m more."""
+    whole, late = names
+    add(store, whole, x=(-19.0, 11.0), start_ns=10**18)
+    add(store, late, x=(-9.0, 18.0), start_ns=10**18 + 10 * 1_200_000_000 + skew_ns)
+    result = build(store, tmp_path)
+    starts_m = np.sort(pq.read_table(tmp_path / "out" / "samples.parquet")["start_lon_deg"].to_numpy())
+    assert result.samples == 37
+    assert np.diff(starts_m).min() > 0.9 * np.median(np.diff(starts_m))  # no metre of it twice
+    assert result.ledger_m["recorded_twice"] == pytest.approx(20)
+    assert any("20 of " in line and "the same drive; used once" in line for line in result.warnings)
+    assert sum(result.ledger_m.values()) == pytest.approx(30 + 27 + 5)
+
+
+def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it_too(store, tmp_path):
+    add(store, "a", x=(-15.0, 5.0), start_ns=10**18)
+    add(store, "b", x=(5.0, 7.0), start_ns=10**18 + 20 * 1_200_000_000 + 50_000_000)
+    result = build(store, tmp_path)
+    assert result.samples == 22
+    assert not any("the same drive" in line for line in result.warnings)
 
 
 def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store, tmp_path):

@@ -20,27 +20,31 @@ def ranks(names, seed=0):
 
 @pytest.mark.parametrize(("n", "tests"), [(6428, 1286), (5, 1), (6, 2), (35, 7), (1, 1), (0, 0)])
 def test_test_is_the_ceiling_of_its_share(n, tests):  # 6428 is the paper's area A, 1286 its test set
-    assert draw_samples(ranks([str(i) for i in range(n)]), test_fraction=0.2).sum() == tests
+    for arrival in (np.zeros(n, int), np.arange(n) // 37, np.arange(n)[::-1] // 400):
+        assert draw_samples(ranks([str(i) for i in range(n)]), arrival, test_fraction=0.2).sum() == tests
 
 
-def test_test_holds_the_lowest_ranks():
-    found = ranks(IDS, seed=3)
-    test = draw_samples(found, test_fraction=0.2)
-    assert found[test].max() < found[~test].min()
+def test_test_holds_the_lowest_ranks_of_every_run():
+    found, run = ranks(IDS, seed=3), np.arange(1000) % 3
+    test = draw_samples(found, run, test_fraction=0.2)
+    for number in range(3):
+        assert found[test & (run == number)].max() < found[~test & (run == number)].min()
+        assert (test & (run == number)).sum() in (66, 67)
 
 
 def test_samples_that_are_kept_stay_and_the_rest_fills_up():
     kept = np.full(1000, UNDECIDED)
     kept[:150], kept[150:300] = 1, 0
-    test = draw_samples(ranks(IDS), test_fraction=0.2, kept=kept)
-    assert test[:150].all()
-    assert not test[150:300].any()
-    assert test.sum() == 200
+    for arrival in (np.zeros(1000, int), np.arange(1000) // 100, -np.arange(1000) // 100):
+        test = draw_samples(ranks(IDS), arrival, test_fraction=0.2, kept=kept)
+        assert test[:150].all()
+        assert not test[150:300].any()
+        assert test.sum() == 200
 
 
 def test_row_order_says_nothing_of_the_holdout():
     order = np.argsort(order_ranks(IDS, seed=0))
-    test = draw_samples(ranks(IDS), test_fraction=0.5)[order]
+    test = draw_samples(ranks(IDS), np.zeros(1000, int), test_fraction=0.5)[order]
     first = test[:500].sum()
     assert 190 < first < 310  # 250 ± 4 sigma; equal salts would give 0 or 500
     assert sorted(order.tolist()) == list(range(1000))
