@@ -16,6 +16,7 @@ import click
 from tcpipe import __version__
 from tcpipe.cli.add_map import add_map
 from tcpipe.cli.build_dataset import build_dataset
+from tcpipe.cli.cost_map import cost_map
 from tcpipe.cli.demo import demo
 from tcpipe.cli.diff import diff
 from tcpipe.cli.evaluate import evaluate
@@ -24,6 +25,8 @@ from tcpipe.cli.export import export
 from tcpipe.cli.ingest import ingest
 from tcpipe.cli.init import init
 from tcpipe.cli.inspect import inspect
+from tcpipe.cli.plan_path import plan_path
+from tcpipe.cli.predict_path import predict_path
 from tcpipe.cli.process import Ended, prepare_process
 from tcpipe.cli.report import report
 from tcpipe.cli.schemas import schemas
@@ -66,6 +69,9 @@ for command in (
     build_dataset,
     train,
     evaluate,
+    predict_path,
+    cost_map,
+    plan_path,
     report,
     export,
     explain,

@@ -44,6 +44,7 @@ class Progress:
     """A bar, lines, or silence; ``line`` says something, ``step`` counts one done."""
 
     def __init__(self, what: str, total: int, *, quiet: bool) -> None:
+        self._what = what
         self._quiet = quiet
         self._bar: Any = None
         if not quiet and sys.stderr.isatty():
@@ -85,6 +86,13 @@ class Progress:
         """Say how many there are."""
         if self._bar is not None:
             self._bar.update(self._task, total=total)
+
+    def count(self, done: int, total: int) -> None:
+        """Say how many of how many are done: lines come at every tenth."""
+        if self._bar is not None:
+            self._bar.update(self._task, total=total, completed=done)
+        elif done * 10 // total > (done - 1) * 10 // total:
+            self.line(f"{self._what}: {100 * done // total} %")
 
     def step(self) -> None:
         """Count one done."""

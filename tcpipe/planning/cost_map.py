@@ -31,6 +31,7 @@ from tcpipe.formats.geotiff import read_bands, write_cog
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.map_files import MapFile
 from tcpipe.formats.nav2_map import HIGHEST, LETHAL, write_nav2_map
+from tcpipe.formats.seals import write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
@@ -119,7 +120,7 @@ def make_cost_map(
     grid, key = grid_over(source, step_m), cost_map_key(model, source, step_m)
     found = read_cost_map_card(out)
     if found is None and out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise UsageError(f"{out}: exists and is no cost map; give another directory with --out")
+        raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claimed(out) as place:
         found = read_cost_map_card(out)  # another process may have been first
         if found is not None and found["key"] == key and _is_whole(out, found):
@@ -129,7 +130,7 @@ def make_cost_map(
         about = {"kind": KIND, "version": VERSION, "key": key, "map": source.name, "model": model.checksum}
         with atomic_directory(out) as directory:
             card = {**about, "robot": model.robot, **_write(directory, spool.costs)}
-            write_json(directory / CARD, {**card, "checksums": checksums_to_json(directory)})
+            write_sealed(directory / CARD, {**card, "checksums": checksums_to_json(directory)})
         rmtree(place)
     return CostMapResult(out, "done", card)
 

@@ -101,10 +101,7 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
     pieces = pieces_of(source, lonlat_deg, chord_m=model.chord_m, where=where)
     frames = pieces.frames(model.chord_m)
     if not corners_on(source.grid, footprints(frames, model.patch_m)).any():
-        raise PathError(
-            f"{where}: no metre of it lies on map {source.name} ({extent_text(source)}); "
-            "wanted longitude before latitude, WGS 84, and the map of this site"
-        )
+        raise PathError(off_map_text(source, where, lonlat_deg))
     said = joined(verdicts_of(model, source, in_batches(frames)))
     said.reasons[pieces.arc_m > SegmentConfig().max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _costed(model, source, pieces, said)
@@ -184,7 +181,15 @@ def _places(source: MapReader, pieces: Pieces) -> dict[str, Floats]:
     }
 
 
-def extent_text(source: MapReader) -> str:
-    """Return where a map lies, in degrees."""
+def off_map_text(source: MapReader, where: str, lonlat_deg: Floats) -> str:
+    """Say that points, shape (P, 2), are not on a map, where that lies, and whether their axes are swapped."""
     west, south, east, north = area_of(projection_of(source).target, source.grid.bounds_m)
-    return f"lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}"
+    lat, lon = lonlat_deg.T
+    swapped = bool(((lon >= west) & (lon <= east) & (lat >= south) & (lat <= north)).any())
+    hint = (
+        "the axes look swapped; longitude comes first"
+        if swapped
+        else "wanted lon, lat in WGS 84, and the map of this site"
+    )
+    extent = f"lon {west:.5f} to {east:.5f}, lat {south:.5f} to {north:.5f}"
+    return f"{where}: is not on map {source.name} ({extent}); {hint}"

@@ -1,9 +1,9 @@
 """The least-cost path between two points (the paper's purpose, section I), proved against all the ground that was not looked at.
 
 A path over a point p is at least as long as the straight ways start-p-goal. So once a path of cost C is found, no point can lie on a
-better one for which that length times the cheapest metre exceeds C: all others are inside an ellipse. The ellipse is looked at, first
-without predictions (what can be driven at all, and the shortest way), then with; it grows until it holds every point that could matter, as
-long as no metre outside is cheaper than the cheapest inside.
+better one for which that length times the cost of a cheap metre exceeds C: all others are inside an ellipse. The ellipse is looked at,
+first without predictions (what can be driven at all, and the shortest way), then with; it grows until it holds every point that could
+matter, as long as the ground outside is nowhere cheaper than the cheapest tenth of that inside.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import PathError
 from tcpipe.planning.cost_grid import BARRED
-from tcpipe.planning.path_cost import PathCost, cost_of_path, extent_text, projection_of
+from tcpipe.planning.path_cost import PathCost, cost_of_path, off_map_text, projection_of
 from tcpipe.planning.reasons import names_of
 from tcpipe.planning.search import Found, least_cost_path, steps_of
 from tcpipe.planning.straight import straightened
@@ -137,8 +137,8 @@ class _Search:
             np.nan_to_num(self.ends_xy_m, posinf=np.inf)
         )
         problems += [
-            f"{label}: is not on map {source.name} ({extent_text(source)}); longitude comes first"
-            for label, inside in zip(labels, on, strict=True)
+            off_map_text(source, label, end[None])
+            for label, end, inside in zip(labels, self.ends_deg, on, strict=True)
             if not inside
         ]
         if problems:
@@ -200,7 +200,7 @@ class _Search:
             found = self._found(objective, self.survey.predicted)
             if found is None and ellipse.all():
                 raise PathError(self._no_way())
-            reach_m = found.reduced_cost / found.cheapest_per_m if found and found.cheapest_per_m > 0.0 else np.inf
+            reach_m = found.reduced_cost / found.cheap_per_m if found and found.cheap_per_m > 0.0 else np.inf
             if found and (reach_m <= bound_m or ellipse.all()):
                 return found
             bound_m = min(bound_m * _GROWTH, reach_m) if found else bound_m * _GROWTH

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M
+from tcpipe.planning.ground_kernel import class_facts, relief_steps
+from tcpipe.terrain.layers import HEIGHT_STEP_M
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.tiles import MapReader
 
@@ -82,7 +83,7 @@ def reasons_of(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, so
     ranges = {
         Reason.SLOPE_NOT_SEEN: (patches.slope_rad, "slope_rad"),
         Reason.CROSS_SLOPE_NOT_SEEN: (patches.cross_slope_rad, "cross_slope_rad"),
-        Reason.RELIEF_NOT_SEEN: (_relief_m(patches), "relief_m"),
+        Reason.RELIEF_NOT_SEEN: (relief_m(patches.height), "relief_m"),
     }
     for reason, (values, name) in ranges.items():
         low, high = model.seen[name]
@@ -94,27 +95,25 @@ def reasons_of(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, so
     return bits
 
 
-def _relief_m(patches: Patches) -> NDArray[np.float64]:
-    """Return the largest height difference within each patch [m]."""
-    return relief_m(patches.height)
-
-
 def relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
     """Return the largest difference of the stored heights of patches, shape (N, px, px), without data left out [m], shape (N,)."""
-    known = np.where(height == HEIGHT_NODATA, np.uint16(0), height)
-    return np.asarray(known.max(axis=(1, 2), initial=0) * HEIGHT_STEP_M)
+    steps = np.empty(len(height), np.uint16)
+    relief_steps(height, steps)
+    return steps.astype(np.float64) * HEIGHT_STEP_M
 
 
 def _class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: CostModel) -> Bits:
     traversable = model.classes.traversable()
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
-    seen, known = np.zeros(256, np.bool_), np.zeros(256, np.bool_)
+    seen, known = np.zeros(256, np.bool_), np.zeros(256, np.uint8)
     seen[[class_id for class_id, count in model.class_counts.items() if count > 0]] = True
-    known[list(model.pixel_classes)] = True
-    bits[~seen[patches.terrain_class] | ~known[terrain].all(axis=(1, 2))] |= np.uint16(Reason.CLASS_NOT_SEEN)
+    known[list(model.pixel_classes)] = 1
     px = terrain.shape[1]
-    off_m = np.abs((np.arange(px) + 0.5) / px - 0.5) * model.patch_m
-    lane = terrain[:, off_m <= LANE_M / 2.0]
-    bits[(~traversable[lane]).mean(axis=(1, 2)) > _STRAY] |= np.uint16(Reason.OBSTACLE)
+    lane = np.flatnonzero(np.abs((np.arange(px) + 0.5) / px - 0.5) * model.patch_m <= LANE_M / 2.0)
+    unknown, shut = np.empty(len(terrain), np.bool_), np.empty(len(terrain))
+    blocked = (~traversable).astype(np.uint8)
+    class_facts(terrain, known, blocked, int(lane[0]), int(lane[-1]) + 1, unknown, shut)
+    bits[~seen[patches.terrain_class] | unknown] |= np.uint16(Reason.CLASS_NOT_SEEN)
+    bits[shut > _STRAY] |= np.uint16(Reason.OBSTACLE)
     return bits

@@ -31,6 +31,9 @@ _STEEPEST_PER_M = 1e5
 
 _PRECISION = 1e-3
 
+_CHEAP = 0.1
+"""Ground that was not looked at is taken as no cheaper than the cheapest tenth of what was: no path is made of the best metres alone."""
+
 
 @dataclass(frozen=True, slots=True)
 class Steps:
@@ -53,12 +56,12 @@ class Steps:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A least-cost path: flat indices of its cells, its cost, and what bounds it (see `reach`)."""
+    """A least-cost path: flat indices of its cells and its cost; both without the grade, too, and what a cheap metre costs without it."""
 
     cells: NDArray[np.int64]
     cost: float
     reduced_cost: float
-    cheapest_per_m: float
+    cheap_per_m: float
     negative_steps: int
 
 
@@ -141,7 +144,7 @@ def least_cost_path(steps: Steps, cells: int, start: int, goal: int) -> Found | 
         path.append(int(before[path[-1]]))
     order = np.array(path[::-1])
     total = float(path_cost(steps, order, cells))
-    cheapest = max(float((reduced / steps.length_m).min()), 0.0)
+    cheapest = max(float(np.quantile(reduced / steps.length_m, _CHEAP)), 0.0)
     return Found(order, total, float(cost[goal]), cheapest, negative)
 
 

@@ -1,0 +1,50 @@
+"""``tcpipe cost-map``: what a metre costs along 16 courses, everywhere."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import json_option, quiet_option, store_option
+
+
+@click.command("cost-map", short_help="Directional cost maps of a whole map")
+@click.argument("model", metavar="MODEL")
+@click.argument("out", default="cost-map", metavar="[OUT]")
+@click.option("--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store).")
+@click.option(
+    "--step",
+    "step_m",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(0.05, 1000.0),
+    metavar="METRES",
+    help="Side of a cell.",
+)
+@store_option
+@json_option
+@quiet_option
+def cost_map(
+    model: str, out: str, *, map_name: str | None, step_m: float, store: str, as_json: bool, quiet: bool
+) -> None:
+    """Predict power, velocity, time and energy a metre along 16 courses in every cell of a map.
+
+    Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
+    maps for Nav2. An interrupted call goes on where it was.
+    """
+    from dataclasses import asdict
+
+    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.learning.models import load_model
+    from tcpipe.planning.cost_map import make_cost_map
+    from tcpipe.planning.inputs import chosen_map
+
+    with progress("cost-map", 1, quiet=quiet) as shown:
+        source = chosen_map(store, map_name)
+        result = make_cost_map(load_model(model), source, Path(out), step_m=step_m, step=shown.count)
+    if as_json:
+        print_json(asdict(result))
+    else:
+        for line in str(result).splitlines():
+            say(line)

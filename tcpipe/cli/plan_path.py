@@ -1,0 +1,89 @@
+"""``tcpipe plan-path``: the least-cost path between two points."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import click
+
+from tcpipe.cli.options import json_option, quiet_option, store_option
+
+
+def _lonlat(context: click.Context, parameter: click.Parameter, value: str) -> tuple[float, float]:
+    """Turn ``LON,LAT`` into two numbers; anything else is a usage error."""
+    try:
+        lon, lat = (float(part) for part in value.split(","))
+    except ValueError:
+        raise click.BadParameter(
+            f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", ctx=context, param=parameter
+        ) from None
+    return lon, lat
+
+
+@click.command("plan-path", short_help="The path of least energy, time or distance")
+@click.argument("model", metavar="MODEL")
+@click.option(
+    "--from", "start", required=True, metavar="LON,LAT", callback=_lonlat, help="Where it begins (WGS84, degrees)."
+)
+@click.option("--to", "goal", required=True, metavar="LON,LAT", callback=_lonlat, help="Where it ends.")
+@click.option(
+    "--objective",
+    default="energy",
+    show_default=True,
+    type=click.Choice(["energy", "time", "distance"]),
+    help="What is to be least.",
+)
+@click.option("--map", "map_name", metavar="NAME", help="Map to plan on (default: the only one in the store).")
+@click.option("--out", default="plan.geojson", show_default=True, metavar="FILE", help="The path as GeoJSON.")
+@click.option("--picture", metavar="FILE", help="Draw all three objectives side by side on the hill (.png).")
+@click.option(
+    "--cost-map", metavar="DIR", help="A cost map of this model and map; without one only what is needed is predicted."
+)
+@click.option(
+    "--step",
+    "step_m",
+    default=1.0,
+    show_default=True,
+    type=click.FloatRange(0.05, 1000.0),
+    metavar="METRES",
+    help="Side of a cell; that of --cost-map rules.",
+)
+@click.option("--allow-unseen", is_flag=True, help="Also cross ground unlike any that the model was trained on.")
+@store_option
+@json_option
+@quiet_option
+def plan_path(
+    model: str,
+    *,
+    start: tuple[float, float],
+    goal: tuple[float, float],
+    objective: Literal["energy", "time", "distance"],
+    map_name: str | None,
+    out: str,
+    picture: str | None,
+    cost_map: str | None,
+    step_m: float,
+    allow_unseen: bool,
+    store: str,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel."""
+    from dataclasses import asdict
+
+    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.learning.models import load_model
+    from tcpipe.planning.inputs import chosen_map
+    from tcpipe.planning.plan_files import PlanRequest, plan
+
+    request = PlanRequest(start, goal, objective, step_m, allow_unseen, Path(cost_map) if cost_map else None)
+    with progress("plan-path", 1, quiet=quiet) as shown:
+        source = chosen_map(store, map_name)
+        drawn = Path(picture) if picture else None
+        result = plan(load_model(model), source, request, out=Path(out), picture=drawn, step=shown.count)
+    if as_json:
+        print_json(asdict(result))
+    else:
+        for line in str(result).splitlines():
+            say(line)

@@ -1,0 +1,41 @@
+"""``tcpipe predict-path``: what a path costs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import json_option, quiet_option, store_option
+
+
+@click.command("predict-path", short_help="Time and energy of a path")
+@click.argument("model", metavar="MODEL")
+@click.option("--path", "path_file", required=True, metavar="FILE", help="GeoJSON LineString (WGS84, lon before lat).")
+@click.option("--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store).")
+@click.option("--out", metavar="FILE", help="Write the table of pieces: .csv, .parquet or .json.")
+@store_option
+@json_option
+@quiet_option
+def predict_path(
+    model: str, *, path_file: str, map_name: str | None, out: str | None, store: str, as_json: bool, quiet: bool
+) -> int:
+    """Cut a path into pieces of a metre and predict the time and energy of each and of all, with intervals.
+
+    Pieces on ground where MODEL has no business (a class, slope or relief not seen in training, off the map, no data, not
+    traversable) are marked and counted. Exit code 3: some pieces have no cost.
+    """
+    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.learning.models import load_model
+    from tcpipe.planning.inputs import chosen_map
+    from tcpipe.planning.path_files import predict_path as run
+
+    with progress("predict-path", 1, quiet=quiet):
+        source = chosen_map(store, map_name)
+        result = run(load_model(model), source, Path(path_file), Path(out) if out else None)
+    if as_json:
+        print_json({**result.summary, "path": path_file, "out": out, "status": result.status})
+    else:
+        for line in str(result).splitlines():
+            say(line)
+    return result.exit_code

@@ -1,0 +1,31 @@
+"""What the commands plan on: one map of a store."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tcpipe.errors import MapError, UsageError
+from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.store import open_store
+
+
+def chosen_map(store: str | Path, name: str | None) -> MapFile:
+    """Return the named map of a store, or its only one.
+
+    Raises
+    ------
+    StoreError, MapError
+        There is no store, no such map, or it cannot be read.
+    UsageError
+        There are several, and none is named.
+
+    """
+    house = open_store(store)
+    maps = house.maps()
+    if not maps:
+        raise MapError(f"{house.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
+    if name is None and len(maps) > 1:
+        raise UsageError(f"{house.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map")
+    if name is not None and name not in maps:
+        raise MapError(f"{house.root}: no map {name!r} in the store; there are {', '.join(maps)}")
+    return open_map(house.map_path(name or maps[0]))

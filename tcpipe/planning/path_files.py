@@ -1,0 +1,116 @@
+"""`tcpipe predict-path`: a path from a file to its cost, and the table of its pieces to another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.dataset_files import file_checksum
+from tcpipe.formats.geojson_lines import read_line
+from tcpipe.formats.json_files import digest, read_json
+from tcpipe.formats.map_files import MapFile
+from tcpipe.formats.seals import write_sealed
+from tcpipe.planning.cost_model import CostModel
+from tcpipe.planning.intervals import COVERAGE
+from tcpipe.planning.path_cost import cost_of_path
+from tcpipe.planning.path_table import check_ending, write_pieces
+
+VERSION = "1.0"
+
+
+@dataclass(frozen=True, slots=True)
+class PathResult:
+    """What a path costs; ``str`` of it is what the command prints."""
+
+    path: Path
+    out: Path | None
+    status: str
+    """``done`` or ``unchanged``."""
+    summary: Mapping[str, Any]
+
+    @property
+    def exit_code(self) -> int:
+        """Return 3 if some of the path has no cost, else 0."""
+        return 0 if self.summary["complete"] else 3
+
+    def __str__(self) -> str:
+        """Return the totals, their intervals, and where the model has no business, as plain lines."""
+        return "\n".join((f"{self.path}: {cost_text(self.summary)}", *_reason_lines(self.summary), *self._out_lines()))
+
+    def _out_lines(self) -> tuple[str, ...]:
+        if self.out is None:
+            return ()
+        same = "; nothing to do: it is made from the same path, model and map"
+        return (f"{self.out}: {self.summary['pieces']} pieces{same if self.status == 'unchanged' else ''}",)
+
+
+def cost_text(summary: Mapping[str, Any]) -> str:
+    """Return length, time and energy with their intervals, as one line."""
+    duration = _quantity(summary["duration_s"], summary["duration_interval_s"], "s")
+    energy = _quantity(summary["energy_joule"], summary["energy_interval_joule"], "J")
+    part = "" if summary["complete"] else f", without {summary['pieces_without_cost']} of {summary['pieces']} pieces"
+    return f"{summary['length_m']:.1f} m, {duration}, {energy}{part}"
+
+
+def _quantity(value: float, interval: tuple[float, float] | None, unit: str) -> str:
+    digits = 1 if unit == "s" else 0
+    if interval is None:
+        return f"{value:.{digits}f} {unit}"
+    low, high = interval
+    return f"{value:.{digits}f} {unit} ({COVERAGE:.0%}: {low:.{digits}f} to {high:.{digits}f})"
+
+
+def _reason_lines(summary: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"warning: {count} of {summary['pieces']} pieces: {name.replace('_', ' ')}"
+        for name, count in summary["reasons"].items()
+    ]
+    if summary["duration_interval_s"] is None:
+        lines.append("warning: no intervals: the model has too few held-out samples to tell its errors")
+    return lines
+
+
+def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None) -> PathResult:
+    """Return what the line in a GeoJSON file costs; write its pieces to ``out`` and the totals beside it.
+
+    Raises
+    ------
+    PathError, ModelError, MapError
+        The path, the model or the map cannot be used.
+    UsageError, StoreError
+        ``out`` ends in no known format, or cannot be written.
+
+    """
+    if out is not None:
+        check_ending(out)
+    lonlat_deg = read_line(path)
+    line = {"lonlat_deg": lonlat_deg.tolist(), "version": VERSION}
+    key = digest({**line, "model": model.checksum, "map": source.summary()})
+    if out is not None and (found := _summary_of(out, key)) is not None:
+        return PathResult(path, out, "unchanged", found)
+    cost = cost_of_path(model, source, lonlat_deg, where=str(path))
+    summary = {"model": model.name, "map": source.name, "robot": model.robot, **cost.summary()}
+    if out is not None:
+        write_pieces(out, cost.pieces)
+        write_sealed(summary_path(out), {"key": key, "sha256": file_checksum(out)[1], **summary})
+    return PathResult(path, out, "done", summary)
+
+
+def summary_path(out: Path) -> Path:
+    """Return where the totals of a table of pieces stand."""
+    return out.with_name(f"{out.name}.summary.json")
+
+
+def _summary_of(out: Path, key: str) -> dict[str, Any] | None:
+    """Return the totals beside a table that is made from the same, and whole; else None."""
+    if not (out.is_file() and summary_path(out).is_file()):
+        return None
+    try:
+        found = read_json(summary_path(out))
+    except StoreError:
+        return None
+    same = found.get("key") == key and found.get("sha256") == file_checksum(out)[1]
+    return found if same else None

@@ -1,0 +1,271 @@
+"""The picture of a plan: the paths of least energy, time and distance side by side on the hill, and their profiles below."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib import patheffects
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from tcpipe.formats.atomic import atomic_file
+from tcpipe.planning.plan import Plan
+from tcpipe.report.figures import CLASS_COLOURS
+from tcpipe.tables.columns import floats
+from tcpipe.terrain.overviews import factor_for
+from tcpipe.terrain.tiles import MapReader, read_window
+
+Array = NDArray[Any]
+
+_INK, _FAINT = "#1d2830", "#7b8893"
+_COLOURS = {"energy": "#d4600c", "time": "#1668b8", "distance": "#4a4f55"}
+_LINES = {"energy": "-", "time": "-", "distance": (0, (5, 2))}
+_PANEL_PX = 900
+_MARGIN = 0.14
+_LEAST_SIDE_M = 40.0
+_ASPECT = 1.12
+_COST_MAP = "plasma"
+_STYLE: dict[Any, Any] = {
+    "font.family": "sans-serif",
+    "font.size": 10,
+    "text.color": _INK,
+    "axes.edgecolor": _FAINT,
+    "axes.labelcolor": _INK,
+    "xtick.color": _FAINT,
+    "ytick.color": _FAINT,
+}
+_WHITE = [patheffects.withStroke(linewidth=3.0, foreground="white")]
+
+
+def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
+    """Draw plans between the same points as PNG, a panel each; the same plans give the same bytes."""
+    bounds = _crop(source, np.concatenate([plan.xy_m for plan in plans]))
+    backdrop = _Backdrop(source, bounds)
+    spent = [_per_metre(plan) for plan in plans]
+    known = np.concatenate(spent)
+    known = known[np.isfinite(known)]
+    scale = Normalize(*(np.percentile(known, (2.0, 98.0)) if known.size else (0.0, 1.0)))
+    with mpl.rc_context(_STYLE):
+        figure = Figure(figsize=(15.0, 7.6), layout="constrained", facecolor="white")
+        FigureCanvasAgg(figure)
+        grid = figure.add_gridspec(2, len(plans), height_ratios=(4.3, 1.25))
+        panels = [figure.add_subplot(grid[0, column]) for column in range(len(plans))]
+        for axes, plan, values in zip(panels, plans, spent, strict=True):
+            backdrop.draw(axes)
+            for other in plans:
+                if other is not plan:
+                    axes.plot(*other.xy_m.T, color="white", lw=1.4, ls=(0, (1.5, 1.5)), alpha=0.9)
+            line = _draw_path(axes, plan, values, scale)
+            _draw_ends(axes, plan)
+            _title(axes, plan, plans)
+        _scale_bar(panels[0], bounds)
+        bar = figure.colorbar(line, ax=panels, shrink=0.82, pad=0.01, aspect=32)
+        bar.set_label("energy a metre along the path [J/m]")
+        bar.outline.set_visible(False)
+        _draw_profiles(figure.add_subplot(grid[1, :]), backdrop, plans)
+        if backdrop.classes:
+            figure.legend(
+                handles=[Patch(facecolor=colour, label=name, alpha=0.75) for name, colour in backdrop.classes],
+                loc="outside lower center", ncols=len(backdrop.classes), frameon=False, fontsize=9,
+            )  # fmt: skip
+        with atomic_file(path) as temporary:
+            figure.savefig(temporary, format="png", dpi=130, metadata={"Software": None})
+
+
+def _per_metre(plan: Plan) -> Array:
+    return np.asarray(floats(plan.cost.pieces, "energy_joule") / floats(plan.cost.pieces, "arc_length_m"))
+
+
+def _crop(source: MapReader, xy_m: Array) -> tuple[float, float, float, float]:
+    """Return x min, y min, x max, y max [m] around points: with a margin, near to the panel's shape, on the map as far as it goes."""
+    low, high = xy_m.min(axis=0), xy_m.max(axis=0)
+    side = (high - low) * (1.0 + 2.0 * _MARGIN)
+    side = np.maximum(side, np.maximum(side.max() * np.array([0.6, 0.6]), _LEAST_SIDE_M))
+    side = np.array([max(side[0], side[1] * _ASPECT), max(side[1], side[0] / _ASPECT)])
+    x_min, y_min, x_max, y_max = source.grid.bounds_m
+    side = np.minimum(side, (x_max - x_min, y_max - y_min))
+    first = np.clip((low + high) / 2.0 - side / 2.0, (x_min, y_min), np.array([x_max, y_max]) - side)
+    (left, bottom), (right, top) = first.tolist(), (first + side).tolist()
+    return left, bottom, right, top
+
+
+class _Backdrop:
+    """The hill: shaded relief under the orthophoto, tinted by class, with contour lines."""
+
+    def __init__(self, source: MapReader, bounds: tuple[float, float, float, float]) -> None:
+        left, bottom, right, top = bounds
+        level = source.at(factor_for(source.factors, source.grid.pitch_m, max(right - left, top - bottom) / _PANEL_PX))
+        corners = level.grid.px_from_xy(np.array([(left, top), (right, bottom)])) + 0.5
+        (col0, row0), (col1, row1) = np.floor(corners[0]).astype(int), np.ceil(corners[1]).astype(int)
+        step = max(1, max(row1 - row0, col1 - col0) // _PANEL_PX)
+        window = (int(row0), int(row1), int(col0), int(col1))
+        layers = {layer: read_window(level, layer, *window)[::step, ::step] for layer in level.layers}
+        self._height = layers["height"].astype(np.float64) + level.height_reference_m
+        pitch = level.grid.pitch_m * step
+        self._extent = (left, right, bottom, top)
+        self._picture = _blend(layers, _shade(self._height, pitch))
+        ids = np.unique(layers["terrain"]).tolist() if "terrain" in layers else []
+        self.classes = [(source.classes.name(i), _colour(i)) for i in ids if i]
+
+    def height_at(self, xy_m: Array) -> Array:
+        """Return the height of the nearest pixel [m], shape (N,)."""
+        left, right, bottom, top = self._extent
+        rows, cols = self._height.shape
+        col = ((xy_m[:, 0] - left) / (right - left) * cols).astype(np.int64)
+        row = ((top - xy_m[:, 1]) / (top - bottom) * rows).astype(np.int64)
+        return np.asarray(self._height[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)])
+
+    def draw(self, axes: Any) -> None:
+        """Draw it."""
+        axes.imshow(self._picture, extent=self._extent, interpolation="bilinear")
+        known = self._height[np.isfinite(self._height)]
+        if known.size and np.ptp(known) > 1.0:
+            step = _nice(float(np.ptp(known)) / 14.0)
+            levels = np.arange(np.ceil(known.min() / step) * step, known.max(), step)
+            left, right, bottom, top = self._extent
+            rows, cols = self._height.shape
+            x = left + (np.arange(cols) + 0.5) / cols * (right - left)
+            y = top - (np.arange(rows) + 0.5) / rows * (top - bottom)
+            lines = axes.contour(x, y, self._height, levels=levels, colors="#2b2013", linewidths=0.5, alpha=0.45)
+            axes.clabel(lines, levels[::3], fontsize=6.5, fmt="%g m")
+        axes.set_xlim(*self._extent[:2])
+        axes.set_ylim(*self._extent[2:])
+        axes.set_aspect("equal")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        for spine in axes.spines.values():
+            spine.set_visible(False)
+
+
+def _colour(class_id: int) -> str:
+    return CLASS_COLOURS[(class_id - 1) % len(CLASS_COLOURS)]
+
+
+def _shade(height_m: Array, pitch_m: float) -> Array:
+    """Return light from the north-west at 40°, exaggerated to the relief there is, in [0, 1]; NaN without data."""
+    down, right = np.gradient(height_m, pitch_m)
+    steep = np.nanpercentile(np.hypot(down, right), 90.0) if np.isfinite(down).any() else 1.0
+    exaggeration = np.clip(0.5 / max(float(steep), 1e-3), 1.0, 6.0)
+    down, right = down * exaggeration, right * exaggeration
+    azimuth, altitude = np.radians(315.0), np.radians(40.0)
+    east, north, up = np.sin(azimuth) * np.cos(altitude), np.cos(azimuth) * np.cos(altitude), np.sin(altitude)
+    light = (-right * east + down * north + up) / np.sqrt(1.0 + right**2 + down**2)
+    return np.asarray(np.clip(light, 0.0, 1.0))
+
+
+def _blend(layers: dict[str, Array], light: Array) -> Array:
+    """Return the picture, RGB in [0, 1]; what has no data is white."""
+    grey = np.full(light.shape, 0.7)
+    if "ortho" in layers:
+        ortho = layers["ortho"].astype(np.float64)
+        low, high = np.percentile(ortho[ortho > 0], (2.0, 98.0)) if (ortho > 0).any() else (0.0, 255.0)
+        grey = 0.35 + 0.6 * np.clip((ortho - low) / max(high - low, 1.0), 0.0, 1.0)
+    picture = np.repeat(grey[..., None], 3, axis=2)
+    if "terrain" in layers:
+        tints = np.array([[1.0, 1.0, 1.0]] + [mpl.colors.to_rgb(_colour(i)) for i in range(1, 256)])
+        tint = tints[layers["terrain"]]
+        picture = picture * 0.45 + tint * 0.55
+    picture = np.clip(picture * (0.45 + 0.75 * light)[..., None], 0.0, 1.0)
+    missing = ~np.isfinite(light) | np.any(
+        [layers[name] == 0 for name in ("ortho", "terrain") if name in layers], axis=0
+    )
+    return np.where(missing[..., None], 1.0, picture)
+
+
+def _draw_path(axes: Any, plan: Plan, values: Array, scale: Normalize) -> LineCollection:
+    """Draw the path, coloured by what its metres cost; return the coloured line."""
+    points = plan.xy_m
+    length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
+    ends = np.r_[floats(plan.cost.pieces, "distance_m"), plan.cost.length_m]
+    at = ends / ends[-1] * length[-1]
+    cuts = np.stack([np.interp(at, length, points[:, axis]) for axis in (0, 1)], axis=1)
+    axes.plot(*points.T, color="white", lw=6.2, solid_capstyle="round", solid_joinstyle="round")
+    axes.plot(*points.T, color=_INK, lw=4.4, solid_capstyle="round", solid_joinstyle="round")
+    line = LineCollection(list(np.stack([cuts[:-1], cuts[1:]], axis=1)), cmap=_COST_MAP, norm=scale, linewidths=3.2)
+    line.set_array(np.ma.masked_invalid(values))
+    line.set_capstyle("round")
+    axes.add_collection(line)
+    return line
+
+
+def _draw_ends(axes: Any, plan: Plan) -> None:
+    (x0, y0), (x1, y1) = plan.xy_m[[0, -1]].tolist()
+    axes.plot(x0, y0, "o", ms=11, color="white", mec=_INK, mew=2.2, zorder=5)
+    axes.plot(x1, y1, "*", ms=19, color="white", mec=_INK, mew=1.6, zorder=5)
+    for x, y, name in ((x0, y0, "start"), (x1, y1, "goal")):
+        offset = (0, 11)
+        axes.annotate(
+            name,
+            (x, y),
+            offset,
+            textcoords="offset points",
+            ha="center",
+            fontsize=9,
+            weight="bold",
+            path_effects=_WHITE,
+        )
+
+
+def _title(axes: Any, plan: Plan, plans: Sequence[Plan]) -> None:
+    axes.text(
+        0.0, 1.075, f"Least {plan.objective}", transform=axes.transAxes, fontsize=15, weight="bold",
+        color=_COLOURS[plan.objective],
+    )  # fmt: skip
+    best = {name: min(other.cost.summary()[name] for other in plans) for name in _SHOWN}
+    mine = plan.cost.summary()
+    parts = [_said(name, mine[name], best[name]) for name in _SHOWN]
+    axes.text(0.0, 1.02, "     ".join(parts), transform=axes.transAxes, fontsize=10.5)
+
+
+_SHOWN = ("energy_joule", "duration_s", "length_m")
+
+
+def _said(name: str, value: float, best: float) -> str:
+    text = {"energy_joule": f"{value / 1000.0:.2f} kJ", "duration_s": f"{value:.0f} s", "length_m": f"{value:.0f} m"}[
+        name
+    ]
+    more = value / best - 1.0 if best > 0.0 else 0.0
+    return f"{text} (+{more:.1%})" if more >= 0.0005 else text
+
+
+def _scale_bar(axes: Any, bounds: tuple[float, float, float, float]) -> None:
+    left, bottom, right, top = bounds
+    length = _nice((right - left) / 4.0)
+    x, y = left + 0.04 * (right - left), bottom + 0.05 * (top - bottom)
+    axes.plot((x, x + length), (y, y), color="white", lw=6, solid_capstyle="butt")
+    axes.plot((x, x + length), (y, y), color=_INK, lw=3, solid_capstyle="butt")
+    axes.annotate(
+        f"{length:g} m", (x + length / 2.0, y), (0, 6), textcoords="offset points", ha="center", fontsize=9,
+        path_effects=_WHITE,
+    )  # fmt: skip
+
+
+def _nice(value: float) -> float:
+    """Return the largest of 1, 2, 5 times a power of ten that is not above ``value``."""
+    power = 10.0 ** np.floor(np.log10(max(value, 1e-9)))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1.0 + 1e-9)))
+
+
+def _draw_profiles(axes: Any, backdrop: _Backdrop, plans: Sequence[Plan]) -> None:
+    """Draw height over distance along every path."""
+    for plan in plans:
+        length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(plan.xy_m, axis=0), axis=1))]
+        at = np.linspace(0.0, length[-1], max(int(length[-1] * 2.0), 2))
+        height = backdrop.height_at(np.stack([np.interp(at, length, plan.xy_m[:, axis]) for axis in (0, 1)], axis=1))
+        colour, style = _COLOURS[plan.objective], _LINES[plan.objective]
+        distance = at / length[-1] * plan.cost.length_m
+        axes.plot(distance, height, color=colour, lw=2.2, ls=style, label=f"least {plan.objective}")
+    axes.set_xlabel("distance [m]")
+    axes.set_ylabel("height [m]")
+    axes.margins(x=0.01)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.grid(axis="y", color="#e3e7ea", lw=0.8)
+    axes.legend(frameon=False, ncols=len(plans), loc="upper right", bbox_to_anchor=(1.0, 1.22), fontsize=9)

@@ -1,0 +1,142 @@
+"""`tcpipe plan-path`: the least-cost path between two points as GeoJSON, and a picture of all three objectives on the hill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tcpipe.errors import ModelError, StoreError, UsageError
+from tcpipe.formats.dataset_files import file_checksum
+from tcpipe.formats.geojson_lines import check_lonlat, write_lines
+from tcpipe.formats.json_files import digest, read_json
+from tcpipe.formats.map_files import MapFile
+from tcpipe.planning.cost_map import cost_map_key, open_cost_map, read_cost_map_card
+from tcpipe.planning.cost_model import CostModel, check_model
+from tcpipe.planning.path_files import cost_text
+from tcpipe.planning.picture import draw_plans
+from tcpipe.planning.plan import OBJECTIVES, Objective, plan_path
+from tcpipe.planning.survey import Survey, new_survey, survey_from
+
+VERSION = "1.0"
+
+
+@dataclass(frozen=True, slots=True)
+class PlanRequest:
+    """What is asked: ends as lon, lat [deg], what is to be least, side of a cell [m], and whether unseen ground may be crossed."""
+
+    start_deg: tuple[float, float]
+    goal_deg: tuple[float, float]
+    objective: Objective = "energy"
+    step_m: float = 1.0
+    allow_unseen: bool = False
+    cost_map: Path | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PlanResult:
+    """What was found; ``str`` of it is what the command prints."""
+
+    out: Path
+    picture: Path | None
+    status: str
+    """``done`` or ``unchanged``."""
+    plans: Mapping[str, Mapping[str, Any]]
+    """Properties of each plan by objective; the one that was asked for comes first."""
+
+    def __str__(self) -> str:
+        """Return what each path costs and where it is, as plain lines."""
+        first = next(iter(self.plans.values()))
+        lines = [f"least {name}: {cost_text(plan)}" for name, plan in self.plans.items()]
+        lines += [f"warning: {count} pieces: {name.replace('_', ' ')}" for name, count in first["reasons"].items()]
+        if first["negative_steps"]:
+            lines.append(
+                f"warning: {first['negative_steps']} steps give back more than their height explains; taken as free"
+            )
+        same = ": nothing to do: it is made from the same model, map and points" if self.status == "unchanged" else ""
+        return "\n".join((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
+
+
+def plan(
+    model: CostModel,
+    source: MapFile,
+    request: PlanRequest,
+    *,
+    out: Path,
+    picture: Path | None,
+    step: Callable[[int, int], None] = lambda _, __: None,
+) -> PlanResult:
+    """Find the path that is asked for and write it to ``out``; with ``picture`` all three, side by side.
+
+    Raises
+    ------
+    PathError, ModelError, MapError
+        An end, the model, the map or the cost map cannot be used, or there is no way.
+    UsageError, StoreError
+        An output has a wrong name, or cannot be written.
+
+    """
+    _check_names(out, picture)
+    start, goal = (np.array(end, np.float64) for end in (request.start_deg, request.goal_deg))
+    for label, end in (("--from", start), ("--to", goal)):
+        check_lonlat(label, end[None])
+    check_model(model, source)
+    drawn = picture is not None
+    key = digest(
+        {"model": model.checksum, "map": source.summary(), "request": request, "drawn": drawn, "version": VERSION}
+    )
+    if (found := _plans_of(out, picture, key)) is not None:
+        return PlanResult(out, picture, "unchanged", found)
+    survey = _survey(model, source, request)
+    wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
+    plans = {
+        name: plan_path(survey, start, goal, name, allow_unseen=request.allow_unseen, step=step) for name in wanted
+    }
+    properties: dict[str, dict[str, Any]] = {name: found.properties() for name, found in plans.items()}
+    about = {"key": key, "plans": properties, "order": list(properties)}
+    if picture is not None:
+        draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
+        about["picture_sha256"] = file_checksum(picture)[1]
+    asked = plans[request.objective]
+    who = {"model": model.name, "map": source.name, "robot": model.robot, "allow_unseen": request.allow_unseen}
+    write_lines(out, [(asked.lonlat_deg, {**asked.properties(), **who})], {"tcpipe": about})
+    return PlanResult(out, picture, "done", properties)
+
+
+def _check_names(out: Path, picture: Path | None) -> None:
+    if out.suffix.lower() not in {".geojson", ".json"} or out.is_dir():
+        raise UsageError(f"{out}: wanted the name of a file that ends in .geojson or .json")
+    if picture is not None and (picture.suffix.lower() != ".png" or picture.is_dir()):
+        raise UsageError(f"{picture}: wanted the name of a file that ends in .png")
+
+
+def _survey(model: CostModel, source: MapFile, request: PlanRequest) -> Survey:
+    """Return what a cost map knows, or nothing yet."""
+    if request.cost_map is None:
+        return new_survey(model, source, request.step_m)
+    card = read_cost_map_card(request.cost_map)
+    if card is None:
+        raise ModelError(f"{request.cost_map}: not a cost map; make one with tcpipe cost-map")
+    if card["key"] != cost_map_key(model, source, card["grid"]["pitch_m"]):
+        raise ModelError(
+            f"{request.cost_map}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
+        )
+    return survey_from(model, source, open_cost_map(request.cost_map, card))
+
+
+def _plans_of(out: Path, picture: Path | None, key: str) -> dict[str, Any] | None:
+    """Return what was found before, if it is made from the same, and whole; else None."""
+    if not out.is_file():
+        return None
+    try:
+        about = read_json(out).get("tcpipe") or {}
+    except StoreError:
+        return None
+    if about.get("key") != key:
+        return None
+    if picture is not None and not (picture.is_file() and file_checksum(picture)[1] == about.get("picture_sha256")):
+        return None
+    return {name: about["plans"][name] for name in about["order"]}
