@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.arrow_values import IrregularColumns, arrow_type, scalars, texts
 from tcpipe.formats.log_part import MessageBlock, gathered
-from tcpipe.formats.ros_types import MessageType, RowError
+from tcpipe.formats.ros_types import DefinitionError, MessageType, RowError
 from tcpipe.logs.units import field_units
 from tcpipe.logs.wire_cursors import Walked, walk
 from tcpipe.logs.wire_layout import (
@@ -70,11 +70,18 @@ def arrow_schema(message: Record) -> pa.Schema:
     """Return the schema of a topic's table: both times, then the message's fields by dotted name.
 
     The metadata of a field says its ``unit`` where that is known; of an array of messages, ``units`` of their fields as JSON.
+    A field of the message that is called like one of the times gets ``_`` behind its name.
     """
-    units = {LOG_TIME: "ns", PUBLISH_TIME: "ns", **field_units(message)}
-    types = {LOG_TIME: pa.int64(), PUBLISH_TIME: pa.int64()}
-    types |= {name: arrow_type(of) for name, of in flat_fields(message)}
-    return pa.schema([pa.field(name, of, metadata=_unit_metadata(name, units)) for name, of in types.items()])
+    units = field_units(message)
+    fields = [pa.field(name, pa.int64(), metadata={"unit": "ns"}) for name in (LOG_TIME, PUBLISH_TIME)]
+    taken = {LOG_TIME, PUBLISH_TIME}
+    for name, of in flat_fields(message):
+        column = name
+        while column in taken:
+            column += "_"
+        taken.add(column)
+        fields.append(pa.field(column, arrow_type(of), metadata=_unit_metadata(name, units)))
+    return pa.schema(fields)
 
 
 def _unit_metadata(name: str, units: Mapping[str, str]) -> dict[str, str] | None:
@@ -215,7 +222,9 @@ class TopicTable:
 
     def _flush(self) -> None:
         for length, group in self._groups.items():
-            rows, payloads = (np.concatenate(parts) if len(group) > 1 else parts[0] for parts in zip(*group, strict=True))
+            rows, payloads = (
+                np.concatenate(parts) if len(group) > 1 else parts[0] for parts in zip(*group, strict=True)
+            )
             self._decode(length, rows, payloads)
         self._groups = {}
         self._gathered_bytes = 0
@@ -328,7 +337,11 @@ class TopicTable:
 
     def _row_by_row(self, rows: _Int64, data: NDArray[np.uint8], starts: _Int64, ends: _Int64) -> None:
         """Decode message by message; one that does not fit its definition is counted and left out."""
-        decode = self._decode_row = self._decode_row or self._type.row_decoder(self._encoding)
+        try:
+            decode = self._decode_row = self._decode_row or self._type.row_decoder(self._encoding)
+        except DefinitionError as error:
+            self._leave_out(str(error), len(rows))
+            return
         kept, values = [], []
         for row, start, end in zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True):
             try:
@@ -337,7 +350,10 @@ class TopicTable:
                 self._leave_out(str(error), 1)
             else:
                 kept.append(row)
-        columns = [pa.array([value[field.name] for value in values], field.type) for field in list(self.schema)[2:]]
+        names = [name for name, _ in flat_fields(self._type.wire)]
+        columns = [
+            pa.array([value[name] for value in values], of) for name, of in zip(names, self._fields.types, strict=True)
+        ]
         self._add_part(np.array(kept, np.int64), columns)
 
     def _leave_out(self, reason: str, count: int) -> None:

@@ -444,15 +444,18 @@ class McapPart:
             self._note_lost(chunk, str(error))
             return
         records = record_offsets(data)
-        self._declare(data, records)
+        self._declare(chunk, data, records)
         if chunk.index is None:
             self._tally_messages(data, message_offsets(data, records))
 
-    def _declare(self, data: memoryview, records: Int64Array) -> None:
+    def _declare(self, chunk: Chunk, data: memoryview, records: Int64Array) -> None:
         for offset in records.tolist():
             if data[offset] in (OP_SCHEMA, OP_CHANNEL):
                 length = int.from_bytes(data[offset + 1 : offset + RECORD_HEAD], "little")
-                self._contents.note(data[offset], data[offset + RECORD_HEAD : offset + RECORD_HEAD + length])
+                try:
+                    self._contents.note(data[offset], data[offset + RECORD_HEAD : offset + RECORD_HEAD + length])
+                except DamageError as error:
+                    self._note(chunk.offset, f"a schema or channel in this chunk is broken: {error}")
 
     def _channel(self, number: int) -> Channel:
         channel = self._contents.channels[number]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import struct
+from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -82,9 +83,20 @@ class MessageType:
     definitions: _Definitions
 
     def row_decoder(self, encoding: str) -> Callable[[bytes], dict[str, Any]]:
-        """Return a function from one serialised message to its fields by dotted name, by rosbags; it raises `RowError`."""
+        """Return a function from one serialised message to its fields by dotted name, by rosbags; it raises `RowError`.
+
+        Raises
+        ------
+        DefinitionError
+            rosbags makes no type of the definition.
+        """
         store = Typestore()
-        store.register(self.definitions)
+        try:
+            store.register(
+                {name: ([], fields) for name, (_, fields) in self.definitions.items()}
+            )  # constants take no bytes
+        except TypesysError as error:
+            raise DefinitionError(str(error)) from None
         name = self.wire.name
         deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
 
@@ -192,6 +204,9 @@ class _Unfold:
                 if field != _PLACEHOLDER
             )
             self._used[name] = entry
+            twice = sorted(field for field, count in Counter(field for field, _ in fields).items() if count > 1)
+            if twice:
+                raise DefinitionError(f"type {name} defines {', '.join(twice)} more than once")
             self._records[name] = record(name, fields)
         return self._records[name]
 

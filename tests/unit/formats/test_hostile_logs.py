@@ -8,7 +8,7 @@ import tracemalloc
 import lz4.frame
 import pytest
 import zstandard
-from mcap.writer import CompressionType
+from mcap.writer import CompressionType, IndexType
 from mcap.writer import Writer as McapWriter
 from random_messages import (
     ROS1,
@@ -266,3 +266,41 @@ def test_what_costs_nothing_is_a_remark(tmp_path):
         log.tables(log.topics)
         assert not any(finding.is_loss for finding in log.damage)
         assert ["not UTF-8" in remark for remark in log.remarks] == [True]
+
+
+@pytest.mark.parametrize("count", [3, 40])
+def test_a_field_called_like_a_time_keeps_its_values(tmp_path, count):
+    text = "int64 log_time_ns\nint64 publish_time_ns\nstring log_time_ns_\n"
+    path = tmp_path / "run.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start()
+        schema = writer.register_schema("acme_msgs/msg/Thing", "ros2msg", text.encode())
+        channel = writer.register_channel("/thing", "cdr", schema)
+        for number in range(count):
+            name = b"a" * (1 + number % 2)
+            payload = b"\0\1\0\0" + struct.pack("<qqI", number, -number, len(name) + 1) + name + b"\0"
+            writer.add_message(channel, START_NS + number, payload, START_NS)
+        writer.finish()
+    tables, damage = read(path)
+    assert damage == []
+    found = tables["/thing"]
+    assert found.column_names == ["log_time_ns", "publish_time_ns", "log_time_ns_", "publish_time_ns_", "log_time_ns__"]
+    assert found["log_time_ns"].to_pylist() == [START_NS + number for number in range(count)]
+    assert found["log_time_ns_"].to_pylist() == list(range(count))
+    assert found["publish_time_ns_"].to_pylist() == [-number for number in range(count)]
+    assert found["log_time_ns__"].to_pylist() == ["a" * (1 + number % 2) for number in range(count)]
+
+
+def test_a_broken_schema_in_a_chunk_costs_its_topics_only(tmp_path):
+    messages = random_messages(1, count=5, types=(*TYPES, "sensor_msgs/msg/Imu"))
+    options = {"compression": CompressionType.NONE, "index_types": IndexType.NONE, "enable_crcs": False}
+    path = write_mcap(tmp_path / "run.mcap", messages, use_statistics=False, use_summary_offsets=False, **options)
+    data = bytearray(path.read_bytes())
+    at = data.index(b"sensor_msgs/msg/Imu") - 4  # the length of the schema's name
+    data[at : at + 4] = struct.pack("<I", 1 << 30)
+    end = data.rindex(b"sensor_msgs/msg/Imu", at)
+    path.write_bytes(data[: end if end > at + 4 else len(data)])
+    tables, damage = read(path)
+    assert_same(tables["/ColorRGBA"], expected_columns(messages, "/ColorRGBA"))
+    assert any("a schema or channel in this chunk is broken" in finding.what for finding in damage)

@@ -28,6 +28,11 @@ def test_a_constant_in_small_letters_does_not_cost_the_topic():
     assert [name for name, _ in found.wire.fields] == ["value"]
 
 
+def test_what_rosbags_makes_no_type_of_is_decoded_row_by_row_all_the_same():
+    found = resolve("uint8 KIND=3\nuint8 KIND=4\nuint8 value\n")  # it refuses the constants, which take no bytes
+    assert found.row_decoder("cdr")(b"\0\1\0\0\7") == {"value": 7}
+
+
 def test_parts_that_the_log_leaves_out_come_from_the_bundled_definitions():
     header = resolve("std_msgs/Header header\nfloat32 value\n").wire.fields[0][1]
     assert isinstance(header, Record)
@@ -68,6 +73,7 @@ def test_idl():
         ("Thing[] children\n", "contains itself: acme_msgs/msg/Thing > acme_msgs/msg/Thing"),
         ("float64 x\n---\nfloat64 y\n", "that of a service, not of a message"),
         ("float64 { x\n", "cannot be parsed"),
+        ("float64 x\nint8 y\nfloat32 x\n", "acme_msgs/msg/Thing defines x more than once"),
     ],
 )
 def test_what_cannot_be_used_is_refused_plainly(text, said):

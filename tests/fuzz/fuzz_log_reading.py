@@ -1,0 +1,258 @@
+"""Coverage-guided fuzzing of what reads logs: whatever the bytes, the reader refuses or sets aside by name, and never tells two stories.
+
+By hand: ``python tests/fuzz/fuzz_log_reading.py TARGET [--seconds 600] [--corpus DIR]``; TARGET is ``containers`` (the record walks of
+.mcap and .bag, the pages of .db3), ``plans`` (decoding plans, against rosbags' row by row) or ``definitions`` (message definitions).
+What breaks is written to the working directory as ``crash-…``: add it to ``test_fuzz_log_reading.py``. Needs atheris.
+"""
+
+import argparse
+import json
+import sqlite3
+import struct
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+if __name__ == "__main__":
+    import atheris
+
+    sys.path.insert(0, str(Path(__file__).parents[1]))
+    with atheris.instrument_imports(include=["tcpipe.formats", "tcpipe.logs"]):
+        import tcpipe.formats.log_file  # noqa: F401
+
+import numpy as np
+from mcap.writer import CompressionType, IndexType
+from random_messages import ROS1, ROS2, random_messages, write_bag, write_mcap, write_rosbag2
+from rosbags.rosbag1 import Writer as BagWriter
+
+from tcpipe.errors import LogError
+from tcpipe.formats.arrow_columns import TopicTable
+from tcpipe.formats.log_file import Log, open_log
+from tcpipe.formats.log_part import MessageBlock
+from tcpipe.formats.ros_types import DefinitionError, MessageType, RowError, TypeLibrary
+
+TYPES = (
+    "std_msgs/msg/ColorRGBA",
+    "diagnostic_msgs/msg/DiagnosticArray",
+    "sensor_msgs/msg/JointState",
+    "std_msgs/msg/UInt8MultiArray",
+    "nav_msgs/msg/Path",
+    "sensor_msgs/msg/BatteryState",
+)
+_MOST_BYTES = 1 << 16
+_ALIKE = 8
+"""So many valid messages go before the fuzzed ones: enough for a layout, which those that are as long may or may not share."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """One thing to fuzz: reads bytes (an uncaught exception is a finding), and the inputs to begin with."""
+
+    read: Callable[[bytes], None]
+    corpus: Callable[[Path], Iterator[bytes]]
+
+
+# ---------------------------------------------------------------- containers
+def read_container(data: bytes) -> None:
+    """Read a file of any container: all topics at once, by pieces and with threads, and the first topic alone."""
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as directory:  # noqa: S108
+        path = Path(directory, "log")
+        path.write_bytes(data)
+        try:
+            with open_log(path) as log:
+                names = list(log.topics)
+                whole = _told(log, names)
+            with open_log(path) as log:
+                rows: dict[str, int] = {}
+                for tables in log.batches(names, batch_bytes=1 << 12, threads=2):
+                    for name, table in tables.items():
+                        rows[name] = rows.get(name, 0) + table.num_rows
+                lines = {str(one) for one in log.damage if "behind their time" not in one.what}
+            assert (rows, lines) == whole
+            with open_log(path) as log:
+                _told(log, names[:1])
+        except LogError:
+            return
+
+
+def _told(log: Log, names: list[str]) -> tuple[dict[str, int], set[str]]:
+    """Return the number of rows of topics and the lines about damage."""
+    tables = log.tables(names)
+    for name, table in tables.items():
+        table.validate(full=True)
+        stamps = table["log_time_ns"].to_numpy()
+        assert (stamps[1:] >= stamps[:-1]).all(), name
+    lines = {str(one) for one in log.damage}
+    return {name: table.num_rows for name, table in tables.items()}, lines
+
+
+def containers(directory: Path) -> Iterator[bytes]:
+    """Yield small logs of every container. Without compression and CRC a changed byte gets far."""
+    messages = random_messages(1, count=6, types=TYPES[:3], ragged=True)
+    ros1 = random_messages(1, count=6, types=TYPES[:3], ragged=True, store=ROS1)
+    small = {"chunk_bytes": 600, "enable_crcs": False}
+    for number, options in enumerate(
+        (
+            {"compression": CompressionType.NONE, **small},
+            {"compression": CompressionType.NONE, "chunk_bytes": 600},
+            {"compression": CompressionType.LZ4, **small},
+            {"compression": CompressionType.ZSTD, **small},
+            {"use_chunking": False, "enable_crcs": False},
+            {"compression": CompressionType.NONE, "index_types": IndexType.NONE, **small},
+        )
+    ):
+        yield write_mcap(directory / f"{number}.mcap", messages, **options).read_bytes()
+    for number, compression in enumerate(
+        (None, BagWriter.CompressionFormat.LZ4, BagWriter.CompressionFormat.BZ2),
+    ):
+        yield write_bag(directory / f"{number}.bag", ros1, compression).read_bytes()
+    path = next(write_rosbag2(directory / "db3", messages).glob("*.db3"))
+    yield path.read_bytes()
+    with sqlite3.connect(path) as database:  # small pages: several to a table, and messages that overflow one
+        database.execute("PRAGMA page_size = 512")
+        database.execute("VACUUM")
+    database.close()
+    yield path.read_bytes()
+
+
+# ---------------------------------------------------------------- decoding plans
+def read_messages(data: bytes) -> None:
+    """Decode messages as columns; what rosbags reads of them, row by row, is the same.
+
+    The first bytes choose type and serialisation; then come messages, each behind its length (uint16).
+    """
+    if len(data) < 2:
+        return
+    encoding = ("cdr", "ros1")[data[1] % 2]
+    message_type, decode, example = _EXAMPLES[TYPES[data[0] % len(TYPES)], encoding]
+    payloads, position = [example] * (_ALIKE if data[1] & 2 else 1), 2
+    while position + 2 <= len(data) and len(payloads) < 4 * _ALIKE:
+        (length,) = struct.unpack_from("<H", data, position)
+        payloads.append(data[position + 2 : position + 2 + length])
+        position += 2 + length
+    table = TopicTable(message_type, encoding)
+    table.add(_block(payloads))
+    found = table.take()
+    found.validate(full=True)
+    assert found.num_rows + sum(table.undecodable.values()) == len(payloads)
+    rows = found.drop_columns(["publish_time_ns"]).to_pylist()
+    for row in rows:
+        try:
+            expected = decode(payloads[row.pop("log_time_ns")])
+        except RowError:
+            continue
+        assert _text(row) == _text(expected)
+
+
+def _text(row: dict[str, object]) -> str:
+    return json.dumps(row, default=lambda value: value.tolist())
+
+
+def _block(payloads: list[bytes]) -> MessageBlock:
+    lengths = np.array([len(payload) for payload in payloads], np.int64)
+    order = np.arange(len(payloads))
+    alike = int(lengths[0]) if (lengths == lengths[0]).all() else None
+    starts = np.cumsum(lengths) - lengths
+    return MessageBlock(0, memoryview(b"".join(payloads)), starts, lengths, order, order, order, alike)
+
+
+def _definition(type_name: str, encoding: str) -> str:
+    store, version = (ROS1, 1) if encoding == "ros1" else (ROS2, 2)
+    return store.generate_msgdef(type_name, ros_version=version)[0]
+
+
+def _message_type(type_name: str, text: str, encoding: str) -> MessageType:
+    schema = "ros1msg" if encoding == "ros1" else "ros2msg"
+    return TypeLibrary(None).message_type(type_name, definition=text, schema_encoding=schema, ros1=encoding == "ros1")
+
+
+def _messages_of(type_name: str, encoding: str, count: int) -> list[bytes]:
+    store = ROS1 if encoding == "ros1" else ROS2
+    return [one.payload for one in random_messages(2, count=count, types=(type_name,), ragged=True, store=store)]
+
+
+_EXAMPLES = {
+    (name, encoding): (
+        (found := _message_type(name, _definition(name, encoding), encoding)),
+        found.row_decoder(encoding),
+        _messages_of(name, encoding, 1)[0],
+    )
+    for name in TYPES
+    for encoding in ("cdr", "ros1")
+}
+
+
+def plans(_directory: Path) -> Iterator[bytes]:
+    """Yield a few valid messages of each type."""
+    for kind, (name, encoding) in enumerate(_EXAMPLES):
+        messages = [*_messages_of(name, encoding, 3), _EXAMPLES[name, encoding][2]]
+        for alike in (0, 2):
+            head = bytes([kind // 2, alike | (encoding == "ros1")])
+            yield head + b"".join(struct.pack("<H", len(message)) + message for message in messages)
+
+
+# ---------------------------------------------------------------- definitions
+_SCHEMAS = ("ros2msg", "ros1msg", "ros2idl")
+
+
+def read_definition(data: bytes) -> None:
+    """Parse a message definition; its first byte chooses the language."""
+    if not data:
+        return
+    schema = _SCHEMAS[data[0] % len(_SCHEMAS)]
+    text = data[1:].decode(errors="backslashreplace")
+    try:
+        found = TypeLibrary(None).message_type(
+            "made_msgs/msg/Made", definition=text, schema_encoding=schema, ros1=schema == "ros1msg"
+        )
+    except DefinitionError:
+        return
+    table = TopicTable(found, "ros1" if schema == "ros1msg" else "cdr")
+    table.add(_block([b"\x00\x01\x00\x00" + bytes(60)] * _ALIKE))
+    table.take().validate(full=True)
+
+
+def definitions(_directory: Path) -> Iterator[bytes]:
+    """Yield definitions in each language."""
+    for name in TYPES:
+        yield b"\0" + _definition(name, "cdr").encode()
+        yield b"\1" + _definition(name, "ros1").encode()
+    yield b"\0uint8 A=1\nstring<=5 text 'x'\nint32[<=3] some\nMade[2] again\nwstring wide\nfloat64[36] matrix\n"
+    yield (
+        b"\2module made_msgs { module msg { typedef double double__36[36]; struct Made {"
+        b' @unit(value="m") double x; sequence<long, 4> some; double__36 matrix; wstring wide; }; }; };'
+    )
+
+
+TARGETS = {
+    "containers": Target(read_container, containers),
+    "plans": Target(read_messages, plans),
+    "definitions": Target(read_definition, definitions),
+}
+
+
+def main() -> None:
+    """Fuzz one target with atheris."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("target", choices=TARGETS)
+    parser.add_argument("--seconds", type=int, default=600)
+    parser.add_argument("--runs", type=int, default=-1, help="stop after so many inputs")
+    parser.add_argument("--seed", type=int, default=0, help="0: another each time")
+    parser.add_argument("--corpus", type=Path, help="a directory to keep what was found interesting")
+    given = parser.parse_args()
+    target = TARGETS[given.target]
+    with tempfile.TemporaryDirectory() as scratch:
+        corpus = given.corpus or Path(scratch, "corpus")
+        corpus.mkdir(parents=True, exist_ok=True)
+        for number, data in enumerate(target.corpus(Path(scratch))):
+            (corpus / f"made-{number}").write_bytes(data)
+        limits = [f"-max_len={_MOST_BYTES}", "-rss_limit_mb=3072", "-timeout=30", "-print_final_stats=1"]
+        often = [f"-max_total_time={given.seconds}", f"-runs={given.runs}", f"-seed={given.seed}"]
+        atheris.Setup([sys.argv[0], *limits, *often, str(corpus)], target.read)
+        atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,58 @@
+"""The fuzz targets of the log reader: what they once found, their corpus with seeded changes, and a bounded run guided by coverage."""
+
+import importlib.util
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+TARGET_FILE = Path(__file__).with_name("fuzz_log_reading.py")
+_spec = importlib.util.spec_from_file_location("fuzz_log_reading", TARGET_FILE)
+fuzz_log_reading = importlib.util.module_from_spec(_spec)
+sys.modules[_spec.name] = fuzz_log_reading
+_spec.loader.exec_module(fuzz_log_reading)
+TARGETS = fuzz_log_reading.TARGETS
+
+CHANGES = 12
+"""Changed copies of each input of a corpus."""
+RUNS = 1500
+"""Inputs of a run with atheris."""
+
+
+def changed(data, rng):
+    """Flip, overwrite, cut, double or insert some bytes."""
+    held = bytearray(data)
+    for _ in range(rng.integers(1, 5)):
+        at, size = int(rng.integers(len(held) + 1)), int(rng.integers(1, 9))
+        kind = rng.integers(5)
+        if kind == 0 and at < len(held):
+            held[at] ^= 1 << int(rng.integers(8))
+        elif kind == 1:
+            held[at : at + size] = rng.choice([b"\0", b"\xff", b"\x7f"]) * size
+        elif kind == 2:
+            del held[at : at + size]
+        elif kind == 3:
+            held[at:at] = held[at : at + 40 * size]
+        else:
+            held[at : at + size] = rng.bytes(size)
+    return bytes(held)
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_inputs_and_changed_inputs_break_nothing(name, tmp_path):
+    target, rng = TARGETS[name], np.random.default_rng(3)
+    for data in target.corpus(tmp_path):
+        target.read(data)
+        for _ in range(CHANGES):
+            target.read(changed(data, rng))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
+@pytest.mark.parametrize("name", TARGETS)
+def test_a_run_guided_by_coverage_finds_nothing(name, tmp_path):
+    command = [sys.executable, "-W", "ignore", TARGET_FILE, name, f"--runs={RUNS}", "--seed=1", "--seconds=120"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert f"DONE   {RUNS}" in done.stderr or "Done" in done.stderr, done.stderr[-3000:]
