@@ -264,5 +264,5 @@ def _inverse_variance(std: NDArray[np.float64]) -> NDArray[np.float64]:
     if not known.any():
         return np.zeros(std.shape)
     least = max(_MIN_STD * float(np.median(std[known])), float(np.finfo(np.float32).tiny))
-    weights = np.where(known, np.maximum(np.where(known, std, 1.0), least) ** -2, 0.0)
-    return weights / weights.mean()
+    weights: NDArray[np.float64] = np.where(known, np.maximum(np.where(known, std, 1.0), least) ** -2, 0.0)
+    return np.asarray(weights / weights.mean())

@@ -23,6 +23,7 @@ from tcpipe.stages.sample import Sampled
 from tcpipe.stages.sample_maps import check_alike, sample_on_maps
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import floats
+from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.layers import LAYERS
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.sampling_kernel import morton
@@ -39,11 +40,8 @@ _CELL_DEG = 1e-4
 
 _XY, _LONLAT, _MAP = "footprint_xy_m", "footprint_lonlat_deg", "map_index"
 
-_HELD_POOLS = 2
-"""Maps whose tiles a process keeps from batch to batch: 0.3 GB."""
-
-_pools: OrderedDict[Path, TilePool] = OrderedDict()
-"""Of this process, while it samples."""
+_HELD_MAPS = 2
+"""Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -125,6 +123,16 @@ class _Batch:
 
 
 @dataclass(frozen=True, slots=True)
+class _HeldMap:
+    source: MapFile
+    tiles: TilePool
+
+
+_held: OrderedDict[Path, _HeldMap] = OrderedDict()
+"""Of this process, while it samples."""
+
+
+@dataclass(frozen=True, slots=True)
 class _Batches(Sequence[_Batch]):
     """The batches, each made when it is asked for, so that one copy of its segments exists at a time."""
 
@@ -200,7 +208,8 @@ def sample_all_segments(
     spool = Spool(directory, layers, segments.num_rows, config.patch_px)
     spool.create()
     rows = list(_batch_rows(segments))
-    batches = _Batches(rows, _slots(rows, ranks), segments, map_paths, config, gnss_crs, spool)
+    placed = segments.select(PLACED_SEGMENTS.names())
+    batches = _Batches(rows, _slots(rows, ranks), placed, map_paths, config, gnss_crs, spool)
     kept = np.zeros(segments.num_rows, np.bool_)
     columns: dict[str, NDArray[Any]] = {}
     parts: dict[int, _Part] = {}
@@ -214,7 +223,7 @@ def sample_all_segments(
                     whole[part.segment] = values
                 parts[outcome.index] = replace(part, columns={})
     finally:
-        _pools.clear()
+        _held.clear()
     ended = [parts[index] for index in sorted(parts)]
     segment = np.flatnonzero(kept)
     for name in columns:
@@ -262,8 +271,8 @@ def _slots(batches: Sequence[NDArray[np.int64]], ranks: NDArray[np.uint64]) -> N
 def _sample_batch(batch: _Batch) -> _Part | TcpipeError:
     """Sample one batch; its pixels go to its slots of the spool."""
     try:
-        sources = [open_map(path) for path in batch.map_paths]
-        pools = [_pool(path, source, batch.config) for path, source in zip(batch.map_paths, sources, strict=True)]
+        held = [_held_map(path, batch.config) for path in batch.map_paths]
+        sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
         parts = [
             {
@@ -282,13 +291,16 @@ def _sample_batch(batch: _Batch) -> _Part | TcpipeError:
     return _Part(batch.rows[np.concatenate(sampled.rows)], columns, sampled.ledger_m, sampled.warnings)
 
 
-def _pool(path: Path, source: MapFile, config: SampleConfig) -> TilePool:
-    """Return the tiles of a map that this process's last batch left: the next batch lies beside it."""
-    pool = _pools.pop(path, None) or TilePool(level_for(source, config.patch_m / config.patch_px))
-    _pools[path] = pool
-    if len(_pools) > _HELD_POOLS:
-        _pools.popitem(last=False)
-    return pool
+def _held_map(path: Path, config: SampleConfig) -> _HeldMap:
+    """Return a map as this process's last batch left it: the next one lies beside it and wants the same tiles."""
+    held = _held.pop(path, None)
+    if held is None:
+        source = open_map(path)
+        held = _HeldMap(source, TilePool(level_for(source, config.patch_m / config.patch_px)))
+    _held[path] = held
+    if len(_held) > _HELD_MAPS:
+        _held.popitem(last=False)
+    return held
 
 
 def _in_first_plane(sampled: Sampled, source: MapFile, first: MapFile) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from pyproj import CRS
 from tcpipe.recipe import SampleConfig
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import floats
-from tcpipe.tables.levels import LABELLED_SEGMENTS, Findings
+from tcpipe.tables.levels import PLACED_SEGMENTS, Findings
 from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.sampling import Patches, sample_patches
@@ -49,7 +49,7 @@ def sample_segments(
 
     Parameters
     ----------
-    segments : L5 table of any number of runs; the reasons rule in the order position uncertain, outside the map, nodata, not traversable.
+    segments : L5 of any runs, or `PLACED_SEGMENTS` of it; reasons rule in the order position uncertain, off the map, nodata, untraversable.
     source, pool : the map, and its tiles as `sample_patches` takes them.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
 
@@ -57,7 +57,7 @@ def sample_segments(
     ------
     TableError : chords and positions contradict each other. MapError : CRSs cannot be connected, or a tile is damaged.
     """
-    LABELLED_SEGMENTS.check(segments)
+    PLACED_SEGMENTS.check(segments, more=True)
     crs, chord_m = parse_crs(source.grid.crs, where=f"map {source.name}"), floats(segments, "chord_m")
     projection = Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
     start, end = (

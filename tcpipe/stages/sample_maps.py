@@ -47,7 +47,7 @@ def sample_on_maps(
 
     Parameters
     ----------
-    segments : L5 table of any number of runs.
+    segments : as `sample_segments`.
     sources : the maps; where they overlap, the earlier one is taken.
     gnss_crs : geographic CRS of the segments' longitudes and latitudes.
     pools : as `sample_patches`, one a map.

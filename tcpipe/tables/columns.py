@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 
 import numpy as np
@@ -75,13 +75,17 @@ class TableSchema:
         """Return the table without rows."""
         return self.arrow().empty_table()
 
-    def check(self, table: pa.Table) -> None:
-        """Raise `TableError` naming every column that is missing, extra, of a wrong type, or null where it must not be."""
-        problems = list(self._problems(table))
+    def only(self, *names: str) -> TableSchema:
+        """Return the contract of some of the columns."""
+        return replace(self, columns=tuple(column for column in self.columns if column.name in names))
+
+    def check(self, table: pa.Table, *, more: bool = False) -> None:
+        """Raise `TableError` naming every column that is missing, extra (unless ``more`` is welcome), of a wrong type, or null in vain."""
+        problems = list(self._problems(table, more=more))
         if problems:
             raise TableError(*problems)
 
-    def _problems(self, table: pa.Table) -> Iterable[str]:
+    def _problems(self, table: pa.Table, *, more: bool) -> Iterable[str]:
         for column in self.columns:
             if column.name not in table.column_names:
                 yield f"table {self.name}: column {column.name} is missing (wanted {column.dtype}, {column.unit})"
@@ -99,7 +103,7 @@ class TableSchema:
             ):
                 yield f"table {self.name}: column {column.name} has values that are not finite"
         for name in table.column_names:
-            if name not in self.names():
+            if name not in self.names() and not more:
                 yield f"table {self.name}: column {name} is not in its schema"
 
 

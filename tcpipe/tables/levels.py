@@ -328,6 +328,12 @@ LABELLED_SEGMENTS = TableSchema(
     "segments", "L5", "Segments with the cost of the metre each one covers.", (*_SEGMENT_COLUMNS, *_LABEL_COLUMNS)
 )
 
+PLACED_SEGMENTS = LABELLED_SEGMENTS.only(
+    *(f"{end}_{axis}_deg" for end in ("start", "end") for axis in ("lon", "lat")),
+    *("chord_m", "arc_length_m", "position_std_m"),
+)
+"""What sampling reads of a segment."""
+
 SAMPLES = TableSchema(
     "samples",
     "L6",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,7 +151,7 @@ class Projection:
 
     def doubt(self) -> str | None:
         """Return a plain sentence if the two datums differ and the shift between them is known only roughly, else None."""
-        if CRS(self.source.geodetic_crs).datum == CRS(self.target.geodetic_crs).datum:
+        if _share_datum(self.source, self.target):
             return None
         accuracy_m = self._transformer.accuracy
         if "ballpark" not in self._transformer.description.lower() and 0.0 <= accuracy_m <= DOUBTFUL_ACCURACY_M:
@@ -159,6 +159,11 @@ class Projection:
         known = f"only to about {accuracy_m:g} m" if accuracy_m > 0.0 else "not at all (taken as none)"
         names = [CRS(crs.geodetic_crs).name for crs in (self.source, self.target)]
         return f"the shift between the datums {names[0]} and {names[1]} is known {known}"
+
+
+@lru_cache(maxsize=64)
+def _share_datum(one: CRS, other: CRS) -> bool:
+    return bool(CRS(one.geodetic_crs).datum == CRS(other.geodetic_crs).datum)
 
 
 def area_of(crs: CRS, bounds: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
