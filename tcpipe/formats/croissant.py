@@ -65,6 +65,8 @@ _ENCODING_BY_SUFFIX = {
     ".json": "application/json",
     ".parquet": "application/x-parquet",
     ".html": "text/html",
+    ".png": "image/png",
+    ".geojson": "application/geo+json",
 }
 
 
@@ -77,6 +79,9 @@ def croissant(
     files: Mapping[str, tuple[int, str]],
     samples_file: str,
     samples: pa.Schema,
+    version: str,
+    shards: str | None = None,
+    layers: Mapping[str, int] | None = None,
 ) -> dict[str, Any]:
     """Return the document.
 
@@ -90,12 +95,36 @@ def croissant(
         Which of them holds the samples.
     samples
         Its Arrow schema; the fields' metadata give their meanings.
+    version
+        Of the dataset.
+    shards, layers
+        Pattern of the Parquet files that hold the patches, and the values a patch of each layer has; None where patches are no Parquet.
 
     Returns
     -------
     JSON-LD as Python values.
 
     """
+    samples_source = {"fileObject": {"@id": samples_file}}
+    records = [
+        _records("samples", "One record a sample, in the order of the patches.", samples, samples_source),
+    ]
+    sets = []
+    if shards is not None and layers is not None:
+        sets.append(
+            {
+                "@type": "cr:FileSet",
+                "@id": "shards",
+                "name": "shards",
+                "encodingFormat": _ENCODING_BY_SUFFIX[".parquet"],
+                "includes": shards,
+            }
+        )
+        columns = pa.schema(
+            [samples.field("sample_id"), samples.field("split"), *(_patch_field(*layer) for layer in layers.items())]
+        )
+        about = "One record a sample with its patch, split by split: rows of the patch one after another."
+        records.append(_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))
     document = {
         "@context": _CONTEXT,
         "@type": "sc:Dataset",
@@ -104,17 +133,9 @@ def croissant(
         "description": description,
         "license": licence,
         "creator": {"@type": "sc:Person", "name": creator} if creator else None,
-        "distribution": [_file_object(path, *files[path]) for path in sorted(files)],
-        "recordSet": [
-            {
-                "@type": "cr:RecordSet",
-                "@id": "samples",
-                "name": "samples",
-                "description": "One record a sample, in the order of the patches.",
-                "key": {"@id": "samples/sample_id"},
-                "field": [_field(field, samples_file) for field in samples],
-            }
-        ],
+        "version": version,
+        "distribution": [*(_file_object(path, *files[path]) for path in sorted(files)), *sets],
+        "recordSet": records,
     }
     return {key: value for key, value in document.items() if value}
 
@@ -132,16 +153,37 @@ def _file_object(path: str, size_bytes: int, sha256: str) -> dict[str, Any]:
     }
 
 
-def _field(field: pa.Field, samples_file: str) -> dict[str, Any]:
+def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Any]) -> dict[str, Any]:
+    return {
+        "@type": "cr:RecordSet",
+        "@id": name,
+        "name": name,
+        "description": about,
+        "key": {"@id": f"{name}/sample_id"},
+        "field": [_field(name, field, source) for field in columns],
+    }
+
+
+def _patch_field(layer: str, values: int) -> pa.Field:
+    return pa.field(
+        layer,
+        pa.list_(pa.uint16(), values),
+        metadata={"doc": f"layer {layer} as stored; dataset.json says how to decode it"},
+    )
+
+
+def _field(records: str, field: pa.Field, source: Mapping[str, Any]) -> dict[str, Any]:
     metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     unit = f" [{metadata['unit']}]" if metadata.get("unit") else ""
+    many = pa.types.is_fixed_size_list(field.type)
     return {
         "@type": "cr:Field",
-        "@id": f"samples/{field.name}",
+        "@id": f"{records}/{field.name}",
         "name": field.name,
         "description": metadata.get("doc", "") + unit,
-        "dataType": _data_type(field.type),
-        "source": {"fileObject": {"@id": samples_file}, "extract": {"column": field.name}},
+        "dataType": _data_type(field.type.value_type if many else field.type),
+        **({"isArray": True, "arrayShape": str(field.type.list_size)} if many else {}),
+        "source": {**source, "extract": {"column": field.name}},
     }
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, RecipeError
 from tcpipe.formats.atomic import atomic_directory, write_text
 from tcpipe.formats.croissant import croissant
@@ -20,6 +21,7 @@ from tcpipe.formats.dataset_files import (
     OVERVIEW,
     REPORT,
     SAMPLES,
+    SHARDS,
     FileFormat,
     Pixels,
     file_checksum,
@@ -50,12 +52,13 @@ from tcpipe.pipeline.dataset_segments import KEPT
 from tcpipe.pipeline.dataset_splitting import regions_to_json
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
-from tcpipe.report.overview import map_overview, write_overview
+from tcpipe.report.overview import maps_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.holdouts import Holdout
 from tcpipe.splits.regions import Regions
 from tcpipe.store import open_store
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 
 logger = logging.getLogger("tcpipe")
@@ -73,9 +76,10 @@ class BuildResult:
     ledger_m: Mapping[str, float]
     audit: tuple[HeldOut, ...]
     warnings: tuple[str, ...]
+    energy_budget: Mapping[str, Any] | None = None
 
     def __str__(self) -> str:
-        """Return counts, the audit and where the metres went, as plain lines."""
+        """Return counts, the audit, where the metres went and how wrong a label may be, as plain lines."""
         counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {self.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -84,7 +88,8 @@ class BuildResult:
         lost.sort(key=lambda entry: (-entry[1], entry[0]))
         ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
-        return "\n".join((head, *audit_lines(self.audit), ledger, *(f"warning: {text}" for text in self.warnings)))
+        floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
+        return "\n".join((head, *audit_lines(self.audit), ledger, *floor, *(f"warning: {text}" for text in self.warnings)))
 
 
 def build_dataset(
@@ -171,6 +176,7 @@ def _result(place: Path, status: str, card: Mapping[str, Any]) -> BuildResult:
         ledger_m=card["ledger_m"],
         audit=tuple(HeldOut(**part) for part in card["split"]["audit"]),
         warnings=tuple(card["warnings"]),
+        energy_budget=card.get("energy_budget"),
     )
 
 
@@ -232,7 +238,7 @@ def _build(
             write(piece)
     shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
     shutil.rmtree(spool)
-    write_overview(directory / OVERVIEW, map_overview(content.sources[0]))
+    write_overview(directory / OVERVIEW, maps_overview(content.sources))
     balance = measure_balance(
         read_samples(directory, BALANCE_COLUMNS),
         content.samples.centres_xy_m(),
@@ -244,7 +250,8 @@ def _build(
     )
     write_json(directory / DRIVE_NEXT, balance.drive_next)
     files = file_checksums(directory)
-    write_json(directory / CROISSANT, _croissant(files, recipe))
+    patches = {layer.name: content.spool.patch_px**2 for layer in content.layers} if file_format == "parquet" else None
+    write_json(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches))
     facts = CardFacts(
         inputs=inputs.digest,
         file_format=file_format,
@@ -286,7 +293,9 @@ def _write_patches(
     return []
 
 
-def _croissant(files: Mapping[str, tuple[int, str]], recipe: Recipe) -> dict[str, Any]:
+def _croissant(
+    files: Mapping[str, tuple[int, str]], recipe: Recipe, inputs: str, patches: Mapping[str, int] | None
+) -> dict[str, Any]:
     about = recipe.dataset
     return croissant(
         name=about.name,
@@ -296,4 +305,7 @@ def _croissant(files: Mapping[str, tuple[int, str]], recipe: Recipe) -> dict[str
         files=files,
         samples_file=SAMPLES,
         samples=SAMPLES_SCHEMA.arrow(),
+        version=f"{DATA_MODEL_VERSION}.0+{inputs[:12]}",
+        shards=None if patches is None else f"{SHARDS}/*.parquet",
+        layers=patches,
     )
