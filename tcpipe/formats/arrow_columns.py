@@ -51,6 +51,8 @@ MAX_MISSES = 3
 RAGGED_BYTES = 1 << 21
 """Ragged messages are walked side by side when about this much of them has gathered."""
 
+MAX_SHAPE_BYTES = 1 << 27
+"""What messages of one shape hold is made a part of the table when it is more than about this."""
 MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 
@@ -92,9 +94,12 @@ def _unit_metadata(name: str, units: Mapping[str, str]) -> dict[str, str] | None
 
 
 class TopicTable:
-    """Collects the messages of one topic and one definition, and gives them as tables in the order of log time."""
+    """Collects the messages of one topic and one definition, and gives them as tables in the order of log time.
 
-    def __init__(self, message_type: MessageType, encoding: str) -> None:
+    ``expected_rows`` is about how many there will be: if it is right, values are copied into their place at once.
+    """
+
+    def __init__(self, message_type: MessageType, encoding: str, *, expected_rows: int = 0) -> None:
         self.schema = arrow_schema(message_type.wire)
         self._fields = pa.schema(list(self.schema)[2:])
         self.undecodable: dict[str, int] = {}
@@ -107,7 +112,8 @@ class TopicTable:
         self._wire = message_type.wire
         self._wide_open = wide_texts(message_type.wire)
         self._groups: dict[int, list[tuple[_Int64, NDArray[np.void]]]] = {}
-        self._layouts: dict[int, list[Layout]] = {}
+        self._shapes: dict[int, list[_Shape]] = {}
+        self._expected_rows = expected_rows
         self._times: list[tuple[_Int64, _Int64, _Int64]] = []
         self._parts: list[tuple[_Int64, pa.Table]] = []
         self._ragged = _Ragged(encoding)
@@ -179,6 +185,8 @@ class TopicTable:
         """
         self._flush()
         self._decode_ragged()
+        for shape in (shape for shapes in self._shapes.values() for shape in shapes):
+            self._close(shape)
         if not self._parts:
             self._forget()
             return self.schema.empty_table()
@@ -191,6 +199,7 @@ class TopicTable:
             table = _contiguous(table).take(scalars(order))
             log, publish, ordinal = log[order], publish[order], ordinal[order]
         count = len(log) if share >= 1 else int(np.searchsorted(log, log[int(share * (len(log) - 1))], "right"))
+        self._expected_rows = len(log)
         self._hold(table, (log, publish, ordinal), count)
         self.late += int(np.searchsorted(log[:count], self._taken_until))
         self._taken_until = max(self._taken_until, int(log[count - 1]))
@@ -231,14 +240,14 @@ class TopicTable:
 
     def _decode(self, length: int, rows: _Int64, payloads: NDArray[np.void]) -> None:
         """Split payloads of equal length into shapes; known shapes first, then new ones, then row by row."""
-        known = self._layouts.setdefault(length, [])
-        for layout in known:
-            fits = same_shape(layout, payloads)
+        known = self._shapes.setdefault(length, [])
+        for shape in known:
+            fits = same_shape(shape.layout, payloads)
             if fits.all():
-                self._keep(layout, rows, payloads)
+                self._keep(shape, rows, payloads)
                 return
             if fits.any():
-                self._keep(layout, rows[fits], payloads[fits])
+                self._keep(shape, rows[fits], payloads[fits])
                 rows, payloads = rows[~fits], payloads[~fits]
         misses = 0
         while len(rows):
@@ -249,8 +258,8 @@ class TopicTable:
                 return
             fits = same_shape(fresh, payloads)
             if fits.sum() >= MIN_GROUP or self._seen < MIN_GROUP:
-                known.append(fresh)
-                self._keep(fresh, rows[fits], payloads[fits])
+                known.append(_Shape(fresh, self._wire))
+                self._keep(known[-1], rows[fits], payloads[fits])
             else:
                 misses += 1
                 self._add_ragged(rows[fits], *_laid_out(payloads[fits]))
@@ -262,46 +271,49 @@ class TopicTable:
         except (LayoutError, RaggedError):
             return None
 
-    def _keep(self, layout: Layout, rows: _Int64, payloads: NDArray[np.void]) -> None:
-        columns = [self._column(node, of, payloads) for node, of in _flat_nodes(layout.root, self._wire)]
-        self._add_part(rows, columns)
+    def _keep(self, shape: _Shape, rows: _Int64, payloads: NDArray[np.void]) -> None:
+        shape.add(rows, payloads, self._expected_rows * len(rows) // max(self._rows, 1))
+        if shape.held_bytes > MAX_SHAPE_BYTES:
+            self._close(shape)
 
-    def _column(self, node: Node, of: WireType, payloads: NDArray[np.void], repeats: _Repeats = ()) -> pa.Array:
-        """Build one column; inside ``repeats`` it has an element for each repetition of each message."""
-        count = math.prod((len(payloads), *(n for n, _ in repeats)))
+    def _close(self, shape: _Shape) -> None:
+        """Turn what a shape holds into a part of the table."""
+        rows, leaves = shape.take()
+        if len(rows):
+            columns = [self._column(node, of, len(rows), leaves) for node, of in shape.nodes]
+            self._add_part(rows, columns)
+
+    def _column(self, node: Node, of: WireType, count: int, leaves: Iterator[NDArray[np.generic]]) -> pa.Array:
+        """Build one column of ``count`` elements from its leaves, which come in the order of `_leaves`."""
         match node:
             case ScalarAt():
-                return scalars(strided(payloads, node.offset, node.dtype, repeats).ravel())
+                return scalars(next(leaves).reshape(-1))
             case ScalarsAt():
-                inner = (*repeats, (node.count, node.dtype.itemsize))
-                return _listed(scalars(strided(payloads, node.offset, node.dtype, inner).ravel()), count, node.array)
+                return _listed(scalars(next(leaves).reshape(-1)), count, node.array)
             case TextAt():
-                return self._texts(payloads, node)
+                raw = pa.py_buffer(next(leaves).reshape(-1).view(np.uint8) if node.length else b"")
+                found, replaced = texts(count, _offsets(count, node.length), raw, node.codec)
+                self.replaced_texts += replaced
+                return found
             case RecordAt():
                 children = [
-                    self._column(child, field, payloads, repeats)
+                    self._column(child, field, count, leaves)
                     for (_, child), (_, field) in zip(node.fields, _fields(of), strict=True)
                 ]
                 return pa.Array.from_buffers(arrow_type(of), count, [None], children=children)
             case RepeatAt():
-                inner = (*repeats, (node.count, node.stride))
-                return _listed(self._column(node.element, node.array.element, payloads, inner), count, node.array)
+                element = self._column(node.element, node.array.element, count * node.count, leaves)
+                return _listed(element, count, node.array)
             case ElementsAt():
-                return self._elements(node, payloads)
+                return self._elements(node, count, leaves)
 
-    def _elements(self, node: ElementsAt, payloads: NDArray[np.void]) -> pa.Array:
-        count, per_message = len(payloads), len(node.elements)
-        if not per_message:
+    def _elements(self, node: ElementsAt, count: int, leaves: Iterator[NDArray[np.generic]]) -> pa.Array:
+        each = len(node.elements)
+        if not each:
             return _listed(pa.array([], arrow_type(node.array.element)), count, node.array)
-        columns = [self._column(element, node.array.element, payloads) for element in node.elements]
-        by_message = (np.arange(per_message) * count + np.arange(count)[:, None]).ravel()
-        return _listed(pa.concat_arrays(columns).take(scalars(by_message)), count, node.array)
-
-    def _texts(self, payloads: NDArray[np.void], node: TextAt) -> pa.Array:
-        raw = strided(payloads, node.offset, np.dtype(f"V{node.length}")).tobytes() if node.length else b""
-        found, replaced = texts(len(payloads), _offsets(len(payloads), node.length), pa.py_buffer(raw), node.codec)
-        self.replaced_texts += replaced
-        return found
+        columns = [self._column(element, node.array.element, count, leaves) for element in node.elements]
+        in_turn = (np.arange(each) * count + np.arange(count)[:, None]).ravel()
+        return _listed(pa.concat_arrays(columns).take(scalars(in_turn)), count, node.array)
 
     def _add_ragged(self, rows: _Int64, buffer: memoryview, offsets: _Int64, lengths: _Int64) -> None:
         self._ragged.add(rows, buffer, offsets, lengths)
@@ -368,6 +380,53 @@ def _contiguous(table: pa.Table) -> pa.Table:
     return table.combine_chunks() if table.nbytes < MAX_CONTIGUOUS_BYTES else table
 
 
+class _Shape:
+    """The messages of one layout: the values of each field side by side, in arrays that grow.
+
+    ``nodes`` are the columns, each with its type.
+    """
+
+    def __init__(self, layout: Layout, wire: Record) -> None:
+        self.layout = layout
+        self.nodes = list(_flat_nodes(layout.root, wire))
+        self.held_bytes = 0
+        self._leaves = [leaf for node, _ in self.nodes for leaf in _leaves(node)]
+        self._row_bytes = sum(dtype.itemsize * math.prod(n for n, _ in repeats) for _, dtype, repeats in self._leaves)
+        self._values: list[NDArray[np.generic]] = []
+        self._rows: list[_Int64] = []
+        self._count = self._room = 0
+
+    def add(self, rows: _Int64, payloads: NDArray[np.void], expected: int) -> None:
+        """Add messages, of which there are expected to be so many in the end."""
+        end = self._count + len(rows)
+        if end > self._room:
+            self._grow(end, expected)
+        for values, (offset, dtype, repeats) in zip(self._values, self._leaves, strict=True):
+            values[self._count : end] = strided(payloads, offset, dtype, repeats)
+        self._rows.append(rows)
+        self._count = end
+        self.held_bytes += len(rows) * self._row_bytes
+
+    def take(self) -> tuple[_Int64, Iterator[NDArray[np.generic]]]:
+        """Return the rows held and, in the order of `_leaves`, the arrays of their values, and forget them."""
+        rows = np.concatenate([np.zeros(0, np.int64), *self._rows])
+        held = iter([values[: self._count] for values in self._values])
+        self._values, self._rows, self._count, self._room, self.held_bytes = [], [], 0, 0, 0
+        return rows, held
+
+    def _grow(self, least: int, expected: int) -> None:
+        """Make room; memory that is not written to is none that is used."""
+        most = least + MAX_SHAPE_BYTES // max(self._row_bytes, 1)
+        self._room = max(least, 2 * self._room, min(expected, most))
+        before = self._values
+        self._values = [
+            np.empty((self._room, *(n for n, _ in repeats)), dtype.newbyteorder("="))
+            for _, dtype, repeats in self._leaves
+        ]
+        for old, new in zip(before, self._values, strict=False):
+            new[: self._count] = old[: self._count]
+
+
 class _Ragged:
     """Messages without a shape in common, laid one after the other so that what CDR aligns is aligned in memory."""
 
@@ -428,6 +487,26 @@ def _flat_nodes(node: RecordAt, of: WireType) -> Iterator[tuple[Node, WireType]]
             yield from _flat_nodes(child, field)
         else:
             yield child, field
+
+
+def _leaves(node: Node, repeats: _Repeats = ()) -> Iterator[tuple[int, np.dtype[np.generic], _Repeats]]:
+    """Yield the values a node consists of: offset, type, and (count, stride in bytes) of the arrays they are in."""
+    match node:
+        case ScalarAt():
+            yield node.offset, node.dtype, repeats
+        case ScalarsAt():
+            yield node.offset, node.dtype, (*repeats, (node.count, node.dtype.itemsize))
+        case TextAt():
+            if node.length:
+                yield node.offset, np.dtype(f"V{node.length}"), repeats
+        case RecordAt():
+            for _, child in node.fields:
+                yield from _leaves(child, repeats)
+        case RepeatAt():
+            yield from _leaves(node.element, (*repeats, (node.count, node.stride)))
+        case ElementsAt():
+            for element in node.elements:
+                yield from _leaves(element, repeats)
 
 
 def _offsets(count: int, length: int) -> pa.Buffer:

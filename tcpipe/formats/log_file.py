@@ -284,7 +284,11 @@ class Log:
                 *(f"{self.path}: there is no topic {name}; it has {_listed(self.topics)}" for name in unknown)
             )
         types = {name: self._message_type(name) for name in wanted}
-        return {name: TopicTable(of, self.topics[name].encoding) for name, of in types.items() if of is not None}
+        return {
+            name: TopicTable(of, self.topics[name].encoding, expected_rows=self.topics[name].message_count or 0)
+            for name, of in types.items()
+            if of is not None
+        }
 
     def _blocks(
         self, index: int, collected: Mapping[str, TopicTable], threads: int

@@ -269,8 +269,7 @@ def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = Fal
         raise DamageError(f"it claims to hold {size} bytes, more than {MAX_CHUNK_BYTES}")
     if is_bomb(len(data), size):
         raise DamageError(f"it claims to hold {size} bytes in {len(data)}")
-    if codec not in ("lz4", "zstd", "bz2"):
-        raise DamageError(f"its compression {codec!r} is unknown (lz4, zstd and bz2 are read)")
+    _refuse_unknown(codec)
     try:
         if codec == "zstd" or (codec == "lz4" and (checked or _lz4_content_bytes(data) == size)):
             return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec)).cast("B")
@@ -282,6 +281,11 @@ def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = Fal
     if len(found) != size or more:
         raise DamageError(f"it holds {'more' if more else f'{len(found)} bytes'}, not the {size} bytes it claims")
     return memoryview(found).cast("B")
+
+
+def _refuse_unknown(codec: str) -> None:
+    if codec not in ("lz4", "zstd", "bz2"):
+        raise DamageError(f"its compression {codec!r} is unknown (lz4, zstd and bz2 are read)")
 
 
 def _lz4_content_bytes(frame: memoryview) -> int:
@@ -296,6 +300,7 @@ def _lz4_content_bytes(frame: memoryview) -> int:
 
 def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
     """Return as many of the ``size`` bytes as the cut ``data`` still gives."""
+    _refuse_unknown(codec)
     pieces, found = [], 0
     try:
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:

@@ -187,3 +187,23 @@ def test_a_message_that_fits_no_definition_costs_only_itself(header):
 def _definitions():
 
     return get_types_from_msg("string[] texts\nfloat64 number\n", "a/msg/A")
+
+
+def test_arrays_of_messages_that_hold_short_arrays_of_messages():
+    leaf = record("a/msg/Leaf", (("x", Scalar("f8")),))
+    inner = record("a/msg/Inner", (("b", Array(leaf, 2)), ("c", Array(Scalar("i2"), 4))))
+    outer = record("a/msg/Outer", (("a", Array(inner, 5)),))
+    values = [
+        {"a": [{"b": [{"x": m + 10.0 * i + j} for j in range(2)], "c": [m, i, -m, -i]} for i in range(5)]}
+        for m in range(12)
+    ]
+    writer = [Writer(b"\x00\x01", None).message(outer, value) for value in values]
+    lengths = np.full(len(writer), len(writer[0]), np.int64)
+    order = np.arange(len(writer))
+    table = TopicTable(MessageType(outer, "log", {}), "cdr")
+    table.add(
+        MessageBlock(0, memoryview(b"".join(writer)), order * lengths[0], lengths, order, order, order, int(lengths[0]))
+    )
+    found = table.take()
+    found.validate(full=True)
+    assert found["a"].to_pylist() == [value["a"] for value in values]

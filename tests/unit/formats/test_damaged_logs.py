@@ -249,3 +249,13 @@ def test_the_index_of_an_intact_bag_is_used(tmp_path):
     one_wrong = replace(entries, log_time_ns=entries.log_time_ns + (np.arange(len(messages)) == 20))
     assert np.flatnonzero(~_borne_out(data, entries.offset, one_wrong)).tolist() == [20]
     part.close()
+
+
+def test_a_cut_chunk_of_an_unknown_compression_is_lost_by_name(tmp_path):
+    messages = random_messages(8, count=50, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, BagWriter.CompressionFormat.LZ4)
+    data = path.read_bytes().replace(b"compression=lz4", b"compression=lz8")
+    path.write_bytes(data[: data.index(b"compression=lz8") + 500])
+    tables, damage = read(path)
+    assert tables == {}
+    assert any("'lz8' is unknown" in finding.what for finding in damage)
