@@ -89,6 +89,8 @@ def ingest(
 
 
 def _print(summary: IngestSummary) -> None:
+    from tcpipe.cost.budget import in_words
+
     for result in summary.results:
         if result.status == "failed":
             click.echo(f"failed     {result.log}")
@@ -99,6 +101,8 @@ def _print(summary: IngestSummary) -> None:
         )
         if result.same_as:
             click.echo(f"  {result.log} is the same recording as {plain_line(result.same_as)}: one run")
+        if result.energy_budget is not None and result.status != "unchanged":
+            click.echo(f"  {in_words(result.energy_budget)}")
         for damage in result.damage:
             click.echo(f"  damage:  {plain_line(damage)}")
         if result.status != "unchanged":

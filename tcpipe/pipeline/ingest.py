@@ -54,6 +54,8 @@ class IngestResult:
     segments: int = 0
     distance_m: float = 0.0
     kept_m: float = 0.0
+    energy_budget: Mapping[str, Any] | None = None
+    """The noise floor of the labels' energy and its causes, as shares of their mean (`tcpipe.cost.budget`)."""
     warnings: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
@@ -351,6 +353,7 @@ def _result(source: LogSource, status: Status, run: RunDirectory, sha256: str, *
         segments=manifest["counts"]["segments"],
         distance_m=sum(ledger.values()),
         kept_m=ledger.get("kept", 0.0),
+        energy_budget=manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget"),
         warnings=tuple(manifest["warnings"]),
         damage=damage,
         same_as=same_as,

@@ -22,8 +22,10 @@ from tcpipe.report.figures import (
     patch_gallery,
     path_on_map,
 )
-from tcpipe.report.overview import read_overview
+from tcpipe.report.overview import Bounds, joint_bounds_m, read_overview
 from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.quality import quality_sections
+from tcpipe.tables.bits import Quality
 
 _GALLERY = 10
 
@@ -38,6 +40,7 @@ _COLUMNS = (
     "velocity_mps",
     "duration_s",
     "energy_joule",
+    "quality",
 )
 
 
@@ -60,6 +63,7 @@ def dataset_report(directory: Path) -> str:
             _split_section(directory, card, samples),
             _gallery_section(directory, card, samples),
             *_label_sections(card, samples),
+            *quality_sections(_quality_counts(samples), "samples"),
             *budget_sections(card.get("energy_budget")),
             Section(
                 "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card["ledger_m"])
@@ -78,13 +82,10 @@ def _floats(samples: pa.Table, name: str) -> NDArray[np.float64]:
 
 
 def _split_section(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Section:
-    grid = card["maps"][0]
-    x_max_m, y_min_m = (
-        grid["x_min_m"] + grid["cols"] * grid["pitch_m"],
-        grid["y_max_m"] - grid["rows"] * grid["pitch_m"],
-    )
-    to_map = Transformer.from_crs(card["recipe"]["read"]["gnss_crs"], grid["crs"], always_xy=True)
-    region_to_map = Transformer.from_crs("EPSG:4326", grid["crs"], always_xy=True)
+    crs = card["maps"][0]["crs"]
+    x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(grid["crs"], _bounds_m(grid)) for grid in card["maps"]])
+    to_map = Transformer.from_crs(card["recipe"]["read"]["gnss_crs"], crs, always_xy=True)
+    region_to_map = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
     x, y = to_map.transform(_floats(samples, "start_lon_deg"), _floats(samples, "start_lat_deg"))
     outlines = [
         np.column_stack(region_to_map.transform(ring[:, 0], ring[:, 1])) for ring in _rings(card["split"]["region"])
@@ -95,12 +96,17 @@ def _split_section(directory: Path, card: Mapping[str, Any], samples: pa.Table) 
         samples.column("split").to_numpy(zero_copy_only=False),
         SPLIT_COLOURS,
         backdrop=read_overview(directory / OVERVIEW),
-        extent_m=(grid["x_min_m"], x_max_m, y_min_m, grid["y_max_m"]),
+        extent_m=(x_min_m, x_max_m, y_min_m, y_max_m),
         outlines_m=outlines,
         labels=("easting [m]", "northing [m]"),
     )
     text = "Where each sample begins, on the map; dashed: the split's region. Samples in the buffer are in no split."
     return Section("The split on the map", text, svg)
+
+
+def _bounds_m(grid: Mapping[str, Any]) -> Bounds:
+    width_m, height_m = grid["cols"] * grid["pitch_m"], grid["rows"] * grid["pitch_m"]
+    return grid["x_min_m"], grid["y_max_m"] - height_m, grid["x_min_m"] + width_m, grid["y_max_m"]
 
 
 def _rings(region: Mapping[str, Any] | None) -> list[NDArray[np.float64]]:
@@ -166,9 +172,14 @@ def _label_sections(card: Mapping[str, Any], samples: pa.Table) -> list[Section]
         Section(
             "Labels",
             "One value a sample.",
-            histograms({label: _floats(samples, name) for label, name in labels.items()}),
+            histograms({label: _floats(samples, name) for label, name in labels.items()}, of_what="samples"),
         ),
     ]
+
+
+def _quality_counts(samples: pa.Table) -> dict[str, int]:
+    quality = samples.column("quality").to_numpy()
+    return {str(bit.name).lower(): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
 
 
 def _audit_section(card: Mapping[str, Any]) -> Section:
@@ -227,6 +238,11 @@ def _table_sections(card: Mapping[str, Any]) -> list[Section]:
         names = sorted({name for counts in card["terrain"].values() for name in counts})
         rows = [(name, *(card["terrain"][split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
         sections.append(Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows))
-    runs = [(run["run_id"], run["robot"], run["recipe_id"]) for run in card["runs"]]
-    sections.append(Section("Runs", header=("run", "robot", "recipe"), rows=runs))
+    runs = [(run["run_id"], run["robot"], run["recipe_id"], _floor(run)) for run in card["runs"]]
+    sections.append(Section("Runs", header=("run", "robot", "recipe", "noise floor of E"), rows=runs, figures_from=3))
     return sections
+
+
+def _floor(run: Mapping[str, Any]) -> str:
+    budget = run.get("energy_budget")
+    return "none" if budget is None else f"{100 * budget['total']:.1f} %"

@@ -23,4 +23,4 @@ def budget_sections(budget: Mapping[str, Any] | None) -> list[Section]:
     if budget is None:
         return []
     rows = [(text, f"{100 * budget[name]:.2f} %") for name, text in _ROWS.items()]
-    return [Section("How wrong a label may be", in_words(budget), header=("from", "of E"), rows=rows)]
+    return [Section("How wrong a label may be", in_words(budget), header=("from", "of E"), rows=rows, figures_from=1)]

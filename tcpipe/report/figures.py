@@ -135,14 +135,16 @@ def ledger_bars(ledger_m: Mapping[str, float]) -> str:
         colours = [KEPT if name == "kept" else DROPPED for name in names]
         bars = axes.barh(names, values, color=colours, height=0.7)
         total = max(values.sum(), 1e-9)
-        axes.bar_label(bars, [f" {v:.1f} m  ({100 * v / total:.1f} %)" for v in values], color=INK, fontsize=8)
+        axes.bar_label(
+            bars, [f"{v:.1f} m  ({100 * v / total:.1f} %)" for v in values], color=INK, fontsize=8, padding=3
+        )
         axes.invert_yaxis()
         axes.set_xlim(0, max(values.max() * 1.25, 1.0))
         axes.set_xlabel("metres")
     return out[0]
 
 
-def histograms(values: Mapping[str, Array]) -> str:
+def histograms(values: Mapping[str, Array], *, of_what: str = "segments") -> str:
     """Draw one histogram a label."""
     with figure_svg(8.2, 2.1) as (figure, out):
         for axes, (label, data) in zip(np.atleast_1d(figure.subplots(1, len(values))), values.items(), strict=True):
@@ -150,7 +152,7 @@ def histograms(values: Mapping[str, Array]) -> str:
             if len(finite):
                 axes.hist(finite, bins=min(40, max(5, int(np.sqrt(len(finite))))), color="#2a6fb0")
             axes.set_xlabel(label)
-        figure.axes[0].set_ylabel("segments")
+        figure.axes[0].set_ylabel(of_what)
     return out[0]
 
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import matplotlib.image
 import numpy as np
 from numpy.typing import NDArray
+from pyproj import Transformer
 
 from tcpipe.formats.atomic import atomic_file
 from tcpipe.formats.map_files import MapFile
@@ -23,6 +25,43 @@ def map_overview(source: MapFile) -> NDArray[np.uint8]:
     layer = "ortho" if "ortho" in level.layers else "height"
     picture = _thinned(level, layer, step)
     return picture.astype(np.uint8) if layer == "ortho" else _shaded(picture, step * level.grid.pitch_m)
+
+
+Bounds = tuple[float, float, float, float]
+"""x_min, y_min, x_max, y_max [m]."""
+
+
+def joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
+    """Return the bounds of all maps, each given with its CRS, in the CRS of the first."""
+    first = places[0][0]
+    every = [
+        bounds if crs == first else Transformer.from_crs(crs, first, always_xy=True).transform_bounds(*bounds)
+        for crs, bounds in places
+    ]
+    low, high = np.min(every, axis=0), np.max(every, axis=0)
+    return float(low[0]), float(low[1]), float(high[2]), float(high[3])
+
+
+def maps_overview(sources: Sequence[MapFile]) -> NDArray[np.uint8]:
+    """Return one picture of all maps over their joint bounds, grey as `map_overview`; the first rules where they overlap."""
+    if len(sources) == 1:
+        return map_overview(sources[0])
+    crs = sources[0].grid.crs
+    x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])
+    step_m = max(x_max_m - x_min_m, y_max_m - y_min_m) / _SIDE_PX
+    x_m, y_m = np.meshgrid(
+        np.arange(x_min_m + step_m / 2, x_max_m, step_m), np.arange(y_max_m - step_m / 2, y_min_m, -step_m)
+    )
+    whole = np.full(x_m.shape, 255, np.uint8)
+    for each in reversed(sources):
+        picture, (left, bottom, right, top) = map_overview(each), each.grid.bounds_m
+        to_map = Transformer.from_crs(crs, each.grid.crs, always_xy=True)
+        x, y = (x_m, y_m) if each.grid.crs == crs else to_map.transform(x_m, y_m)
+        col = np.floor((x - left) / (right - left) * picture.shape[1]).astype(np.int64)
+        row = np.floor((top - y) / (top - bottom) * picture.shape[0]).astype(np.int64)
+        inside = (col >= 0) & (col < picture.shape[1]) & (row >= 0) & (row < picture.shape[0])
+        whole[inside] = picture[row[inside], col[inside]]
+    return whole
 
 
 def quick_look(source: MapFile) -> NDArray[np.uint8]:

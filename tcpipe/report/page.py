@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -38,7 +39,13 @@ def render_page(
 ) -> str:
     """Return the page's HTML; every text is escaped, pictures are inline."""
     source = files("tcpipe.report").joinpath("page.html.j2").read_text(encoding="utf-8")
-    template = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True).from_string(source)
-    return template.render(
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    environment.filters["breakable"] = _breakable
+    return environment.from_string(source).render(
         title=title, lead=lead, numbers=numbers, warnings=warnings, sections=sections, version=__version__
     )
+
+
+def _breakable(cell: object) -> str:
+    """Return a cell's text as HTML, escaped, that may break after every / and _, as topics and types are long."""
+    return html.escape(str(cell)).replace("/", "/<wbr>").replace("_", "_<wbr>")

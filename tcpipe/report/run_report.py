@@ -10,11 +10,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import DROPPED, KEPT, histograms, ledger_bars, over_distance, path_on_map
 from tcpipe.report.overview import map_overview
 from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.quality import quality_sections
+from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.store import RunDirectory, Store
 from tcpipe.tables.bits import DropReason, Quality
 
@@ -55,7 +58,7 @@ def run_report(store: Store, run: RunDirectory) -> str:
                 segments, ledger, manifest["info"]["findings"]["facts"].get("label", {}).get("physics", {})
             ),
             *budget_sections(manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget")),
-            *_detail_sections(run, source),
+            *sensor_sections(source, manifest, run.rejections()),
         ],
     )
 
@@ -104,34 +107,42 @@ def _track_sections(store: Store, run: RunDirectory, track: pa.Table) -> list[Se
 def _path_section(store: Store, run: RunDirectory, track: pa.Table) -> Section:
     reasons = _first_reason(_column(track, "dropped_by"))
     text = "The fused track; colour says why a row is not used."
-    found = None if run.track().info.datum is None else _map_under(store, run, track)
+    found, lost = _map_under(store, run, track)
+    text += "".join(f" Map {name} cannot be shown: {why}." for name, why in lost)
     if found is None:
         x, y = _column(track, "x_m"), _column(track, "y_m")
         return Section("Path", text, path_on_map(x, y, reasons, _COLOURS))
-    source, x, y = found
+    source, picture, x, y = found
     x_min_m, y_min_m, x_max_m, y_max_m = source.grid.bounds_m
     svg = path_on_map(
         x,
         y,
         reasons,
         _COLOURS,
-        backdrop=map_overview(source),
+        backdrop=picture,
         extent_m=(x_min_m, x_max_m, y_min_m, y_max_m),
         labels=("easting [m]", "northing [m]"),
     )
     return Section("Path on the map", text, svg)
 
 
-def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[MapFile, NDArray[Any], NDArray[Any]] | None:
-    """Return the first map that holds most of the track, and the track in its CRS; None if there is none."""
+_Under = tuple[MapFile, NDArray[np.uint8], NDArray[Any], NDArray[Any]]
+
+
+def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under | None, list[tuple[str, str]]]:
+    """Return the first map that holds most of the track, its picture and the track in its CRS, and the maps that cannot be read."""
     gnss_crs = run.manifest["recipe"]["read"]["gnss_crs"]
     lon, lat = _column(track, "lon_deg"), _column(track, "lat_deg")
-    for name in store.maps():
-        source = open_map(store.map_path(name))
-        x, y = Transformer.from_crs(gnss_crs, source.grid.crs, always_xy=True).transform(lon, lat)
-        if source.grid.contains(np.column_stack([x, y])).mean() > _MOSTLY:
-            return source, np.asarray(x), np.asarray(y)
-    return None
+    lost: list[tuple[str, str]] = []
+    for name in store.maps() if run.track().info.datum is not None else ():
+        try:
+            source = open_map(store.map_path(name))
+            x, y = Transformer.from_crs(gnss_crs, source.grid.crs, always_xy=True).transform(lon, lat)
+            if source.grid.contains(np.column_stack([x, y])).mean() > _MOSTLY:
+                return (source, map_overview(source), np.asarray(x), np.asarray(y)), lost
+        except (TcpipeError, OSError) as error:
+            lost.append((name, plain_line(str(error))))
+    return None, lost
 
 
 def _physics_sections(segments: pa.Table, physics: Mapping[str, Any]) -> list[Section]:
@@ -159,33 +170,7 @@ def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: 
         sections.append(Section("Labels", "One value a segment.", histograms(data)))
         sections += _physics_sections(segments, physics)
         quality = _column(segments, "quality")
-        counts = [(str(bit.name).lower(), int(((quality & int(bit)) != 0).sum()), bit.__doc__) for bit in Quality]
-        rows = [(name.replace("_", " "), count) for name, count, _ in counts if count]
-        if rows:
-            sections.append(Section("Quality flags", "", header=("flag", "segments"), rows=rows))
-    return sections
-
-
-def _detail_sections(run: RunDirectory, source: Mapping[str, Any] | None) -> list[Section]:
-    rejections = run.rejections()
-    refused: dict[str, int] = {}
-    for role in rejections.column("role").to_pylist():
-        refused[role] = refused.get(role, 0) + 1
-    sections = []
-    if source is not None:
-        rows = [
-            (
-                role.replace("_", " "),
-                sensor["topic"],
-                sensor["type_name"],
-                run.manifest["counts"].get(f"{role}_messages", 0),
-                refused.get(role, 0),
-                sensor["time_source"],
-                sensor["placed_by"],
-                sensor["why"],
-            )
-            for role, sensor in sorted(source["sensors"].items())
-        ]
-        header = ("role", "topic", "type", "messages", "refused", "stamp", "placed by", "why this topic")
-        sections.append(Section("Sensors", "Which topic played which role.", header=header, rows=rows))
+        sections += quality_sections(
+            {str(bit.name).lower(): int(((quality & int(bit)) != 0).sum()) for bit in Quality}, "segments"
+        )
     return sections
