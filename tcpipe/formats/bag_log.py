@@ -192,8 +192,8 @@ class BagPart:
             found = excerpt(
                 run.plan,
                 run.plan.entries,
-                load=lambda number: self._load(run.members[number].chunk),
-                copy=lambda number, places, to: self._copy(run.members[number].chunk, places, to),
+                load=lambda number: self._load(run.members[number].chunk, run.members[number].record),
+                copy=lambda number, places, to: self._copy(run.members[number], places, to),
             )
             lost += [(run.members[number].chunk, error) for number, error in found.lost]
             true = _borne_out(found.data, found.offset, found.entries)
@@ -205,7 +205,7 @@ class BagPart:
         for number in doubtful:
             member = run.members[number]
             try:
-                data = self._load(member.chunk)
+                data = self._load(member.chunk, member.record)
             except DamageError as error:
                 lost.append((member.chunk, error))
             else:
@@ -254,17 +254,6 @@ class BagPart:
             raise DamageError("a chunk's index does not hold what the summary counts")
         return found
 
-    def _copy(self, chunk: _Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
-        """Copy pieces (start, stop, place) of a chunk; of a plain one nothing else is read."""
-        record = self._record(chunk.offset)
-        if _codec(record) != "none" or record.opcode != _OP_CHUNK:
-            copy_pieces(self._load(chunk), places, to)
-            return
-        self._without_checksum = True
-        self._bytes.read_pieces(
-            [(record.data_offset + start, to[at : at + stop - start]) for start, stop, at in places]
-        )
-
     def _index_record(self, position: int) -> tuple[int, int, int]:
         """Return the connection of an index record, and offset and size of its entries.
 
@@ -287,9 +276,20 @@ class BagPart:
             self._index_heads[length] = places[0], low, high, header[:low] + header[low + 4 : high] + header[high + 4 :]
         return record.number(b"conn"), record.data_offset, record.data_bytes
 
-    def _load(self, chunk: _Chunk) -> memoryview:
+    def _copy(self, member: _PlacedChunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
+        """Copy pieces (start, stop, place) of a chunk; of a plain one nothing else is read."""
+        record = member.record
+        if record is None or record.opcode != _OP_CHUNK or _codec(record) != "none":
+            copy_pieces(self._load(member.chunk, record), places, to)
+            return
+        self._without_checksum = True
+        self._bytes.read_pieces(
+            [(record.data_offset + start, to[at : at + stop - start]) for start, stop, at in places]
+        )
+
+    def _load(self, chunk: _Chunk, record: _Record | None = None) -> memoryview:
         """Return the records of a chunk; of one that the file's end cuts, what can still be had."""
-        record = self._record(chunk.offset)
+        record = record or self._record(chunk.offset)
         codec = _codec(record)
         if codec != "bz2":
             self._without_checksum = True
