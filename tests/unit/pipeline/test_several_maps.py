@@ -15,8 +15,10 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError
 from tcpipe.formats.dataset_files import read_card, read_samples
 from tcpipe.formats.map_building import build_map
+from tcpipe.formats.map_files import open_map
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.recipe import Recipe
+from tcpipe.report.overview import joint_bounds_m, maps_overview
 from tcpipe.store import Store
 
 
@@ -92,6 +94,24 @@ def test_the_card_names_the_maps_in_their_order_and_a_second_call_does_nothing(s
     assert [entry["crs"] for entry in card["maps"]] == ["EPSG:31256", "EPSG:32633"]
     assert build(store, tmp_path / "out", ["east", "west"]).status == "unchanged"
     assert build(store, tmp_path / "out", ["west", "east"]).status == "done"
+
+
+@pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])
+def test_the_page_shows_all_maps_in_their_places(store, order):
+    """Grey of the world at places of either map alone, in the CRS of the first; white outside both."""
+    sources = [open_map(store.map_path(name)) for name in order]
+    picture = maps_overview(sources)
+    crs = sources[0].grid.crs
+    x_min, y_min, x_max, y_max = joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])
+    xy = np.array([(x, y) for x in (-15.0, -8.0, 0.0, 8.0, 15.0) for y in (-12.0, 3.0, 14.0)])
+    x, y = pyproj.Transformer.from_crs(WORLD.crs, crs, always_xy=True).transform(
+        WORLD.x_m + xy[:, 0], WORLD.y_m + xy[:, 1]
+    )
+    cols = ((x - x_min) / (x_max - x_min) * picture.shape[1]).astype(int)
+    rows = ((y_max - y) / (y_max - y_min) * picture.shape[0]).astype(int)
+    wanted = WORLD.grey(WORLD.x_m + xy[:, 0], WORLD.y_m + xy[:, 1])
+    assert np.abs(picture[rows, cols] - wanted).max() < 12.0
+    assert max(picture.shape) <= 901
 
 
 def test_the_same_bytes_however_the_segments_are_cut_into_batches(store, tmp_path, monkeypatch):
