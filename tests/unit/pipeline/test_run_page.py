@@ -1,0 +1,71 @@
+"""The page of a run: what it must say of its sensors, and that a map which cannot be read costs only its picture."""
+
+import json
+import shutil
+
+import pytest
+
+from tcpipe.formats.log_file import open_log
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.maps import add_map
+from tcpipe.report.run_report import run_report
+from tcpipe.simulation import Faults, simulate, tiny
+from tcpipe.store import Store
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """A run of half a minute with all sensor faults, a map under it, and another that is damaged."""
+    here = tmp_path_factory.mktemp("page")
+    site = simulate(here / "site", scenario=tiny(Faults.every(), seconds=40.0), seed=4)
+    assert ingest(site.logs, store=here / "store").exit_code == 0
+    add_map("site", store=here / "store", height=site.rasters["height"])
+    maps = here / "store" / "maps"
+    shutil.copytree(maps / "site.zarr", maps / "damaged.zarr")
+    (maps / "damaged.zarr" / "zarr.json").write_text("{")
+    return Store(here / "store")
+
+
+def page(store):
+    (run,) = store.runs()
+    return run, run_report(store, run)
+
+
+def test_a_map_that_cannot_be_read_is_named_and_the_next_one_drawn(store):
+    _, html = page(store)
+    assert "Map damaged cannot be shown:" in html
+    assert "<h2>Path on the map</h2>" in html
+
+
+def test_without_any_readable_map_the_path_stands_alone(store, tmp_path):
+    alone = tmp_path / "store"
+    shutil.copytree(store.root, alone)
+    shutil.copy(alone / "maps/damaged.zarr/zarr.json", alone / "maps/site.zarr/zarr.json")
+    _, html = page(Store(alone))
+    assert "<h2>Path</h2>" in html
+    assert html.count("cannot be shown") == 2
+
+
+def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
+    run, html = page(store)
+    facts = run.manifest["info"]["findings"]["facts"]
+    trust = html.split("<h2>How far each sensor was believed</h2>")[1].split("<h2>")[0]
+    for role, nis in facts["fuse"]["nis_mean"].items():
+        (row,) = [row for row in trust.split("<tr>") if f"<td>{role.replace('_', ' ')}</td>" in row]
+        assert f"<td>{nis:.2f}</td>" in row
+        refused = facts["fuse"]["rejected"][role]
+        assert (f"<td>{refused} gate</td>" in row) == (refused > 0)
+    clocks = html.split("<h2>Clocks</h2>")[1].split("<h2>")[0]
+    assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts["clock_offsets"]["offsets"])
+    assert f"Noise floor of E {100 * facts['label']['energy_budget']['total']:.1f} %" in html
+    assert "Kept and dropped add up to the odometer" in html
+
+
+def test_every_topic_stands_on_the_page_and_may_break(store):
+    run, html = page(store)
+    source = json.loads((run.path.parent / "run.json").read_text())
+    with open_log(source["source"]["paths"][0]) as log:
+        names = set(log.topics)
+    played = {sensor["topic"] for sensor in source["sensors"].values()}
+    assert played <= names
+    assert all(topic.replace("/", "/<wbr>").replace("_", "_<wbr>") in html for topic in played)
