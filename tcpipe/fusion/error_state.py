@@ -24,12 +24,15 @@ from scipy.special import chdtri
 from tcpipe.errors import FusionError
 from tcpipe.fusion import error_state_kernel as kernel
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD, process_noise, turn_scale_std, turn_sources
 from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.standing import standing_intervals
-from tcpipe.fusion.timeline import Timeline, build_timeline, turn_sources
+from tcpipe.fusion.timeline import Timeline, build_timeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
+from tcpipe.fusion.windows import part
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix
 
+_WIDTH = 30  # of a row of outputs, see `error_state_kernel._saved`; 81 more with covariances
 _BLOCK = 2048
 _KEPT_BLOCKS = 24
 """Blocks whose forward pass is kept at once: about 2.2 kB an event, 0.11 GB."""
@@ -39,12 +42,11 @@ _Store = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], ND
 _ROLES = {kernel.GNSS_POSITION: GNSS, kernel.WHEEL_VELOCITY: WHEELS, kernel.VISUAL_VELOCITY: VISUAL}
 _DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
 _DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2}
+_ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
+_LEVELLING_NS = 60_000_000_000
 _NEVER = 1e18
 _MANY_REFUSED = 0.1
 _GNSS_FACTORS = (16.0, 256.0)
-_WHEEL_SCALE_TIME_S = 30.0
-_WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
-_VISUAL_SCALE_STD = 0.05
 _LOCK_OUT = {
     kernel.GNSS_POSITION: (5.0, 15.0, 5.0),
     kernel.WHEEL_VELOCITY: (5.0, 5.0, 0.3),
@@ -83,6 +85,8 @@ def run_error_state(
     FusionError
         The estimate is not finite.
     """
+    if measurements.imu is None and output_ns.size:
+        initial = _levelled(measurements, initial, output_ns, gate_probability)
     timeline = build_timeline(measurements, standing_intervals(measurements), output_ns)
     run = _Run(timeline, measurements, gate_probability, lags=_lags(output_ns), covariances=covariances)
     outputs = run.smoothed(initial) if smooth else run.filtered(initial)
@@ -93,6 +97,19 @@ def run_error_state(
     if not np.isfinite(outputs).all():
         raise FusionError("fusion: the estimate is not finite; look at the streams' values with tcpipe inspect --full")
     return _trajectory(timeline, outputs, run, output_ns)
+
+
+def _levelled(
+    measurements: Measurements, initial: InitialState, output_ns: NDArray[np.int64], gate_probability: float
+) -> InitialState:
+    """Return the start with the attitude that its first minute, smoothed, says it had: without an IMU it starts level, on any slope."""
+    output_ns = output_ns[output_ns < output_ns[0] + _LEVELLING_NS]
+    first = part(measurements, 0, int(output_ns[-1]))
+    timeline = build_timeline(first, standing_intervals(first), output_ns)
+    outputs = _Run(timeline, first, gate_probability, lags=_lags(output_ns)).smoothed(initial)
+    if not np.isfinite(outputs[0]).all():
+        return initial
+    return replace(initial, quat_xyzw=quat_from_matrix(outputs[0, 0:9].reshape(3, 3)))
 
 
 def _softened(run: _Run, initial: InitialState, measurements: Measurements, gate_probability: float) -> _Run | None:
@@ -142,7 +159,7 @@ class _Run:
     ) -> None:
         self.lags = lags
         self.covariances = covariances
-        self._width = 111 if covariances else 30
+        self._width = _WIDTH + 81 if covariances else _WIDTH
         self.timeline = timeline
         self.gnss_factor = gnss_factor
         count = timeline.stamp_ns.size
@@ -168,12 +185,18 @@ class _Run:
             self._lock_out[kind] = limits
         if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
             self._lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
-        if measurements.imu is None and not turn_sources(measurements):  # nothing but GNSS tells how it turns
+        if measurements.imu is None and measurements.visual is None:  # wheels that dig in must not overrule GNSS
             self._lock_out[kernel.GNSS_POSITION, 1:] = 1.0
         # Without GNSS nothing tells how long a metre of odometry is; an accelerometer has a scale and an alignment of its own.
         self.unseen_scale_std = 0.0
         if measurements.gnss is None:
-            self.unseen_scale_std = _WHEEL_SCALE_STD if measurements.visual is None else _VISUAL_SCALE_STD
+            self.unseen_scale_std = WHEEL_SCALE_STD if measurements.visual is None else VISUAL_SCALE_STD
+        # From positions alone forward and reverse look the same: yaw is the course, and may be anything.
+        self.unseen_yaw_std = 0.0
+        self.antenna_m = self._levers[kernel.GNSS_POSITION]
+        if measurements.imu is None and not turn_sources(measurements):
+            self.unseen_yaw_std = _ANY_YAW_STD_RAD
+        self.turn_scale_std = turn_scale_std(measurements)
         self.last: _Memory
 
     def refused_share(self, kind: int) -> float:
@@ -184,7 +207,7 @@ class _Run:
     def filtered(self, initial: InitialState) -> NDArray[np.float64]:
         """Forward states at the wanted stamps, rows as `error_state_kernel` saves them."""
         outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
-        memory = _start(initial)
+        memory = _start(initial, self.turn_scale_std)
         self._forward(0, self.timeline.stamp_ns.size, memory, outputs, None)
         self.last = memory
         return outputs
@@ -195,7 +218,7 @@ class _Run:
         outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
         edges = [*range(0, count, _BLOCK), count]
         blocks = list(pairwise(edges))
-        memory = _start(initial)
+        memory = _start(initial, self.turn_scale_std)
         checkpoints: list[_Memory] = []
         kept: dict[int, _Store] = {}
         for index, (first, last) in enumerate(blocks):
@@ -245,6 +268,7 @@ class _Run:
             t.dt_s,
             t.kind,
             t.mode,
+            t.shake_m2ps3,
             t.value,
             t.variance,
             t.turn_rate_radps,
@@ -294,40 +318,13 @@ def _links(lags: Sequence[int]) -> tuple[NDArray[Any], ...]:
     return np.eye(n), chains, np.zeros((size, n, 2)), np.zeros((size, 6)), recipe, np.array(list(nodes)), wanted
 
 
-def process_noise(measurements: Measurements) -> NDArray[np.float64]:
-    """Return the noise densities by process mode [unit²/s], and the decay of the wheels' scale [1/s], shape (4, 18).
-
-    White noise of standard deviation s at f Hz has the density s²/f; somewhat more stands for scale and alignment errors of the IMU.
-    Biases, scales and the velocity of a robot without IMU wander: their densities are what such robots do in a second. Slip comes and goes,
-    so the wheels' scale returns to one; where only the wheels and the camera tell speed, neither is known to be right on average, and it
-    wanders freely.
-    """
-    density = np.empty((4, kernel.N + 1))
-    density[:, 0:3] = 0.01
-    density[:, 3:6] = (1e-4) ** 2
-    density[:, 6:9] = (1.5e-3) ** 2  # a milli-g or two in a minute, as uncooled MEMS units drift
-    density[:, 9:12] = 1.0
-    density[:, 12:15] = 1e-8
-    density[:, 15] = 2 * _WHEEL_SCALE_STD**2 / _WHEEL_SCALE_TIME_S
-    density[:, 17] = 0.0 if measurements.gnss is None and measurements.visual is not None else 1 / _WHEEL_SCALE_TIME_S
-    density[:, 16] = 0.002**2
-    density[kernel.FLAT_TURN, 2] = 8e-3 if turn_sources(measurements) else 0.02
-    density[kernel.VISUAL_TURN, 2] = 5e-4
-    if measurements.visual is not None and measurements.visual.turn_rate_radps is not None:
-        density[kernel.VISUAL_TURN, 0:2] = 5e-4
-    imu = measurements.imu
-    if imu is not None:
-        rate_hz = 1e9 / median_period_ns(imu.stamp_ns)
-        density[kernel.GYRO_TURN :, 0:3] = 1.5 * imu.gyro_std_radps**2 / rate_hz + 1e-8
-        density[kernel.INERTIAL, 9:12] = 1.1 * imu.accelerometer_std_mps2**2 / rate_hz + 1e-6
-    return density
-
-
-def _start(initial: InitialState) -> _Memory:
+def _start(initial: InitialState, turn_scale_std: float = 0.0) -> _Memory:
+    """Return the state at the start; with a scale error of the turn rate to be found in the place of the gyroscope's bias, or without."""
     x = np.zeros(kernel.NX)
     rotation = matrix_from_quat(initial.quat_xyzw)
     x[0:9] = rotation.ravel()
-    x[9:12] = initial.gyro_bias_radps
+    bias_std = turn_scale_std or initial.gyro_bias_std_radps
+    x[9:12] = 0.0 if turn_scale_std else initial.gyro_bias_radps
     x[15:18] = initial.velocity_enu_mps
     x[18:21] = initial.position_enu_m
     P = np.zeros((kernel.N, kernel.N))
@@ -335,11 +332,11 @@ def _start(initial: InitialState) -> _Memory:
     index = np.arange(3, kernel.N)
     P[index, index] = np.concatenate(
         (
-            np.full(3, initial.gyro_bias_std_radps**2),
+            np.full(3, bias_std**2),
             np.full(3, 0.15**2),
             np.full(3, initial.velocity_std_mps**2),
             initial.position_std_m**2,
-            [_WHEEL_SCALE_STD**2, _VISUAL_SCALE_STD**2],
+            [WHEEL_SCALE_STD**2, VISUAL_SCALE_STD**2],
         )
     )
     return _Memory(x, P, np.zeros(8), np.zeros(8))
@@ -350,7 +347,9 @@ def _trajectory(
 ) -> Trajectory:
     rotation = outputs[:, 0:9].reshape(-1, 3, 3)
     scale_std, speed_mps = run.unseen_scale_std, np.linalg.norm(outputs[:, 15:18], axis=1)
-    bias = np.where(timeline.output_has_gyro[:, None], outputs[:, 9:12], 0.0)
+    if run.unseen_yaw_std:
+        _doubt_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
+    bias = outputs[:, 9:12] * (timeline.output_rate_radps if run.turn_scale_std else timeline.output_has_gyro[:, None])
     return Trajectory(
         stamp_ns=output_ns,
         position_enu_m=outputs[:, 18:21].copy(),
@@ -365,8 +364,26 @@ def _trajectory(
             _displacement_std_m(run, output_ns), scale_std * speed_mps[:, None] * DISPLACEMENT_LAGS_S
         ),
         facts=_facts(timeline, run),
-        covariance=outputs[:, 30:].reshape(-1, 9, 9) if run.covariances else None,
+        covariance=outputs[:, _WIDTH:].reshape(-1, 9, 9) if run.covariances else None,
     )
+
+
+def _doubt_yaw(
+    outputs: NDArray[np.float64], rotation: NDArray[np.float64], yaw_std: float, antenna_m: NDArray[np.float64]
+) -> None:
+    """Add what cannot be known where yaw may be anything: itself, where below its antenna the robot is, and whether it drives forward."""
+    velocity, beside = outputs[:, 15:18], rotation @ antenna_m
+    aside2 = np.sum(beside[:, :2] ** 2, axis=1)
+    above2 = 2 * (rotation[:, 2, :2] @ antenna_m[:2]) ** 2
+    outputs[:, 23:26] += np.column_stack((aside2, aside2, above2))
+    outputs[:, 26] += yaw_std**2
+    outputs[:, 27] += 1.5 * np.sum(velocity**2, axis=1)
+    if outputs.shape[1] > _WIDTH:
+        up = rotation[:, 2, :]  # the vertical, in base_link's axes
+        covariance = outputs[:, _WIDTH:].reshape(-1, 9, 9)
+        covariance[:, :3, :3] += yaw_std**2 * up[:, :, None] * up[:, None, :]
+        for row, doubt in ((6, aside2), (7, aside2), (8, above2)):
+            covariance[:, row, row] += doubt
 
 
 def _lags(output_ns: NDArray[np.int64]) -> list[int]:
@@ -411,7 +428,8 @@ def _facts(timeline: Timeline, run: _Run) -> dict[str, Any]:
     facts["standing_updates"] = int((timeline.kind == kernel.STANDING).sum())
     facts["gnss_variance_factor"] = run.gnss_factor
     facts["covariance_repairs"] = int(run.repairs)
-    facts["gyro_bias_radps"] = x[9:12].tolist()
+    facts["gyro_bias_radps"] = None if run.turn_scale_std else x[9:12].tolist()
+    facts["turn_scale"] = float(1 + x[11]) if run.turn_scale_std else None
     facts["accelerometer_bias_mps2"] = x[12:15].tolist()
     facts["wheel_scale"], facts["wheel_scale_std"] = float(1 + x[21]), float(deviation[15])
     facts["visual_scale"], facts["visual_scale_std"] = float(1 + x[22]), float(deviation[16])

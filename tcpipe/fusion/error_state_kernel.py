@@ -10,8 +10,9 @@ Process, over an interval dt with the mean angular velocity w and specific force
 
     R⁺ = R exp((w - b_g) dt)    v⁺ = v + (R exp((w - b_g) dt/2) (a - b_a) - g e_z) dt    p⁺ = p + v dt + ½ (v⁺ - v) dt
 
-Without a usable accelerometer the body velocity is kept instead (v⁺ = R⁺ R' v), without a gyroscope the yaw rate of an odometry
-takes its place; both with more noise. The wheels' scale may decay towards one (slip comes and goes).
+Without a usable accelerometer the body velocity is kept instead (v⁺ = R⁺ R' v), without a gyroscope the turn rate of an odometry
+takes its place; both with more noise. A log without any gyroscope has no b_g: the three hold the scale errors of that turn rate,
+w (1 - b_g). The wheels' scale may decay towards one (slip comes and goes).
 
 Sigma points x ⊞ ±√n L_i with α = 1, κ = 0, β = 2, so that the centre has weight 0 in the mean and 2 in the covariance and no weight is
 negative (Wan & van der Merwe 2000). Errors of columns that do not touch R or b_g move linearly; their sigma points are summed in closed
@@ -61,6 +62,9 @@ FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
 
 _MOVED = (0, 1, 2, 9, 10, 11, 12, 13, 14)
 """Errors that others move into: th, v, p. All others stay what they are, but s_w, which may decay."""
+
+SLIDING, DECAY, TURNING, SCALED, GROUND = 9, *range(N, N + 4)
+"""Places in a row of process noise beside the densities, see `predict`."""
 
 NOT_A_MEASUREMENT, ACCEPTED, REFUSED, REOPENED = range(4)
 """Verdicts of the gate."""
@@ -138,11 +142,14 @@ def _displaced(x: Vector, d: Vector, sign: float, rotate: bool, out: Vector, tur
 
 
 @kernel
-def _propagated(x: Vector, w: Vector, a: Vector, dt: float, mode: int, decay: float, out: Vector, turn: Vector) -> None:
-    """State after dt; see the module's equations."""
-    b = 1.0 if mode >= GYRO_TURN else 0.0
+def _propagated(x: Vector, w: Vector, a: Vector, dt: float, mode: int, q: Vector, out: Vector, turn: Vector) -> None:
+    """State after dt; see the module's equations. q as in `predict`."""
     h = 0.5 * dt
-    _exp(h * (w[0] - b * x[9]), h * (w[1] - b * x[10]), h * (w[2] - b * x[11]), turn)
+    if mode >= GYRO_TURN:
+        _exp(h * (w[0] - x[9]), h * (w[1] - x[10]), h * (w[2] - x[11]), turn)
+    else:
+        s = q[SCALED]
+        _exp(h * w[0] * (1.0 - s * x[9]), h * w[1] * (1.0 - s * x[10]), h * w[2] * (1.0 - s * x[11]), turn)
     f0 = a[0] - x[12]
     f1 = a[1] - x[13]
     f2 = a[2] - x[14]
@@ -172,7 +179,7 @@ def _propagated(x: Vector, w: Vector, a: Vector, dt: float, mode: int, decay: fl
         out[18 + k] = x[18 + k] + h * (x[15 + k] + out[15 + k])
     for i in range(9, 15):
         out[i] = x[i]
-    out[21] = x[21] * (1.0 - dt * decay)
+    out[21] = x[21] * (1.0 - dt * q[DECAY])
     out[22] = x[22]
 
 
@@ -215,14 +222,48 @@ def _factor(P: Matrix, U: Matrix, tally: Vector) -> None:
 
 
 @kernel
-def predict(x: Vector, P: Matrix, q: Vector, dt: float, w: Vector, a: Vector, mode: int, F: Matrix, work: Any) -> None:
-    """Advance x and P by dt; q holds 17 noise densities and the rate at which s_w decays.
+def _stray(P: Matrix, x: Vector, centre: Vector, q: Vector, shake: float, dt: float, w: Vector, mode: int) -> None:
+    """Add the noise of attitude and velocity over dt to P; see `predict`. A velocity that is kept in the body turns with its noise."""
+    speed = sqrt(x[15] * x[15] + x[16] * x[16] + x[17] * x[17])
+    for k in range(3):
+        turned = dt * (q[k] + q[TURNING] * w[k] * w[k] + (q[GROUND] * speed if k < 2 else 0.0))
+        P[k, k] += turned
+        P[9 + k, 9 + k] += shake * dt
+        if mode == INERTIAL:
+            continue
+        b = (k + 1) % 3
+        c = (k + 2) % 3
+        ub = x[b] * x[15] + x[3 + b] * x[16] + x[6 + b] * x[17]
+        uc = x[c] * x[15] + x[3 + c] * x[16] + x[6 + c] * x[17]
+        more = 0.0  # of the noise along body axis k beyond ``shake``
+        if k == 1:
+            more = dt * (q[10] + (q[SLIDING] - 1.0) * shake)
+        elif k == 2:
+            more = dt * (q[11] - shake)
+        for i in range(3):
+            vi = centre[3 * i + c] * ub - centre[3 * i + b] * uc  # R⁺ (e_k x u)
+            P[k, 9 + i] += turned * vi
+            P[9 + i, k] += turned * vi
+            for j in range(3):
+                vj = centre[3 * j + c] * ub - centre[3 * j + b] * uc
+                P[9 + i, 9 + j] += turned * vi * vj + more * centre[3 * i + k] * centre[3 * j + k]
 
+
+@kernel
+def predict(
+    x: Vector, P: Matrix, q: Vector, shake: float, dt: float, w: Vector, a: Vector, mode: int, F: Matrix, work: Any
+) -> None:
+    """Advance x and P by dt.
+
+    q holds 17 noise densities [unit²/s], of which that of v is left out: it is ``shake`` in all directions, or where the body velocity is
+    kept ``shake`` forward, and sideways and upward what stands there, with SLIDING times ``shake`` sideways. Then come the rate at which
+    s_w decays (DECAY), how much the noise of the turn grows with its square (TURNING), whether b_g are scale errors (SCALED, 0 or 1),
+    and by how much roll and pitch stray on a metre of ground [rad²/m] (GROUND).
     F, shape (12, 9), becomes what the first 12 errors turn into of those in `_MOVED`; a F of no rows is left alone.
     """
     U, D, d, moved, middle, shifted, centre, turn, tally = work
     _factor(P, U, tally)
-    _propagated(x, w, a, dt, mode, q[N], centre, turn)
+    _propagated(x, w, a, dt, mode, q, centre, turn)
     for i in range(0, 9, 3):  # R exp(half the turn)
         for j in range(3):
             middle[i + j] = x[i] * turn[j] + x[i + 1] * turn[3 + j] + x[i + 2] * turn[6 + j]
@@ -238,7 +279,7 @@ def predict(x: Vector, P: Matrix, q: Vector, dt: float, w: Vector, a: Vector, mo
         if i < 6:  # touches R or b_g
             for side in range(2):
                 _displaced(x, d, 1.0 - 2.0 * side, i < 3, shifted, turn)
-                _propagated(shifted, w, a, dt, mode, q[N], moved, turn)
+                _propagated(shifted, w, a, dt, mode, q, moved, turn)
                 _difference(moved, centre, D[side])
             for j in range(N):
                 mean[j] += _WI * (D[0, j] + D[1, j])
@@ -268,7 +309,7 @@ def predict(x: Vector, P: Matrix, q: Vector, dt: float, w: Vector, a: Vector, mo
                     D[0, 9 + k] = gain
             for k in range(3):
                 D[0, 12 + k] = d[12 + k] + h * (d[9 + k] + D[0, 9 + k])
-            D[0, 15] = d[15] * (1.0 - dt * q[N])
+            D[0, 15] = d[15] * (1.0 - dt * q[DECAY])
             for r in range(6, N):
                 e = 2.0 * _WI * D[0, r]
                 for j in range(N):
@@ -276,7 +317,9 @@ def predict(x: Vector, P: Matrix, q: Vector, dt: float, w: Vector, a: Vector, mo
     for i in range(N):
         for j in range(N):
             P[i, j] += (_WC0 - 1.0) * mean[i] * mean[j]
-        P[i, i] += q[i] * dt
+        if i >= 3 and not 9 <= i < 12:
+            P[i, i] += q[i] * dt
+    _stray(P, x, centre, q, shake, dt, w, mode)
     if F.shape[0] > 0:
         _transition(x, middle, centre, dt, mode, U, F)
     _displaced(centre, mean, 1.0, True, x, turn)
@@ -326,7 +369,7 @@ def _observation(U: Matrix, Z: Matrix, H: Matrix) -> None:
 
 @kernel
 def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: Vector) -> None:
-    """Measurement h(x) of an event; w: angular velocity now, of which ``bias`` times b_g is taken off."""
+    """Measurement h(x) of an event; w: angular velocity now, of which ``bias`` times b_g is taken off; -1 where b_g are scale errors."""
     out[0] = 0.0
     out[1] = 0.0
     out[2] = 0.0
@@ -343,9 +386,9 @@ def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: 
         out[0] = x[6]
         out[1] = x[7]
     else:
-        w0 = w[0] - bias * x[9]
-        w1 = w[1] - bias * x[10]
-        w2 = w[2] - bias * x[11]
+        w0 = w[0] - x[9] * (bias if bias >= 0.0 else w[0])
+        w1 = w[1] - x[10] * (bias if bias >= 0.0 else w[1])
+        w2 = w[2] - x[11] * (bias if bias >= 0.0 else w[2])
         v0 = x[0] * x[15] + x[3] * x[16] + x[6] * x[17] + w1 * lever[2] - w2 * lever[1]
         v1 = x[1] * x[15] + x[4] * x[16] + x[7] * x[17] + w2 * lever[0] - w0 * lever[2]
         v2 = x[2] * x[15] + x[5] * x[16] + x[8] * x[17] + w0 * lever[1] - w1 * lever[0]
@@ -489,6 +532,7 @@ def _lifted(kind: int, P: Matrix, y: Vector, alone: bool) -> None:  # noqa: FBT0
     """Lift P after a lock-out so that the sensor can be heard again: the state may have jumped, or the sensor's scale."""
     if kind == GNSS_POSITION:
         P[2, 2] += 0.1**2
+        P[15, 15] += 0.3**2
         for i in range(3):
             P[9 + i, 9 + i] += 0.3**2
             P[12 + i, 12 + i] += y[i] * y[i]
@@ -558,6 +602,7 @@ def filter_block(
     dt: Vector,
     kind: NDArray[np.int8],
     mode: NDArray[np.int8],
+    shake: Vector,
     z: Matrix,
     r: Matrix,
     turn_rate: Matrix,
@@ -582,13 +627,12 @@ def filter_block(
 
     Parameters
     ----------
-    dt : [s], time since the event before. kind, mode : see above.
+    dt : [s], time since the event before. kind, mode : see above. shake : noise of v since then, see `predict`.
     z, r : measurement and variances, shape (E, 3); unused entries are 0 and 1.
     turn_rate, force : mean angular velocity and specific force since the event before, shape (E, 3).
     turn_rate_now : angular velocity at the event, shape (E, 3).
     output : row of ``outputs`` that the event fills, or -1.
-    levers : lever arm by kind, shape (8, 3). densities : process noise by mode and decay of s_w, shape (4, 18)
-        [unit²/s], [1/s].
+    levers : lever arm by kind, shape (8, 3). densities : process noise by mode, shape (4, 21), see `predict`.
     gates : threshold of the squared normalised innovation by kind; infinite where there is no gate.
     lock_out : by kind (8, 3): refusals in a row, and seconds since the last accepted one, after which the gate reopens; the seconds
         where no other sensor that tells velocity has been accepted for 2 s.
@@ -604,13 +648,13 @@ def filter_block(
     wanted = 0
     for e in range(first, last):
         if dt[e] > 0.0:
-            predict(x, P, densities[mode[e]], dt[e], turn_rate[e], force[e], mode[e], F, work)
+            predict(x, P, densities[mode[e]], shake[e], dt[e], turn_rate[e], force[e], mode[e], F, work)
             for k in range(silent.size):
                 silent[k] += dt[e]
         k = kind[e]
         hears = False
         if k != PREDICT:
-            bias = 1.0 if mode[e] >= GYRO_TURN else 0.0
+            bias = 1.0 if mode[e] >= GYRO_TURN else -densities[mode[e], SCALED]
             value = _innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
             hears = True
             verdict[e] = ACCEPTED
@@ -635,7 +679,7 @@ def filter_block(
         if keep:
             store_F[row] = F
             store_y[row, 0] = 1.0 if dt[e] > 0.0 else 0.0
-            store_y[row, 1] = 1.0 - dt[e] * densities[mode[e], N]
+            store_y[row, 1] = 1.0 - dt[e] * densities[mode[e], DECAY]
             store_y[row, 2] = 1.0 if hears else 0.0
             if hears:
                 y, Z, _, _, inverse = gain

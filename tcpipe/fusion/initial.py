@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
+from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import integral, interval_means, seconds
-from tcpipe.fusion.timeline import turn_sources
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 _MIN_COURSE_M = 5.0
@@ -76,13 +76,13 @@ def _tilt(
 ) -> tuple[float, float, float]:
     """Roll and pitch [rad] at the start, and their standard deviation."""
     if imu is None or imu.stamp_ns.size == 0:
-        return 0.0, 0.0, 0.15
+        return 0.0, 0.0, 0.2
     stands = standing_ns.size > 0 and standing_ns[0, 0] < start_ns + 2_000_000_000
     end = int(standing_ns[0, 1]) if stands else start_ns + 1_500_000_000
     oriented = np.flatnonzero(np.isfinite(imu.quat_xyzw).all(1) & (imu.stamp_ns >= start_ns) & (imu.stamp_ns <= end))
     own = rpy_from_quat(imu.quat_xyzw[oriented[0]]) if oriented.size else None
     if not imu.accelerometer_usable:
-        return (0.0, 0.0, 0.15) if own is None else (float(own[0]), float(own[1]), 0.05)
+        return (0.0, 0.0, 0.2) if own is None else (float(own[0]), float(own[1]), 0.05)
     stamp_s = seconds(imu.stamp_ns, start_ns)
     span_s = np.array([(standing_ns[0, 0] if stands else start_ns) - start_ns, end - start_ns]) * 1e-9
     fx, fy, fz = interval_means(stamp_s, imu.specific_force_mps2, span_s[:1], span_s[1:])[0]

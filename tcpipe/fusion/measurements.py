@@ -74,6 +74,7 @@ class InertialMeasurements:
     quat_xyzw : shape (N, 4), enu_from_base_link by the unit's own attitude filter; NaN where absent. Yaw may be magnetic or offset.
     gyro_std_radps, accelerometer_std_mps2 : white noise at the unit's rate, one axis.
     accelerometer_usable : False where the specific force is not one (gravity removed, other units): the gyroscope alone is used.
+    accelerometer_noise_mps2 : the same around each sample, shape (N,): vibration comes and goes with the motion; None: the same throughout.
     lever_arm_m : [m], where the specific force is felt; zero once it is moved to base_link, as the error-state filter wants it.
     """
 
@@ -85,6 +86,7 @@ class InertialMeasurements:
     accelerometer_std_mps2: float
     accelerometer_usable: bool = True
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
+    accelerometer_noise_mps2: NDArray[np.float64] | None = None
 
 
 @dataclass(frozen=True, slots=True)

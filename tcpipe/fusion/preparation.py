@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Positions
-from tcpipe.fusion.signals import median_period_ns
+from tcpipe.fusion.signals import median_period_ns, white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate, rotation_vector_from_quat
 
@@ -32,6 +32,7 @@ _MAX_RATE_RADPS = 100.0
 _MAX_FORCE_MPS2 = 1000.0
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _DATUM_FIXES = 10
+_NOISE_WINDOW_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,8 +154,7 @@ def inertial(
     """Prepare an IMU (columns of the role imu): turned into base_link axes, its specific force checked for being one.
 
     The specific force is moved to base_link: what the unit feels beyond base_link, since it sits off it and the robot turns, is taken
-    off. The noise is the one given or, where that is larger, what the samples show: the second difference of white noise has sqrt(6)
-    times its standard deviation, and motion too fast for the unit's rate counts as noise.
+    off. The noise is the one given or, where that is larger, what the samples show: motion too fast for the unit's rate counts as noise.
     """
     rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
@@ -176,9 +176,10 @@ def inertial(
         turn,
         rotate(quat_xyzw, force[usable]) - _lever_acceleration(stamp_ns[usable], turn, np.asarray(xyz_m)),
         product(orientation, inverse(quat_xyzw)),
-        max(gyro_std_radps, _white_noise(rate[usable])),
-        max(accelerometer_std_mps2, _white_noise(force[usable])),
+        max(gyro_std_radps, white_noise(rate[usable])),
+        max(accelerometer_std_mps2, white_noise(force[usable])),
         not remarks,
+        accelerometer_noise_mps2=np.maximum(accelerometer_std_mps2, _local_noise(stamp_ns[usable], force[usable])),
     )
     return made, Prepared(stamp_ns[~good], repeated, 0, remarks)
 
@@ -199,12 +200,17 @@ def _lever_acceleration(
     return acceleration
 
 
-def _white_noise(values: NDArray[np.float64]) -> float:
-    """Estimate the standard deviation of white noise on a signal (N, 3), the largest of its axes; 0 for fewer than three samples."""
+def _local_noise(stamp_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Estimate the white noise over the second around each sample, the largest of the axes, shape (N,)."""
     if values.shape[0] < 3:
-        return 0.0
-    second = np.diff(values, n=2, axis=0)
-    return float(np.sqrt(np.mean(second**2, axis=0) / 6).max())
+        return np.zeros(values.shape[0])
+    half = max(1, round(_NOISE_WINDOW_S * 0.5e9 / median_period_ns(stamp_ns)))
+    total = np.zeros((values.shape[0] - 1, values.shape[1]))
+    np.cumsum(np.diff(values, n=2, axis=0) ** 2 / 6, axis=0, out=total[1:])
+    row = np.arange(values.shape[0]) - 1
+    first, last = np.clip(row - half, 0, len(total) - 1), np.clip(row + half + 1, 0, len(total) - 1)
+    mean = (total[last] - total[first]) / np.maximum(last - first, 1)[:, None]
+    return np.asarray(np.sqrt(np.maximum(mean.max(axis=1), 0.0)))
 
 
 def _matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> NDArray[np.float64]:

@@ -88,3 +88,33 @@ def hold_last(
 def median_period_ns(stamp_ns: NDArray[np.int64]) -> int:
     """Return the median time between samples [ns], at least 1; 1 for fewer than two samples."""
     return max(1, int(np.median(np.diff(stamp_ns)))) if stamp_ns.size > 1 else 1
+
+
+def slopes(stamp_ns: NDArray[np.int64], values: NDArray[np.float64], window_s: float) -> NDArray[np.float64]:
+    """Return the slope [u/s] at each sample of the line through the samples within half a window, shape (N,); 0 where there is one only."""
+    t = seconds(stamp_ns, int(stamp_ns[0]))
+    first = np.searchsorted(t, t - 0.5 * window_s, "left")
+    last = np.searchsorted(t, t + 0.5 * window_s, "right")
+    count = (last - first).astype(np.float64)
+
+    def window(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+        total = np.concatenate(([0.0], np.cumsum(samples)))
+        mean: NDArray[np.float64] = (total[last] - total[first]) / count
+        return mean
+
+    centred = values - values.mean()
+    mean_t = window(t)
+    spread = window(t * t) - mean_t**2
+    covariance = window(t * centred) - mean_t * window(centred)
+    return np.where(spread > 1e-9, covariance / np.maximum(spread, 1e-9), 0.0)
+
+
+def white_noise(values: NDArray[np.float64]) -> float:
+    """Estimate the standard deviation of white noise on a signal (N, k), the largest of its axes; 0 for fewer than three samples.
+
+    The second difference of white noise has sqrt(6) times its standard deviation.
+    """
+    if values.shape[0] < 3:
+        return 0.0
+    second = np.diff(values, n=2, axis=0)
+    return float(np.sqrt(np.mean(second**2, axis=0) / 6).max())

@@ -8,8 +8,8 @@ Constraints are events of our own making:
 
 - sideways and vertical body velocity are about zero (a wheeled robot), folded into the wheels' events, else 10 times a second. The
   error of this constraint (side slip, a lever arm to the turning centre) lasts, so it must not be counted as white at 50 Hz with a
-  small deviation: that locks GNSS out. Its information is that of 0.15 m/s ten times a second, whatever the wheels' rate; so is the
-  wheels' own, whose error, slip, lasts as well.
+  small deviation: that locks GNSS out. Its information is that of 0.15 m/s ten times a second, whatever the wheels' rate; so is that of
+  the wheels themselves, as far as they claim a larger variance than they scatter by: such an error, slip, lasts as well.
 - standing (`tcpipe.fusion.standing`): zero velocity, and the gyroscope shows its bias, five times a second.
 - level, where no accelerometer tells up from down: roll and pitch are small. A slope lasts, so 20° are counted once in four seconds: as 40°
   once a second.
@@ -24,10 +24,14 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import error_state_kernel as kernel
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.process import shake_density, turn_sources
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 
 _MAX_STEP_NS = 50_000_000
 _NONHOLONOMIC_HZ = 10.0
+_MOVING_MPS = 0.05
+_UNSEEN_TURN_RADPS, _UNSEEN_TURN_S = 0.07, 1.0  # roll and pitch of a robot on uneven ground
+_MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _STANDING_NS = 200_000_000
 _STANDING_STD_MPS = 0.01
 _LEVEL_NS = 1_000_000_000
@@ -42,6 +46,7 @@ class Timeline:
     Attributes
     ----------
     stamp_ns : [ns], shape (E,). dt_s : [s], since the event before. kind, mode : see the kernel.
+    shake_m2ps3 : noise density of the velocity, shape (E,), see `tcpipe.fusion.process`.
     value, variance : shape (E, 3); unused entries are 0 and 1.
     turn_rate_radps, force_mps2 : mean over the time since the event before, shape (E, 3).
     turn_rate_now_radps : at the event, shape (E, 3).
@@ -53,6 +58,7 @@ class Timeline:
     dt_s: NDArray[np.float64]
     kind: NDArray[np.int8]
     mode: NDArray[np.int8]
+    shake_m2ps3: NDArray[np.float64]
     value: NDArray[np.float64]
     variance: NDArray[np.float64]
     turn_rate_radps: NDArray[np.float64]
@@ -98,6 +104,7 @@ def build_timeline(
         np.asarray(stamp - before, np.float64) * 1e-9,
         kind,
         mode,
+        shake_density(measurements, stamp, mode),
         np.concatenate([part[2] for part in parts])[order],
         np.concatenate([part[3] for part in parts])[order],
         rate,
@@ -128,17 +135,37 @@ def _measured(measurements: Measurements) -> list[_Part]:
     if wheels is not None and wheels.stamp_ns.size:
         parts.append(_wheels(wheels, measurements.nonholonomic_std_mps))
     if visual is not None and visual.stamp_ns.size:
-        parts.append((visual.stamp_ns, kernel.VISUAL_VELOCITY, visual.velocity_mps, visual.variance_m2ps2))
+        flat = measurements.imu is None and visual.turn_rate_radps is None
+        variance = visual.variance_m2ps2 + (_unseen_turn_variance(visual) if flat else 0.0)
+        parts.append((visual.stamp_ns, kernel.VISUAL_VELOCITY, visual.velocity_mps, variance))
     return parts
 
 
+def _unseen_turn_variance(visual: BodyVelocities) -> NDArray[np.float64]:
+    """Variance [m²/s²], shape (3,), of what a camera off base_link sees of turns that no sensor tells; they last, as the ground does."""
+    rate_hz = 1e9 / median_period_ns(visual.stamp_ns)
+    x, y, z = np.square(visual.lever_arm_m)
+    lasting: NDArray[np.float64] = np.array([z, z, x + y]) * _UNSEEN_TURN_RADPS**2 * max(1.0, rate_hz * _UNSEEN_TURN_S)
+    return lasting
+
+
 def _wheels(wheels: BodyVelocities, nonholonomic_std_mps: float) -> _Part:
+    """Take what the wheels' samples scatter by as white, and what their variance claims beyond that as an error that lasts."""
     rate_hz = 1e9 / median_period_ns(wheels.stamp_ns) if wheels.stamp_ns.size > 1 else _NONHOLONOMIC_HZ
     together = max(1.0, rate_hz / _NONHOLONOMIC_HZ)
     value = np.zeros_like(wheels.velocity_mps)
     variance = np.full_like(value, nonholonomic_std_mps**2 * together)
-    value[:, 0], variance[:, 0] = wheels.velocity_mps[:, 0], wheels.variance_m2ps2[:, 0] * together
+    claimed = wheels.variance_m2ps2[:, 0]
+    white = np.minimum(claimed, _white_variance(wheels.velocity_mps[:, 0]))
+    value[:, 0], variance[:, 0] = wheels.velocity_mps[:, 0], white + (claimed - white) * together
     return wheels.stamp_ns, kernel.WHEEL_VELOCITY, value, variance
+
+
+def _white_variance(velocity_mps: NDArray[np.float64]) -> float:
+    """Estimate the variance of a moving wheel's white noise by the median of squared second differences, which wild ones do not move."""
+    second = np.diff(velocity_mps, n=2)
+    moving = (np.abs(velocity_mps) > _MOVING_MPS)[1:-1]
+    return float(np.median(second[moving] ** 2) / (6 * _MEDIAN_OF_SQUARES)) if moving.sum() > 1 else 0.0
 
 
 def _constraints(measurements: Measurements, standing_ns: NDArray[np.int64], start: int, end: int) -> list[_Part]:
@@ -207,12 +234,6 @@ def _covered(
     """Whether each interval lies among samples without a gap."""
     longest = max(_MIN_INPUT_GAP_NS, 3 * median_period_ns(stamp_ns))
     return ~in_gap(stamp_ns, before_ns, after_ns, longest_ns=longest)
-
-
-def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
-    """Return the odometries with a yaw rate, for where there is no gyroscope: the wheels, which skid, then visual odometry."""
-    sources = (measurements.wheels, measurements.visual)
-    return [source for source in sources if source is not None and np.isfinite(source.yaw_rate_radps).any()]
 
 
 def _odometric_turn_rate(

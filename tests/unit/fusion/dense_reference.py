@@ -20,16 +20,16 @@ def minus(y, x):
     return np.concatenate((turn, y[9:] - x[9:]))
 
 
-def move(x, w, a, dt, mode, decay):  # noqa: PLR0917
+def move(x, w, a, dt, mode, q):  # noqa: PLR0917
     R, v = x[:9].reshape(3, 3), x[15:18]
-    w = w - (x[9:12] if mode >= kernel.GYRO_TURN else 0)
+    w = w - x[9:12] if mode >= kernel.GYRO_TURN else w * (1 - q[19] * x[9:12])
     half = Rotation.from_rotvec(w * dt / 2).as_matrix()
     later = R @ Rotation.from_rotvec(w * dt).as_matrix()
     fall = np.array([0, 0, kernel.GRAVITY_MPS2])
     faster = v + dt * (R @ half @ (a - x[12:15]) - fall) if mode == kernel.INERTIAL else later @ R.T @ v
     y = x.copy()
     y[:9], y[15:18], y[18:21] = later.ravel(), faster, x[18:21] + dt / 2 * (v + faster)
-    y[21] *= 1 - dt * decay
+    y[21] *= 1 - dt * q[17]
     return y
 
 
@@ -53,13 +53,34 @@ def sigma(P):
     return np.vstack((np.zeros(N), root.T, -root.T)), mean_weight, np.concatenate(([2.0], mean_weight[1:]))
 
 
-def predict(x, P, q, dt, w, a, mode):  # noqa: PLR0917
+def predict(x, P, q, shake, dt, w, a, mode):  # noqa: PLR0917
     """Return x⁻, P⁻ and the cross covariance."""
     d, wm, wc = sigma(P)
-    centre = move(x, w, a, dt, mode, q[N])
-    D = np.array([minus(move(plus(x, e), w, a, dt, mode, q[N]), centre) for e in d])
+    centre = move(x, w, a, dt, mode, q)
+    D = np.array([minus(move(plus(x, e), w, a, dt, mode, q), centre) for e in d])
     mean = wm @ D
-    return plus(centre, mean), (D - mean).T * wc @ (D - mean) + np.diag(q[:N] * dt), d.T * wc @ (D - mean)
+    return (
+        plus(centre, mean),
+        (D - mean).T * wc @ (D - mean) + stray(x, centre, q, shake, w, mode) * dt,
+        d.T * wc @ (D - mean),
+    )
+
+
+def stray(x, centre, q, shake, w, mode):  # noqa: PLR0917
+    """Return the noise density of the error."""
+    inertial = mode == kernel.INERTIAL
+    noise = np.diag(q[:N])
+    noise[9:12, 9:12] = 0.0
+    turned = q[:3] + q[18] * np.square(w) + q[20] * np.linalg.norm(x[15:18]) * np.array([1, 1, 0])
+    later, body = centre[:9].reshape(3, 3), x[:9].reshape(3, 3).T @ x[15:18]
+    spread = np.zeros((N, 6))
+    spread[:3, :3] = np.eye(3)
+    spread[9:12, 3:] = np.eye(3) if inertial else later
+    if not inertial:  # what is kept in the body turns with it
+        spread[9:12, :3] = later @ np.cross(np.eye(3), body).T
+    noise[:3, :3] = 0.0
+    slides = [shake] * 3 if inertial else [shake, q[10] + q[9] * shake, q[11]]
+    return noise + spread @ np.diag(np.concatenate((turned, slides))) @ spread.T
 
 
 def update(kind, x, P, z, r, w, lever):  # noqa: PLR0917
@@ -92,9 +113,8 @@ def filter_and_smooth(timeline, densities, levers, x, P):
         C = P
         if timeline.dt_s[e] > 0:
             mode = timeline.mode[e]
-            x, P, C = predict(
-                x, P, densities[mode], timeline.dt_s[e], timeline.turn_rate_radps[e], timeline.force_mps2[e], mode
-            )
+            turn, force = timeline.turn_rate_radps[e], timeline.force_mps2[e]
+            x, P, C = predict(x, P, densities[mode], timeline.shake_m2ps3[e], timeline.dt_s[e], turn, force, mode)
         before.append((x, P, C))
         x_before = x
         kind = int(timeline.kind[e])

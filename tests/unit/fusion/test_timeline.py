@@ -1,5 +1,7 @@
 """The order of events, and what lies between them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from unit.fusion import drive
@@ -60,15 +62,20 @@ def test_a_gap_of_the_imu_changes_the_process_there_only():
     assert (timeline.mode[~hole] == kernel.INERTIAL).all()
 
 
-def test_the_constraint_carries_the_same_information_at_any_rate_of_the_wheels():
+def test_the_constraint_and_a_lasting_error_carry_the_same_information_at_any_rate_of_the_wheels():
     truth = drive.make_drive(20.0)
     measurements = drive.measure(truth, 6)
-    timeline = build_timeline(measurements, NOBODY, drive.ns(np.arange(1.0, 19.0)))
+    smooth = measurements.wheels.velocity_mps.copy()
+    smooth[:, 0] = 1.0  # scatters by nothing of what its variance claims
+    lasting = replace(measurements, wheels=replace(measurements.wheels, velocity_mps=smooth))
+    timeline = build_timeline(lasting, NOBODY, drive.ns(np.arange(1.0, 19.0)))
     wheels = timeline.kind == kernel.WHEEL_VELOCITY
     rate_hz = wheels.sum() / 20.0
     assert np.sum(1 / timeline.variance[wheels, 1]) / 20.0 == pytest.approx(10.0 / 0.15**2, rel=0.02)
     assert np.sum(1 / timeline.variance[wheels, 0]) / 20.0 == pytest.approx(10.0 / 0.03**2, rel=0.02)
     assert rate_hz == pytest.approx(50.0, abs=1)
+    scattering = build_timeline(measurements, NOBODY, drive.ns(np.arange(1.0, 19.0)))
+    assert np.sum(1 / scattering.variance[wheels, 0]) / 20.0 == pytest.approx(50.0 / 0.03**2, rel=0.15)
     assert not (timeline.kind == kernel.SIDEWAYS).any()
 
 

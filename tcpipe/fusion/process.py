@@ -1,0 +1,173 @@
+"""How far the robot strays from what the process holds: noise densities, most of them read from the sensors themselves.
+
+White noise of standard deviation s at f Hz has the density s²/f. What of it changes along the drive is one number an event, the *shake*:
+with an accelerometer its noise, which vibration multiplies while the robot moves; without one, where the body velocity is held, how
+fast the forward velocity changes there, since a robot that is taken to brake all the time is one of which nothing is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.signals import in_gap, median_period_ns, seconds, slopes, white_noise
+
+WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
+VISUAL_SCALE_STD = 0.05
+_WHEEL_SCALE_TIME_S = 30.0
+_WHEEL_TURN_SCALE_STD, _VISUAL_TURN_SCALE_STD = 0.2, 0.03
+_TURN_SCALE_TIME_S = 60.0
+_GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
+_ACCELERATION_WINDOW_S = 0.6
+_SLIDE_WINDOW_S = 1.0
+_ACCELERATION_LASTS_S = 0.05
+_DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
+_MAX_GAP_NS = 300_000_000
+_STEADY = 1e-4  # m²/s³
+_SLIDE = 1e-4
+_UNSEEN_SLIDE = 4e-4
+_FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3
+_UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
+
+
+def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
+    """Return the odometries with a yaw rate, for where there is no gyroscope: the wheels, which skid, then visual odometry."""
+    sources = (measurements.wheels, measurements.visual)
+    return [source for source in sources if source is not None and np.isfinite(source.yaw_rate_radps).any()]
+
+
+def turn_scale_std(measurements: Measurements) -> float:
+    """Return how far the scale of the turn rate may be off where an odometry tells it; 0 where a gyroscope does, or nothing."""
+    if measurements.imu is not None:
+        return 0.0
+    sources = turn_sources(measurements)
+    if not sources:
+        return 0.0
+    return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
+
+
+def process_noise(measurements: Measurements) -> NDArray[np.float64]:
+    """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.error_state_kernel.predict` takes it.
+
+    Somewhat more than the IMU's white noise stands for its scale and alignment errors. Biases and scales wander: their densities are
+    what such sensors do in a second. Slip comes and goes, so the wheels' scale returns to one; where only the wheels and the camera
+    tell speed, neither is known to be right on average, and it wanders freely.
+    """
+    density = np.zeros((4, kernel.N + 4))
+    density[:, 0:3] = _DRIFT
+    density[:, 3:6] = (1e-4) ** 2
+    density[:, 6:9] = (1.5e-3) ** 2  # a milli-g or two in a minute, as uncooled MEMS units drift
+    density[:, 10:12] = _slides(measurements.visual)
+    density[:, kernel.SLIDING] = measurements.visual is None and measurements.wheels is None
+    density[: kernel.GYRO_TURN, kernel.GROUND] = _GROUND
+    density[:, 12:15] = 1e-8
+    density[:, 15] = 2 * WHEEL_SCALE_STD**2 / _WHEEL_SCALE_TIME_S
+    density[:, 16] = 0.002**2
+    drifts = measurements.gnss is None and measurements.visual is not None
+    density[:, kernel.DECAY] = 0.0 if drifts else 1 / _WHEEL_SCALE_TIME_S
+    _odometric_turns(measurements, density)
+    imu = measurements.imu
+    if imu is not None:
+        rate_hz = 1e9 / median_period_ns(imu.stamp_ns)
+        density[kernel.GYRO_TURN :, 0:3] = 1.5 * imu.gyro_std_radps**2 / rate_hz + 1e-8
+    else:
+        density[:, 3:6] = 2 * turn_scale_std(measurements) ** 2 / _TURN_SCALE_TIME_S
+    return density
+
+
+def _odometric_turns(measurements: Measurements, density: NDArray[np.float64]) -> None:
+    """Fill in the noise of turning where an odometry, or nothing, tells how the robot turns."""
+    sources = turn_sources(measurements)
+    if not sources:
+        density[kernel.FLAT_TURN, 2] = 0.02
+    for source in sources:
+        visual = source is measurements.visual
+        rows = [kernel.VISUAL_TURN] if visual else [kernel.FLAT_TURN]
+        known = np.isfinite(source.yaw_rate_radps)
+        rate_hz = 1e9 / median_period_ns(source.stamp_ns[known])
+        turns = source.yaw_rate_radps[known, None] if source.turn_rate_radps is None else source.turn_rate_radps[known]
+        density[rows, 0 if turns.shape[1] == 3 else 2 : 3] = 1.1 * white_noise(turns) ** 2 / rate_hz + _DRIFT
+        if turns.shape[1] == 3:
+            density[rows, kernel.GROUND] = 0.0
+        best = measurements.imu is None and source is sources[-1]
+        density[rows, kernel.SCALED] = best
+        # The scale is off by this share for a second at a time, beside what is constant of it.
+        density[rows, kernel.TURNING] = (0.02 if visual else 0.1 if best else 0.3) ** 2
+
+
+def shake_density(
+    measurements: Measurements, stamp_ns: NDArray[np.int64], mode: NDArray[np.int8]
+) -> NDArray[np.float64]:
+    """Return the noise density of the velocity at each event [m²/s³], shape (E,), for its process mode."""
+    imu = measurements.imu
+    shake = np.full(stamp_ns.size, np.nan)
+    inertial = mode == kernel.INERTIAL
+    if imu is not None and inertial.any():
+        shake[inertial] = _accelerometer_density(imu)(stamp_ns[inertial])
+    if not inertial.all():
+        shake[~inertial] = _held_density(measurements)(stamp_ns[~inertial])
+    return shake
+
+
+_Density = Callable[[NDArray[np.int64]], NDArray[np.float64]]
+
+
+def _accelerometer_density(imu: InertialMeasurements) -> _Density:
+    rate_hz = 1e9 / median_period_ns(imu.stamp_ns)
+    noise = imu.accelerometer_noise_mps2
+    density = np.square(np.full(imu.stamp_ns.size, imu.accelerometer_std_mps2) if noise is None else noise)
+    density = density / rate_hz + 1e-6
+    return lambda at_ns: _interpolated(imu.stamp_ns, density, at_ns)
+
+
+def _held_density(measurements: Measurements) -> _Density:
+    """Without an accelerometer: the square of the acceleration around an event, times how long it lasts.
+
+    Where two odometries differ, the one that shows the least of it is right: wheels that dig in show much.
+    """
+    sources = [s for s in (measurements.wheels, measurements.visual) if s is not None and s.stamp_ns.size > 2]
+    slope = [slopes(s.stamp_ns, s.velocity_mps[:, 0], _ACCELERATION_WINDOW_S) for s in sources]
+    unknown = _unseen_density(None if sources else measurements.gnss)
+
+    def density(at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+        found = np.full(at_ns.size, np.nan)
+        for source, acceleration in zip(sources, slope, strict=True):
+            covered = ~in_gap(source.stamp_ns, at_ns, at_ns, longest_ns=_MAX_GAP_NS)
+            shown = _interpolated(source.stamp_ns, np.abs(acceleration), at_ns[covered])
+            found[covered] = np.fmin(found[covered], shown)
+        return np.where(np.isnan(found), unknown(at_ns), _STEADY + _ACCELERATION_LASTS_S * found**2)
+
+    return density
+
+
+def _unseen_density(gnss: Positions | None) -> _Density:
+    """Without odometry: the square of the acceleration of the fixes, over a second or five of them; else what is usual."""
+    if gnss is None or gnss.stamp_ns.size < _FIXES:
+        return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
+    window_s = max(_FIX_WINDOW_S, _FIXES * 1e-9 * median_period_ns(gnss.stamp_ns))
+    found = np.zeros(gnss.stamp_ns.size)
+    for axis in range(2):
+        velocity = slopes(gnss.stamp_ns, gnss.position_enu_m[:, axis], window_s)
+        found += np.square(slopes(gnss.stamp_ns, velocity, window_s))
+    density = np.minimum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, _UNKNOWN)
+    stamp_ns = gnss.stamp_ns
+    return lambda at_ns: _interpolated(stamp_ns, density, at_ns)
+
+
+def _interpolated(
+    stamp_ns: NDArray[np.int64], values: NDArray[np.float64], at_ns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    zero = int(stamp_ns[0])
+    return np.interp(seconds(at_ns, zero), seconds(stamp_ns, zero), values)
+
+
+def _slides(visual: BodyVelocities | None) -> float:
+    """Return how fast a body that is held to drive straight comes to slide [m²/s³]: as visual odometry shows it, or a guess."""
+    if visual is None or visual.stamp_ns.size < 3:
+        return _UNSEEN_SLIDE
+    shown = [slopes(visual.stamp_ns, visual.velocity_mps[:, axis], _SLIDE_WINDOW_S) for axis in (1, 2)]
+    return max(_SLIDE, _ACCELERATION_LASTS_S * float(np.median(np.square(shown)) / 0.4549))
