@@ -29,6 +29,7 @@ from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
 from tcpipe.cli.process import Ended, prepare_process
 from tcpipe.cli.report import report
+from tcpipe.cli.reproduce import reproduce
 from tcpipe.cli.schemas import schemas
 from tcpipe.cli.simulate import simulate
 from tcpipe.cli.train import train
@@ -69,6 +70,7 @@ for command in (
     build_dataset,
     train,
     evaluate,
+    reproduce,
     predict_path,
     cost_map,
     plan_path,

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from tcpipe import __version__
-from tcpipe.dataset import Dataset, open_dataset
+from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.formats.json_files import plain
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.metrics import ALL, LEAST, Errors, combined, errors, errors_by_class, label_floor, mean_of_draws
+from tcpipe.learning.metrics import (
+    ALL,
+    LEAST,
+    Array,
+    Errors,
+    combined,
+    errors,
+    errors_by_class,
+    label_floor,
+    mean_of_draws,
+)
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs
-from tcpipe.learning.training import Variant, dataset_checksum, train
+from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
 from tcpipe.logs.profiles import GENERIC, ROBOTS
 
 logger = logging.getLogger("tcpipe")
@@ -40,6 +50,9 @@ OURS, GRASS_ONLY, PER_CLASS, EXPECTED = (
     "expected time",
 )
 
+_MORE_EPOCHS = 2.0
+"""A network of fewer samples takes fewer steps in an epoch, and gets up to so many times more of them."""
+
 _FEWEST = 20
 """Samples of a class in train that a network of its own needs."""
 
@@ -60,20 +73,20 @@ class EvaluateConfig:
     """Patches a class in the pictures."""
 
 
-@dataclass(frozen=True, slots=True)
-class Evaluation:
-    """Everything that was found, as JSON values, and what the pictures show."""
-
-    values: dict[str, Any]
-    plots: Mapping[str, Mapping[str, Any]]
-
+PlantCosts = Callable[[Split], dict[str, Array]]
+"""Costs of samples by a predictor that knows how they were simulated."""
 
 Sets = dict[str, Measured]
 Trained = Callable[[str, Variant], Model]
 
 
-def evaluate(model: str | Path, dataset: str | Path, out: Path, config: EvaluateConfig) -> Evaluation:
-    """Measure a model on a dataset; networks that it needs beside it are trained into ``out`` and kept there.
+def evaluate(
+    model: str | Path, dataset: str | Path, out: Path, config: EvaluateConfig, *, plant: PlantCosts | None = None
+) -> dict[str, Any]:
+    """Measure a model on a dataset and return everything that was found, as JSON values.
+
+    Networks that it needs beside it are trained into ``out`` and kept there. ``plant`` is the best that can be predicted where the
+    samples were simulated.
 
     Raises
     ------
@@ -92,7 +105,9 @@ def evaluate(model: str | Path, dataset: str | Path, out: Path, config: Evaluate
 
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
-        train(dataset, place, config=fitting, variant=variant)
+        few = len(training_task(data, fitting.fold, variant).fit)
+        longer = min(_MORE_EPOCHS, ours.card.training["samples"]["fitted"] / few)
+        train(dataset, place, config=replace(fitting, epochs=round(longer * fitting.epochs)), variant=variant)
         return load_model(place)
 
     values = {
@@ -102,26 +117,29 @@ def evaluate(model: str | Path, dataset: str | Path, out: Path, config: Evaluate
         "model": {"name": ours.name, "checksum": ours.checksum, "training": ours.card.training},
         "dataset": {"name": data.card["name"], "sha256": dataset_checksum(data.card), "samples": data.card["splits"]},
         "config": asdict(config),
-        "splits": {name: _split_values(found, said[name]) for name, found in sets.items()},
+        "splits": {name: _split_values(found, said[name], plant) for name, found in sets.items()},
         "ablation": list(_ablation(ours, sets, config, trained)),
         "energy": _energy(ours, data, sets, said, trained if config.baselines else None),
         "time": _time(ours, sets, said),
         "repeatability": data.card.get("repeatability"),
         "warnings": _warnings(ours, data, sets),
+        "plots": {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
     }
-    plots = {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()}
-    return Evaluation(plain(values), plots)
+    return dict(plain(values))
 
 
-def _split_values(found: Measured, said: Mapping[str, Any]) -> dict[str, Any]:
-    """Return tables I and II of one split, and what its labels' deviations allow."""
+def _split_values(found: Measured, said: Mapping[str, Any], plant: PlantCosts | None) -> dict[str, Any]:
+    """Return tables I and II of one split, and what its labels' deviations, or the simulator, allow."""
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
-    return {
+    values = {
         "samples": len(found.split),
         "classes": counts,
         "errors": errors_by_class(said, found.costs, found.class_ids, found.names),
         "label_floor": label_floor(found.deviations, found.costs, found.class_ids, found.names),
     }
+    if plant is not None:
+        values["simulation_floor"] = errors_by_class(plant(found.split), found.costs, found.class_ids, found.names)
+    return values
 
 
 def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained) -> Iterator[dict[str, Any]]:

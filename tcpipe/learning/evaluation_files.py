@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from tcpipe import __version__
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import write_text
-from tcpipe.formats.json_files import write_json
-from tcpipe.learning.evaluation import NETWORKS, EvaluateConfig, Evaluation, evaluate
+from tcpipe.formats.dataset_files import read_card
+from tcpipe.formats.json_files import digest, read_json, write_json
+from tcpipe.learning.evaluation import NETWORKS, EvaluateConfig, PlantCosts, evaluate
 from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows
 from tcpipe.learning.metrics import ALL, QUANTITIES
-from tcpipe.report.page import Section
+from tcpipe.learning.models import read_model_card
+from tcpipe.learning.training import dataset_checksum
+
+SIMULATED = "The data are simulated: what can be compared with the paper is the pattern, not the figures."
 
 JSON, CSV, PAGE = "evaluation.json", "evaluation.csv", "evaluation.html"
 
@@ -40,9 +44,16 @@ class EvaluationResult:
 
 
 def run_evaluation(
-    model: str | Path, dataset: str | Path, out: str | Path = "evaluation", *, config: EvaluateConfig | None = None
+    model: str | Path,
+    dataset: str | Path,
+    out: str | Path = "evaluation",
+    *,
+    config: EvaluateConfig | None = None,
+    plant: PlantCosts | None = None,
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
+
+    Where the same evaluation is already, only its table and page are written again.
 
     Raises
     ------
@@ -58,27 +69,31 @@ def run_evaluation(
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
         raise UsageError(f"{place}: exists and is no evaluation; it is left alone; give another OUT")
-    found = evaluate(model, dataset, place, config or EvaluateConfig())
-    name = found.values["dataset"]["name"]
+    rules = config or EvaluateConfig()
+    key = _key(model, dataset, rules, simulated=plant is not None)
+    if (place / JSON).is_file() and (known := read_json(place / JSON)).get("key") == key:
+        values = known
+    else:
+        values = {**evaluate(model, dataset, place, rules, plant=plant), "key": key}
+    name = values["dataset"]["name"]
     lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E, beside the paper's."
-    write_evaluation(place, found, title=f"Evaluation on {name}", lead=lead)
-    return EvaluationResult(place, found.values)
-
-
-def write_evaluation(
-    place: Path,
-    found: Evaluation,
-    *,
-    title: str,
-    lead: str,
-    before: Sequence[Section] = (),
-    warnings: Sequence[str] = (),
-) -> None:
-    """Write the three files."""
+    warnings = [SIMULATED] if plant is not None else []
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(evaluation_rows(found.values))
-    write_json(place / JSON, found.values)
+    writer.writerows([COLUMNS, *evaluation_rows(values)])
+    write_json(place / JSON, values)
     write_text(place / CSV, table.getvalue())
-    write_text(place / PAGE, evaluation_page(found, title=title, lead=lead, before=before, warnings=warnings))
+    write_text(place / PAGE, evaluation_page(values, title=f"Evaluation on {name}", lead=lead, warnings=warnings))
+    return EvaluationResult(place, values)
+
+
+def _key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
+    """Return what tells one evaluation from another."""
+    told = [
+        read_model_card(Path(model)),
+        dataset_checksum(read_card(Path(dataset))),
+        asdict(config),
+        simulated,
+        __version__,
+    ]
+    return digest(told)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.evaluation import SPLITS, Evaluation
+from tcpipe.learning.evaluation import SPLITS
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.prediction_figures import predictions_by_patch
@@ -22,11 +22,10 @@ _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"
 
 
 def evaluation_page(
-    found: Evaluation, *, title: str, lead: str, before: Sequence[Section] = (), warnings: Sequence[str] = ()
+    values: Mapping[str, Any], *, title: str, lead: str, before: Sequence[Section] = (), warnings: Sequence[str] = ()
 ) -> str:
-    """Return the HTML page; ``before`` and ``warnings`` come first."""
-    values = found.values
-    sections = [*before, *_by_class(values), _ablation(values), _energy(values), _time(values), *_pictures(found)]
+    """Return the HTML page of what `evaluate` found; ``before`` and ``warnings`` come first."""
+    sections = [*before, *_by_class(values), _ablation(values), _energy(values), _time(values), *_pictures(values)]
     return render_page(
         title=title,
         lead=lead,
@@ -145,7 +144,7 @@ def _ablation(values: Mapping[str, Any]) -> Section:
                 rows.append(("", "", "the paper", *(_paper_figure(value) for value in told)))
     header = ("layers", "", "", *(f"{q} {MEASURES[m]} [{_unit(m, q)}]" for q, m in paper.ABLATION_COLUMNS))
     draws = values["config"]["draws"]
-    text = f"Layers that are not named are replaced by noise in the trained network; mean of {draws} draws. Retrained: a network that never had them."
+    text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them."
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
 
 
@@ -176,12 +175,12 @@ def _time(values: Mapping[str, Any]) -> Section:
     return _compared("Table V: time against the expected time", text, values["time"], paper.TIME, "T")
 
 
-def _pictures(found: Evaluation) -> list[Section]:
+def _pictures(values: Mapping[str, Any]) -> list[Section]:
     """Return the paper's pictures: E of test samples and T of the unseen area, each with its error."""
     sections = []
     for split, quantity, label in (("test", "E", "energy E [J]"), ("unseen", "T", "time T [s]")):
-        if split in found.plots:
-            plot = found.plots[split]
+        if split in values["plots"]:
+            plot = values["plots"][split]
             svg = predictions_by_patch(
                 np.asarray(plot[f"{quantity}_measured"]),
                 np.asarray(plot[f"{quantity}_predicted"]),

@@ -243,5 +243,5 @@ def _power(
         slope_rad=slope,
         rolling_resistance=rolling * (1.0 + robot.resistance_noise * noise),
     )
-    voltage, current = robot.battery(robot.propulsion_watt(wheel_power), dt_s=_DT_S)
+    voltage, current = robot.battery(robot.propulsion_watt(wheel_power, driven.wheel_mps), dt_s=_DT_S)
     return voltage, current, 0.5 + 0.15 * np.tanh(yaw_rate)

@@ -58,6 +58,8 @@ class Robot:
     """Turning in place."""
     drive_efficiency: float = 0.72
     regeneration_efficiency: float = 0.55
+    drivetrain_loss_newton: float = 0.0
+    """Friction of motors and gears, as a force on the ground: paid at any grade, never given back."""
     idle_watt: float = 14.0
     """Both motor drivers at rest; part of the propulsion current."""
     electronics_watt: float = 38.0
@@ -109,11 +111,14 @@ class Robot:
         scrub = self.scrub_torque_nm * np.abs(yaw_rate_radps) / (1.0 + radius_m / 0.4)
         return force * wheel_velocity_mps + scrub
 
-    def propulsion_watt(self, wheel_power_watt: Float) -> Float:
+    def propulsion_watt(self, wheel_power_watt: Float, wheel_velocity_mps: Float) -> Float:
         """Return the electrical power of both motor drivers [W], negative when they give back."""
         driving = wheel_power_watt > 0.0
-        return self.idle_watt + wheel_power_watt * np.where(
-            driving, 1.0 / self.drive_efficiency, self.regeneration_efficiency
+        friction = self.drivetrain_loss_newton * np.abs(wheel_velocity_mps) / self.drive_efficiency
+        return (
+            self.idle_watt
+            + friction
+            + wheel_power_watt * np.where(driving, 1.0 / self.drive_efficiency, self.regeneration_efficiency)
         )
 
     def battery(self, propulsion_watt: Float, *, dt_s: float) -> tuple[Float, Float]:

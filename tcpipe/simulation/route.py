@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from tcpipe.simulation.site import Float
-from tcpipe.simulation.world import GRASS, World
+from tcpipe.simulation.world import GRASS, Band, World
 
 PATH_GRID_M = 0.01
 _SMOOTH_M = 0.5
@@ -146,6 +146,51 @@ def _wrapped(angle_rad: Float) -> Float:
 
 
 @dataclass(frozen=True, slots=True)
+class AlongRoad:
+    """To and fro along a road, each time on another line of it."""
+
+    road: Band
+    from_m: float
+    """Along the road's axis, from its (x, y)."""
+    to_m: float
+    length_m: float
+    """About how far to drive."""
+
+    _STEP_M = 9.0
+    _LEG_STEPS = 6
+    _VERGE_M = 1.3
+
+    @property
+    def start_m(self) -> tuple[float, float]:
+        """Where it begins, from the site's south-west corner."""
+        return self._place(self.from_m, 0.0)
+
+    def plan(self, world: World, rng: np.random.Generator) -> list[Manoeuvre]:  # noqa: ARG002  as other tours
+        """Return the manoeuvres; the same generator state gives the same plan."""
+        plan: list[Manoeuvre] = [Pause(3.0)]
+        reach = max(self.road.width_m / 2.0 - self._VERGE_M, 0.0)
+        marks = np.arange(self.from_m, self.to_m, self._STEP_M)
+        driven, back = 0.0, False
+        while driven < self.length_m:
+            aside = float(rng.uniform(-reach, reach))
+            line = [self._place(float(at), aside) for at in (marks[::-1] if back else marks)]
+            for first in range(1, len(line), self._LEG_STEPS):
+                plan.append(Leg(tuple(line[first : first + self._LEG_STEPS])))
+                plan.append(Pause(float(rng.uniform(0.6, 2.5))))
+                driven += self._STEP_M * len(line[first : first + self._LEG_STEPS])
+                if driven >= self.length_m:
+                    break
+            back = not back
+        return plan
+
+    def _place(self, along_m: float, aside_m: float) -> tuple[float, float]:
+        road = self.road
+        across = aside_m + road.amplitude_m * np.sin(2.0 * np.pi / road.wavelength_m * along_m + road.phase_rad)
+        c, s = np.cos(road.direction_rad), np.sin(road.direction_rad)
+        return float(road.x_m + c * along_m - s * across), float(road.y_m + s * along_m + c * across)
+
+
+@dataclass(frozen=True, slots=True)
 class Wander:
     """A random tour that stays on traversable ground and steers towards wanted shares of terrain classes."""
 
@@ -155,6 +200,8 @@ class Wander:
     """From the site's south-west corner."""
     shares: tuple[tuple[int, float], ...] = ((4, 0.51), (5, 0.09), (6, 0.20), (7, 0.20))
     """Wanted share of the way by class id (the paper's by default)."""
+    x_range_m: tuple[float, float] | None = None
+    """Kept between these, from the site's west border; None: the whole site."""
     margin_m: float = 5.0
     """Kept from the site's border."""
     max_slope_deg: float = 22.5
@@ -222,7 +269,8 @@ class Wander:
     def _allowed(self, world: World, u: Float, v: Float) -> tuple[NDArray[np.bool_], NDArray[np.uint8], Float]:
         """Return which lines may be driven, the classes along them, and how steep they are on the whole (1: the steepest allowed)."""
         site, margin = world.site, self.margin_m
-        inside = (u > margin) & (u < site.width_m - margin) & (v > margin) & (v < site.height_m - margin)
+        west, east = self.x_range_m or (margin, site.width_m - margin)
+        inside = (u > west) & (u < east) & (v > margin) & (v < site.height_m - margin)
         x, y = u + site.west_m, v + site.south_m
         steepness = np.hypot(*world.gradient(x, y)) / np.tan(np.radians(self.max_slope_deg))
         classes = world.terrain_class(x, y)

@@ -11,11 +11,12 @@ import numpy as np
 from tcpipe.errors import UsageError
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.messages import Recorder
+from tcpipe.simulation.paper_site import paper_site
 from tcpipe.simulation.robot import Robot
-from tcpipe.simulation.route import Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
+from tcpipe.simulation.route import AlongRoad, Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
 from tcpipe.simulation.sensors import Imu, Sensors, Visual
 from tcpipe.simulation.site import Site
-from tcpipe.simulation.world import MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, Wave, World
+from tcpipe.simulation.world import MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, World, waves
 
 HUSKY_ROS2 = Recorder("ros2", "clearpath_power")
 HUSKY_ROS1 = Recorder("ros1", "husky_status")
@@ -34,7 +35,7 @@ class DriveSpec:
     """One drive: where it goes, what records it, what is wrong with that."""
 
     name: str
-    plan: tuple[Manoeuvre, ...] | Wander
+    plan: tuple[Manoeuvre, ...] | Wander | AlongRoad
     start_m: tuple[float, float]
     """From the site's south-west corner."""
     container: Container = "mcap"
@@ -74,21 +75,6 @@ class Scenario:
         return _FIRST_START_NS + drive * _BETWEEN_DRIVES_NS
 
 
-def waves(seed: int, *, count: int, total: float, wavelength_m: tuple[float, float]) -> tuple[Wave, ...]:
-    """Return plane waves of random direction and phase, log-uniform wavelength, and amplitudes that sum in square to ``total``²."""
-    rng = np.random.default_rng(seed)
-    amplitude = total * np.sqrt(2.0 / count)
-    return tuple(
-        Wave(
-            amplitude,
-            float(np.exp(rng.uniform(*np.log(wavelength_m)))),
-            float(rng.uniform(0.0, np.pi)),
-            float(rng.uniform(0.0, 2.0 * np.pi)),
-        )
-        for _ in range(count)
-    )
-
-
 def small_world(site: Site | None = None) -> World:
     """Return 120 m × 80 m with three hills of up to 22.5°, two roads, mud, trees, and a hole in the rasters."""
     return World(
@@ -119,105 +105,32 @@ def small_world(site: Site | None = None) -> World:
     )
 
 
-_PAPER_ROADS = (
-    Band(UNPAVED, 150.0, 150.0, 1.40, 4.2, 9.0, 170.0, 0.4),
-    Band(UNPAVED, 300.0, 215.0, 0.06, 4.2, 12.0, 230.0, 2.0),
-    Band(UNPAVED, 470.0, 150.0, 1.75, 4.2, 8.0, 150.0, 1.1),
-    Band(PAVED, 300.0, 95.0, -0.04, 5.0, 14.0, 260.0, 0.0),
-    Band(PAVED, 330.0, 150.0, 1.25, 5.0, 10.0, 210.0, 2.6),
-)
-
-
-def paper_world() -> World:
-    """Return a site as large, as high and as steep as the paper's (section IV-A): 596 m × 305 m, 574.8 m to 661.3 m above sea level.
-
-    Its shape is made up: a long slope with knolls, two paved and three unpaved roads, mud in the hollows, trees and hedges.
-    """
-    rng = np.random.default_rng(2024)
-    site = Site(west_m=697300.0, south_m=5208300.0, width_m=596.0, height_m=305.0)
-    slope = (Hill(420.0, 210.0, 60.0, 170.0, 130.0), Hill(120.0, 60.0, -16.0, 120.0, 80.0))
-    knolls = tuple(
-        Hill(x, y, float(rng.uniform(3.0, 7.5)), x_sigma, y_sigma)
-        for x, y, x_sigma, y_sigma, _ in _scattered(rng, 26, size_m=(14.0, 26.0), margin_m=25.0)
-    )
-    mud = tuple(Ellipse(MUD, *place) for place in _scattered(rng, 26, size_m=(5.0, 13.0), margin_m=25.0))
-    hedges = tuple(Ellipse(VEGETATION, *place) for place in _scattered(rng, 16, size_m=(3.0, 14.0)))
-    trees = tuple(Ellipse(TREE, *place) for place in _scattered(rng, 30, size_m=(1.5, 4.5)))
-    world = World(
-        site,
-        base_m=600.0,
-        hills=slope + knolls,
-        waves=waves(21, count=6, total=0.12, wavelength_m=(9.0, 24.0)),
-        regions=(
-            *mud,
-            *_PAPER_ROADS,
-            *hedges,
-            *trees,
-            Ellipse(OBSTACLE, 60.0, 245.0, 9.0, 6.0, 0.3),
-            Ellipse(OBSTACLE, 520.0, 40.0, 7.0, 5.0),
-        ),
-        holes=(
-            Ellipse(0, 0.0, 305.0, 70.0, 40.0),
-            Ellipse(0, 596.0, 0.0, 60.0, 35.0),
-            Ellipse(0, 250.0, 60.0, 3.0, 2.0),
-        ),
-        texture=waves(22, count=12, total=0.05, wavelength_m=(0.8, 6.0)),
-        resistance=waves(23, count=10, total=0.03, wavelength_m=(1.5, 15.0)),
-    )
-    return _stretched(world, 574.8, 661.3)
-
-
-def _scattered(
-    rng: np.random.Generator, count: int, *, size_m: tuple[float, float], margin_m: float = 0.0
-) -> list[tuple[float, float, float, float, float]]:
-    """Return random places on the paper's site: x, y, two radii [m], rotation [rad]."""
-    low, high = (
-        (margin_m, margin_m, *[size_m[0]] * 2, 0.0),
-        (596.0 - margin_m, 305.0 - margin_m, *[size_m[1]] * 2, np.pi),
-    )
-    drawn = rng.uniform(low, high, (count, 5)).tolist()
-    return [(x, y, x_radius, y_radius, rotation) for x, y, x_radius, y_radius, rotation in drawn]
-
-
-def _stretched(world: World, lowest_m: float, highest_m: float) -> World:
-    """Scale and shift the heights so that they span the given range (on a 1 m grid)."""
-    x = world.site.west_m + np.arange(0.5, world.site.width_m)
-    y = world.site.south_m + np.arange(0.5, world.site.height_m)
-    heights = world.height_m(x[None, :], y[:, None]) - world.base_m
-    factor = (highest_m - lowest_m) / float(heights.max() - heights.min())
-    return replace(
-        world,
-        base_m=lowest_m - factor * float(heights.min()),
-        hills=tuple(replace(hill, height_m=factor * hill.height_m) for hill in world.hills),
-        waves=tuple(replace(wave, amplitude=factor * wave.amplitude) for wave in world.waves),
-    )
-
-
 def _paper() -> Scenario:
-    """Eleven drives of 1.2 km, mcap and bag in turn, over the paper's site; 60 % of it to train and test in."""
-    world, sensors = paper_world(), Sensors()
-    starts = (
-        (40, 40),
-        (90, 150),
-        (200, 120),
-        (240, 250),
-        (310, 60),
-        (350, 180),
-        (380, 260),
-        (430, 90),
-        (470, 190),
-        (540, 150),
-        (560, 260),
-    )
+    """Drives over the paper's site, mcap and bag in turn; its western part is to train and test in."""
+    site = paper_site()
     drives = tuple(
         DriveSpec(
-            f"paper_{number:02d}", Wander(1200.0, start, climbing=0.1), start, "mcap" if number % 2 else "bag",
-            HUSKY_ROS2 if number % 2 else HUSKY_ROS1, sensors, Faults.every(),
+            f"paper_{number:02d}", tour, tour.start_m, "mcap" if number % 2 else "bag",
+            HUSKY_ROS2 if number % 2 else HUSKY_ROS1, site.sensors, Faults.every(), site.robot,
+        )
+        for number, tour in enumerate(site.tours, 1)
+    )  # fmt: skip
+    region = ((1.0, 1.0), (398.0, 1.0), (386.0, 120.0), (412.0, 200.0), (396.0, 304.0), (1.0, 304.0))
+    return Scenario("paper", site.world, drives, region)
+
+
+def _paper_quick() -> Scenario:
+    """Return the paper's robot and sensors on the small world for some minutes, with coarse rasters: to see everything run."""
+    site = paper_site()
+    starts = ((14.0, 34.0), (40.0, 60.0), (110.0, 30.0))
+    drives = tuple(
+        DriveSpec(
+            f"quick_{number}", Wander(190.0, start, odd_manoeuvres=False), start, "mcap", HUSKY_ROS2, site.sensors,
+            Faults.only("gnss_noise", "wheel_slip", "wheel_noise", "imu_noise", "visual_noise", "power_noise"), site.robot,
         )
         for number, start in enumerate(starts, 1)
     )  # fmt: skip
-    region = ((1.0, 1.0), (398.0, 1.0), (386.0, 120.0), (412.0, 200.0), (396.0, 304.0), (1.0, 304.0))
-    return Scenario("paper", world, drives, region)
+    return Scenario("paper_quick", small_world(), drives, _WEST, RasterSpec(0.1, 0.12, 0.1))
 
 
 def _demo() -> Scenario:
@@ -307,11 +220,12 @@ SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
     "demo": _demo,
     "hills12": _hills12,
     "paper": _paper,
+    "paper_quick": _paper_quick,
     "tiny": tiny,
     "manoeuvres": _manoeuvres,
 }
-"""Scenarios by name: demo (two drives of 5 minutes), hills12 (12 minutes, all faults), paper (eleven drives of 1.2 km over a site of
-the paper's size), tiny (half a minute), manoeuvres (one of each, no faults)."""
+"""Scenarios by name: demo (two drives of 5 minutes), hills12 (12 minutes, all faults), paper (eleven drives of about 1.1 km over a
+site of the paper's size), paper_quick (three short ones of the same robot), tiny (half a minute), manoeuvres (one of each, no faults)."""
 
 
 def scenario(name: str) -> Scenario:

@@ -19,7 +19,6 @@ from tcpipe.formats.log_writing import write_bag, write_mcap, write_rosbag2
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.simulation.drive import drive
 from tcpipe.simulation.messages import streams
-from tcpipe.simulation.route import Wander
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario
 from tcpipe.simulation.scenarios import scenario as scenario_by_name
 from tcpipe.simulation.sensors import Noise, Reading, record
@@ -99,7 +98,7 @@ def _holds(site: SimulatedSite, about: Mapping[str, Any]) -> bool:
 def simulated_drive(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tuple[Truth, dict[str, Reading]]:
     """Return the truth of one drive of a scenario, and what its sensors said; nothing is written."""
     spec, noise = scenario.drives[index], Noise(seed, index)
-    plan = spec.plan.plan(scenario.world, noise("plan")) if isinstance(spec.plan, Wander) else spec.plan
+    plan = spec.plan if isinstance(spec.plan, tuple) else spec.plan.plan(scenario.world, noise("plan"))
     truth = drive(
         scenario.world,
         plan,

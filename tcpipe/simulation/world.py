@@ -59,6 +59,21 @@ class Wave:
     phase_rad: float
 
 
+def waves(seed: int, *, count: int, total: float, wavelength_m: tuple[float, float]) -> tuple[Wave, ...]:
+    """Return plane waves of random direction and phase, log-uniform wavelength, and amplitudes that sum in square to ``total``²."""
+    rng = np.random.default_rng(seed)
+    amplitude = total * np.sqrt(2.0 / count)
+    return tuple(
+        Wave(
+            amplitude,
+            float(np.exp(rng.uniform(*np.log(wavelength_m)))),
+            float(rng.uniform(0.0, np.pi)),
+            float(rng.uniform(0.0, 2.0 * np.pi)),
+        )
+        for _ in range(count)
+    )
+
+
 class Region(Protocol):
     """A part of the ground with one class."""
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from tcpipe.simulation import Faults, scenario, simulated_drive, tiny, true_cost
-from tcpipe.simulation.scenarios import SCENARIOS, paper_world
+from tcpipe.simulation.paper_site import paper_world
+from tcpipe.simulation.scenarios import SCENARIOS
 
 PAGE = (Path(__file__).parents[3] / "docs" / "reference" / "simulation.md").read_text(encoding="utf-8")
 

@@ -1,0 +1,109 @@
+"""The paper's claims (sections V, VI) as ratios of figures: each holds or does not, by a margin set before any training."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS
+from tcpipe.learning.metrics import ALL, QUANTITIES
+
+NOTICEABLE, WIDE, FLOOR_FACTOR = 1.1, 1.5, 1.5
+
+
+@dataclass(frozen=True, slots=True)
+class Claim:
+    """One comparison on one split: ``ratio`` should be at least, or at most, ``wanted``."""
+
+    says: str
+    split: str
+    measure: str
+    """What the ratio is of."""
+    ratio: float | None
+    """None: it could not be measured."""
+    at_least: bool
+    wanted: float
+    in_the_paper: float | None
+
+    @property
+    def held(self) -> bool:
+        """Return whether it holds here."""
+        if self.ratio is None:
+            return False
+        return self.ratio >= self.wanted if self.at_least else self.ratio <= self.wanted
+
+    def __str__(self) -> str:
+        """Return the claim, its figure and its verdict as one line."""
+        verdict = "held" if self.held else "NOT held" if self.ratio is not None else "not measured"
+        figure = "–" if self.ratio is None else f"{self.ratio:.2f}"
+        paper = "" if self.in_the_paper is None else f", {self.in_the_paper:.2f} in the paper"
+        return f"{verdict}: {self.says}, {self.split}: {self.measure} {figure} (wanted {self.sign} {self.wanted:.2f}{paper})"
+
+    @property
+    def sign(self) -> str:
+        """Return how the ratio should stand to what is wanted."""
+        return "≥" if self.at_least else "≤"
+
+
+def checked_claims(runs: Sequence[Mapping[str, Any]]) -> list[Claim]:
+    """Return every claim with its ratio, of errors averaged over the runs (one evaluation a seed)."""
+    found = []
+    for split in runs[0]["splits"]:
+        mean = _mean_figures([_figures(run, split) for run in runs])
+        for number, (says, measure, numerator, denominator, wanted) in enumerate(_CLAIMS):
+            if split in _IN_THE_PAPER and _IN_THE_PAPER[split][number] is not None:
+                ratio = _over(mean.get(numerator), mean.get(denominator))
+                found.append(Claim(says, split, measure, ratio, True, wanted, _IN_THE_PAPER[split][number]))
+        floors = [quantity for quantity in QUANTITIES if f"floor {quantity}" in mean and split == "unseen"]
+        measure = "RMSE over that of a predictor that knows the simulator"
+        for quantity in floors:
+            ratio = _over(mean[quantity], mean[f"floor {quantity}"])
+            found.append(Claim(f"{quantity} is as good as can be", split, measure, ratio, False, FLOOR_FACTOR, None))
+    return found
+
+
+_CLAIMS = (
+    ("height matters most", "MAPE of E without H over without O or C", "without H", "without O or C", WIDE),
+    ("class matters for unseen areas", "MAPE of E without C over all layers", "without C", "all layers", NOTICEABLE),
+    ("one net beats grass-only by far", "MAPE of E of grass-only over one net", GRASS_ONLY, OURS, WIDE),
+    ("one net beats per-class nets", "MAPE of E of per-class over one net", PER_CLASS, OURS, 1.0),
+    ("T is far better than expected time", "MAPE of T of expected over one net", EXPECTED, "T of one net", WIDE),
+)
+"""What is said, of what, numerator and denominator, the least ratio."""
+
+_IN_THE_PAPER: Mapping[str, tuple[float | None, ...]] = {
+    "test": (47.84 / 12.29, None, 27.25 / 10.77, 14.64 / 10.77, 17.45 / 3.37),
+    "unseen": (52.20 / 17.38, 17.38 / 12.80, 28.37 / 12.80, 16.96 / 12.80, 13.82 / 5.04),
+}
+"""The same ratios of its tables III to V; None where it does not claim it."""
+
+
+def _figures(run: Mapping[str, Any], split: str) -> dict[str, float | None]:
+    """Return what the claims compare, of one evaluation."""
+    left = {"".join(row["layers"]): row[split]["E"]["mape_percent"] for row in run["ablation"] if row["how"] == "noise"}
+    others = [left[letters] for letters in ("CH", "OH") if left.get(letters) is not None]
+    figures = {"without H": left.get("OC"), "without C": left.get("OH"), "all layers": left.get("OCH")}
+    figures["without O or C"] = max(others, default=None)
+    for who in (OURS, GRASS_ONLY, PER_CLASS):
+        figures[who] = run["energy"].get(who, {}).get(split, {}).get("mape_percent")
+    figures["T of one net"] = run["time"][OURS][split]["mape_percent"]
+    figures[EXPECTED] = run["time"].get(EXPECTED, {}).get(split, {}).get("mape_percent")
+    part = run["splits"][split]
+    for quantity, by_class in part.get("simulation_floor", {}).items():
+        figures[quantity] = part["errors"][quantity][ALL]["rmse"]
+        figures[f"floor {quantity}"] = by_class[ALL]["rmse"]
+    return figures
+
+
+def _mean_figures(found: Sequence[Mapping[str, float | None]]) -> dict[str, float | None]:
+    """Return the means over the runs; None where a run has none."""
+    mean: dict[str, float | None] = {}
+    for name in found[0]:
+        values = [value for figures in found if (value := figures[name]) is not None]
+        mean[name] = sum(values) / len(values) if len(values) == len(found) else None
+    return mean
+
+
+def _over(value: float | None, other: float | None) -> float | None:
+    return None if value is None or not other else value / other

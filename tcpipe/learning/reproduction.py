@@ -1,0 +1,166 @@
+"""``tcpipe reproduce``: the paper's experiment from a simulated site to its claims; every stage is gone on from where it was stopped."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.atomic import write_text
+from tcpipe.formats.json_files import write_json
+from tcpipe.learning.claims import Claim, checked_claims
+from tcpipe.learning.evaluation import EvaluateConfig
+from tcpipe.learning.evaluation_files import run_evaluation
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.plant_floor import plant_costs
+from tcpipe.learning.reproduction_page import reproduction_page
+from tcpipe.learning.training import train
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.maps import add_map
+from tcpipe.recipe import Recipe
+from tcpipe.simulation import Scenario, SimulatedSite, scenario, simulate
+
+logger = logging.getLogger("tcpipe")
+
+JSON, PAGE = "reproduction.json", "reproduction.html"
+SIMULATION_SEED = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """How large an experiment is."""
+
+    scenario: str
+    fitting: FitConfig
+    evaluating: EvaluateConfig
+
+
+FULL = Plan("paper", FitConfig(epochs=60, patience=10), EvaluateConfig(draws=5))
+"""The paper's size: fits 90 minutes on two cores."""
+
+QUICK = Plan(
+    "paper_quick", FitConfig(epochs=12, patience=12, batch=32, learning_rate=1e-3, width=8), EvaluateConfig(draws=2)
+)
+"""Three minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
+
+RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="sample"))
+"""The defaults with the paper's random test samples."""
+
+
+@dataclass(slots=True)
+class Reproduction:
+    """What was found; ``str`` of it is what the command prints."""
+
+    directory: Path
+    scenario: str
+    claims: list[Claim] = field(default_factory=list)
+    runs: list[dict[str, Any]] = field(default_factory=list)
+    counts: Mapping[str, Any] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Of the stages, of this call."""
+
+    def __str__(self) -> str:
+        """Return every claim and how it stands, as plain lines."""
+        held = sum(claim.held for claim in self.claims)
+        spent = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
+        return "\n".join(
+            (
+                "the data are simulated: what is compared with the paper is the pattern, not the figures",
+                *(str(claim) for claim in self.claims),
+                f"{held} of {len(self.claims)} claims held",
+                f"spent: {spent}",
+                f"open {self.directory / PAGE}",
+            )
+        )
+
+
+def reproduce(directory: str | Path, *, quick: bool = False, seeds: int = 1, jobs: int = 1) -> Reproduction:
+    """Simulate the paper's site, build the dataset, train, evaluate, and compare with the paper's claims.
+
+    Parameters
+    ----------
+    directory
+        Where everything goes: new, empty, or an earlier reproduction of the same size, which is gone on from.
+    quick
+        A small one, to see it run.
+    seeds
+        Trainings; figures are compared by their means.
+    jobs
+        Logs read side by side.
+
+    Raises
+    ------
+    UsageError
+        ``directory`` holds something else.
+
+    """
+    place, plan = Path(directory), QUICK if quick else FULL
+    if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
+        raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
+    made, result = scenario(plan.scenario), Reproduction(place, plan.scenario)
+    with _timed(result, "simulate"):
+        site = simulate(place / "site", scenario=made, seed=SIMULATION_SEED)
+    with _timed(result, "ingest and build"):
+        _build(place, site, jobs)
+    card = open_dataset(place / "dataset").card
+    result.counts = {"splits": card["splits"], "terrain": card["terrain"], "segments": card["samples"]}
+    for seed in range(seeds):
+        result.runs.append(_train_and_evaluate(place, made, plan, seed, result))
+    result.claims = checked_claims(result.runs)
+    _write(result, plan)
+    return result
+
+
+@contextmanager
+def _timed(result: Reproduction, stage: str) -> Iterator[None]:
+    began = time.perf_counter()
+    yield
+    result.seconds[stage] = result.seconds.get(stage, 0.0) + time.perf_counter() - began
+
+
+def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
+    """Read the logs, add the map and build the dataset, as a user would."""
+    store = place / "store"
+    ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs)
+    if ingested.exit_code:
+        raise DatasetError(*(problem for result in ingested.results for problem in result.problems))
+    height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
+    add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store)
+    built = build_dataset(place / "dataset", store=store, split=site.region, recipe=RECIPE, jobs=jobs)
+    logger.info("%s", str(built).splitlines()[0])
+
+
+def _train_and_evaluate(place: Path, made: Scenario, plan: Plan, seed: int, result: Reproduction) -> dict[str, Any]:
+    here, dataset = place / f"seed-{seed}", place / "dataset"
+    with _timed(result, "train"):
+        train(dataset, here / "model", config=replace(plan.fitting, seed=seed))
+    with _timed(result, "evaluate"):
+        known: Callable[[Any], Any] = partial(plant_costs, made.world, made.drives[0].robot)
+        config = replace(plan.evaluating, seed=seed)
+        return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
+
+
+def _write(result: Reproduction, plan: Plan) -> None:
+    """Write the page, and the same as JSON."""
+    claims = [{**asdict(claim), "held": claim.held} for claim in result.claims]
+    values = {
+        "kind": "tcpipe reproduction",
+        "simulated": True,
+        "scenario": result.scenario,
+        "plan": asdict(plan),
+        "counts": result.counts,
+        "claims": claims,
+        "seeds": [run["splits"] for run in result.runs],
+    }
+    write_json(result.directory / JSON, values)
+    write_text(
+        result.directory / PAGE, reproduction_page(result.runs, result.claims, result.counts, quick=plan is QUICK)
+    )
