@@ -166,8 +166,9 @@ class McapPart:
             members = chunks[group.start : group.stop]
             sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
             entries, sound = self._entries([chunk for _, chunk in members], sizes)
+            bases = np.array([base for base, _ in members], np.int64)
             for run in runs(entries, sizes, sound, sorted(wanted)):
-                yield _ChunkRun(run, members)
+                yield _ChunkRun(run, members, bases)
 
     def _run_blocks(
         self, run: _ChunkRun, wanted: frozenset[int], lost: list[tuple[Chunk, DamageError]]
@@ -524,12 +525,14 @@ class McapPart:
         ] = None
 
 
+@dataclass(frozen=True, slots=True)
 class _ChunkRun:
     """A run of chunks to read: its plan, and the chunks of its group, each with the number of bytes in all chunks before it."""
 
-    def __init__(self, plan: Run, members: list[tuple[int, Chunk]]) -> None:
-        self.plan, self.members = plan, members
-        self.bases = np.array([base for base, _ in members], np.int64)
+    plan: Run
+    members: list[tuple[int, Chunk]]
+    bases: Int64Array
+    """These numbers once more, shape (members,)."""
 
 
 class _MessageRun:
