@@ -51,9 +51,10 @@ class Tally:
         if layer.role == "height" and present.size:
             self.low, self.high = min(self.low, float(present.min())), max(self.high, float(present.max()))
             if self.high > _HIGHEST_M or self.low < _DEEPEST_M:
+                wrong = self.low if self.low < _DEEPEST_M else self.high
                 raise MapError(
-                    f"{layer.path}: heights from {self.low:.0f} to {self.high:.0f} are not metres of dry land; "
-                    "if they are centimetres, say so in the file (gdal_edit -scale 0.01 or a unit tag)"
+                    f"{layer.path}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
+                    f"{wrong:.6g} is no data (gdal_edit -a_nodata {wrong:.9g}), or that they are centimetres (gdal_edit -scale 0.01)"
                 )
 
     def note_unnamed(self, values: NDArray[Any]) -> None:
