@@ -14,7 +14,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.dataset_files import (
     FileFormat,
     file_checksum,
@@ -23,8 +23,9 @@ from tcpipe.formats.dataset_files import (
     read_samples,
     sample_columns,
 )
-from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.json_files import digest, plain, read_json
 from tcpipe.formats.recipe_toml import ingest_key
+from tcpipe.formats.seals import CHECKSUMS, broken_seal
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store
@@ -67,7 +68,7 @@ def choose_inputs(
     once = each_drive_once(chosen, {run.run_id: _source(store, run)["sha256"] for run in chosen})
     runs = once.runs
     paths = tuple(store.map_path(name) for name in names)
-    map_sha256 = tuple(digest(file_checksums(path)) for path in paths)
+    map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths, strict=True))
     values = plain(asdict(recipe))
     fingerprint = digest(
         {
@@ -82,6 +83,24 @@ def choose_inputs(
     )
     sources = tuple(run_source(store, run) for run in runs)
     return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, (*warnings, *once.warnings))
+
+
+def _map_digest(name: str, path: Path) -> str:
+    """Return one hash over a map's files; `MapError` if they are not as they were written: a lost one would read as no data."""
+    found = file_checksums(path)
+    problem = broken_seal(path / CHECKSUMS)
+    recorded = {} if problem else read_json(path / CHECKSUMS)["checksums"]
+    wrong = sorted(
+        file
+        for file in {*found, *recorded} - {CHECKSUMS}
+        if found.get(file) != tuple(recorded.get(file, {}).get(key) for key in ("size_bytes", "sha256"))
+    )
+    if problem or wrong:
+        what = problem or f"{path / wrong[0]}{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}"
+        raise MapError(
+            f"map {name}: not as it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
+        )
+    return digest(found)
 
 
 def earlier_splits(directory: Path) -> pa.Table:
@@ -173,7 +192,12 @@ def _source(store: Store, run: RunDirectory) -> dict[str, Any]:
 
 
 def _run_fingerprint(run: RunDirectory) -> list[Any]:
-    return [run.run_id, run.recipe_id, file_checksum(run.path / "segments.parquet"), run.manifest["tags"]]
+    found = size_bytes, sha256 = file_checksum(run.path / "segments.parquet")
+    if run.manifest["checksums"].get("segments.parquet") != {"size_bytes": size_bytes, "sha256": sha256}:
+        raise StoreError(
+            f"{run.path / 'segments.parquet'}: is not as it was written; ingest the log again with --force"
+        )
+    return [run.run_id, run.recipe_id, found, run.manifest["tags"]]
 
 
 def _table_digest(table: pa.Table) -> str:

@@ -17,7 +17,7 @@ from pyproj import CRS
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset_sampling import PatchTable
 from tcpipe.recipe import Recipe
-from tcpipe.splits.assignment import NO_FOLD, Assignment, assign_splits
+from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
 from tcpipe.splits.audit import HeldOut, audit_leakage
 from tcpipe.splits.ranking import hash_ranks
 from tcpipe.splits.regions import Regions, project_regions
@@ -157,7 +157,12 @@ def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: ND
     """Say why no sample is inside, and what may be wrong with the region."""
     points = shapely.multipoints(lonlat_deg.mean(axis=1))
     lon, lat = lonlat_deg.mean(axis=(0, 1))
-    near = int((split == "buffer").sum())
+    near, excluded = int((split == "buffer").sum()), int((split == EXCLUDED).sum())
+    if excluded:
+        return (
+            f"the region (--split) leaves nothing to train on: {excluded} of {len(split)} samples lie in its exclude polygons, "
+            f"{near} on a border or nearer to one than the buffer; redraw them"
+        )
     if near:
         return (
             f"the region (--split) holds no whole footprint: {near} of {len(split)} samples lie on its border or nearer "

@@ -6,7 +6,7 @@ import pytest
 from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file, segments
 
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import DatasetError, RecipeError, RegionError, StoreError
+from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
 from tcpipe.store import Store
@@ -37,8 +37,12 @@ def add(store, run_id="a", y_m=(0.0,), *, x=(-10.0, 10.0), start_ns=0, recipe=No
     add_run(store, run_id, table, recipe=recipe, sha256=sha256)
 
 
-def build(store, tmp_path, **keywords):
-    return build_dataset(tmp_path / "out", store=store.root, **{"recipe": Recipe(), **keywords})
+def build(store, tmp_path, *, page=False, **keywords):
+    """Build into ``out``; drawing the page is nine tenths of so small a build, so only datasets of an odd kind get one."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not page:
+            patch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")
+        return build_dataset(tmp_path / "out", store=store.root, **{"recipe": Recipe(), **keywords})
 
 
 def refused(store, tmp_path, error=DatasetError, **keywords):
@@ -151,7 +155,7 @@ def test_no_power_is_no_sample(store, tmp_path):
     add(store, powered=False)
     assert "none with power" in refused(store, tmp_path)
     add(store, "b", (3.0,))
-    result = build(store, tmp_path)
+    result = build(store, tmp_path, page=True)
     assert result.samples == 20
     assert result.ledger_m["no_power"] == pytest.approx(20)
     assert "run a: without power: no label" in result.warnings
@@ -163,6 +167,25 @@ def test_a_map_that_does_not_cover_the_runs(store, tmp_path):
     line = refused(store, tmp_path)
     assert "none of 20 segments gives a sample (20 m outside map)" in line
     assert "the map covers" in line
+
+
+@pytest.mark.parametrize("lost", ["terrain/c", "checksums.json", "height/zarr.json"])
+def test_a_map_that_lost_a_part_is_refused_and_not_taken_for_a_hole(store, tmp_path, lost):
+    add(store)
+    part = store.map_path("site") / lost
+    for path in [part] if part.is_file() else sorted(path for path in part.rglob("*") if path.is_file()):
+        path.unlink()
+    line = refused(store, tmp_path, MapError)
+    assert "map site: not as it was written" in line
+    assert "add the map again" in line
+
+
+def test_segments_that_were_changed_behind_its_back_are_refused(store, tmp_path):
+    add(store)
+    add(store, "b", (3.0,), start_ns=10**15)
+    mine, other = (next((store.runs_path / name).glob("*/segments.parquet")) for name in ("a", "b"))
+    mine.write_bytes(other.read_bytes())
+    assert "segments.parquet: is not as it was written" in refused(store, tmp_path, StoreError)
 
 
 def test_metres_off_the_map_are_in_the_ledger(store, tmp_path):
@@ -195,6 +218,13 @@ def test_a_region_too_thin_for_a_footprint(store, tmp_path):
     assert "no whole footprint" in refused(store, tmp_path, split=region)
 
 
+def test_a_region_that_excludes_everything(store, tmp_path):
+    add(store)
+    both = box(-20, -20, 20, 20), box(-20, -20, 20, 20)
+    region = region_file(tmp_path / "r.geojson", *both, splits=(None, "exclude"))
+    assert "20 of 20 samples lie in its exclude polygons" in refused(store, tmp_path, split=region)
+
+
 def test_a_broken_region(store, tmp_path):
     add(store)
     (tmp_path / "r.geojson").write_text("{")
@@ -204,7 +234,7 @@ def test_a_broken_region(store, tmp_path):
 def test_an_exclude_region_takes_samples_out_of_the_dataset(store, tmp_path):
     add(store)
     region = region_file(tmp_path / "r.geojson", box(-20, -20, 20, 20), box(-5, -2, 5, 2), splits=(None, "exclude"))
-    result = build(store, tmp_path, split=region)
+    result = build(store, tmp_path, page=True, split=region)
     # 20 segments from -10 to 10: 10 lie in the exclude region, 1 m of gap to each border goes to the buffer
     assert result.ledger_m["split_excluded"] == pytest.approx(10)
     assert result.splits["buffer"] == 4
@@ -257,7 +287,7 @@ def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
 
 def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
     add(store)
-    result = build(store, tmp_path, holdout="run")
+    result = build(store, tmp_path, page=True, holdout="run")
     assert result.splits["test"] == 0
     assert any("no sample tests" in warning for warning in result.warnings)
 
@@ -272,7 +302,7 @@ def test_split_keys_out_of_range(store, tmp_path):
 def test_the_fused_velocity_can_be_the_label(store, tmp_path):
     recipe = Recipe(label=LabelConfig(velocity="fused"))
     add(store, recipe=recipe)
-    build(store, tmp_path, recipe=recipe)
+    build(store, tmp_path, page=True, recipe=recipe)
     assert open_dataset(tmp_path / "out")["train"].labels[:, 1].min() >= 0.9
 
 
@@ -280,7 +310,7 @@ def test_a_map_of_height_alone_has_no_other_layers(tmp_path):
     store = Store(tmp_path / "store")
     add_world(store, tmp_path / "rasters", layers=())
     add(store)
-    build(store, tmp_path)
+    build(store, tmp_path, page=True)
     train = open_dataset(tmp_path / "out")["train"]
     assert train.channels == ("height",)
     assert train.patches.shape[1:] == (40, 40, 1)
