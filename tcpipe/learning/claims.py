@@ -56,7 +56,7 @@ def checked_claims(runs: Sequence[Mapping[str, Any]]) -> list[Claim]:
                 ratio = _over(mean.get(numerator), mean.get(denominator))
                 found.append(Claim(says, split, measure, ratio, True, wanted, _IN_THE_PAPER[split][number]))
         floors = [quantity for quantity in QUANTITIES if f"floor {quantity}" in mean and split == "unseen"]
-        measure = "RMSE over that of a predictor that knows the simulator"
+        measure = "RMSE, one net : simulator known"
         for quantity in floors:
             ratio = _over(mean[quantity], mean[f"floor {quantity}"])
             found.append(Claim(f"{quantity} is as good as can be", split, measure, ratio, False, FLOOR_FACTOR, None))
@@ -64,11 +64,11 @@ def checked_claims(runs: Sequence[Mapping[str, Any]]) -> list[Claim]:
 
 
 _CLAIMS = (
-    ("height matters most", "MAPE of E without H over without O or C", "without H", "without O or C", WIDE),
-    ("class matters for unseen areas", "MAPE of E without C over all layers", "without C", "all layers", NOTICEABLE),
-    ("one net beats grass-only by far", "MAPE of E of grass-only over one net", GRASS_ONLY, OURS, WIDE),
-    ("one net beats per-class nets", "MAPE of E of per-class over one net", PER_CLASS, OURS, 1.0),
-    ("T is far better than expected time", "MAPE of T of expected over one net", EXPECTED, "T of one net", WIDE),
+    ("height matters most", "E, without H : without O or C", "without H", "without O or C", WIDE),
+    ("class matters for unseen areas", "E, without C : all layers", "without C", "all layers", NOTICEABLE),
+    ("one net beats grass-only by far", "E, grass only : one net", GRASS_ONLY, OURS, WIDE),
+    ("one net beats per-class nets", "E, a net per class : one net", PER_CLASS, OURS, 1.0),
+    ("T is far better than expected time", "T, expected : one net", EXPECTED, "T of one net", WIDE),
 )
 """What is said, of what, numerator and denominator, the least ratio."""
 

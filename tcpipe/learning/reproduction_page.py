@@ -40,8 +40,8 @@ def _claims(claims: Sequence[Claim]) -> Section:
         )
         for claim in claims
     ]  # fmt: skip
-    text = "Margins were set before the first training. What does not hold is printed as it is."
-    header = ("claim", "split", "ratio of", "", "here", "wanted", "the paper")
+    text = "Ratios of MAPE unless they say RMSE; margins were set before the first training. What does not hold is printed as it is."
+    header = ("claim", "split", "ratio", "", "here", "wanted", "the paper")
     return Section("Does the pattern of the paper hold?", text, header=header, rows=rows, figures_from=4)
 
 

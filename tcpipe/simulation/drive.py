@@ -147,7 +147,9 @@ def _along(world: World, path: Path, command: float, robot: Robot, *, backwards:
     gx, gy = world.gradient(x, y)
     slope = np.arctan((gx * np.cos(direction) + gy * np.sin(direction)) / scale)
     ground = robot.ground_table()[world.terrain_class(x, y)]
+    excess = moving_average(world.resistance_factor(x, y), robot.wheelbase_m) - 1.0
     speed_factor = robot.speed_factor(moving_average(ground[:, 0], robot.wheelbase_m), np.sin(slope))
+    speed_factor = speed_factor * (1.0 - robot.hidden_slowdown * excess)
     slip = robot.slip(moving_average(ground[:, 1], robot.wheelbase_m), np.sin(slope))
     command_mps = command * robot.max_velocity_mps
     brake_at_m = max(path.stop_m - _BRAKE_BEFORE_M * command, 0.1)
