@@ -158,7 +158,7 @@ def _sign(
     if given != "auto":
         return (1 if given == "drawn_positive" else -1), [], {"current_sign": f"{given} (recipe)"}
     time_s, whole = _whole_current(rails, log_times)
-    sign, one_sided = sign_by_mean(whole, np.gradient(time_s) if len(time_s) > 1 else np.ones_like(time_s))
+    sign, one_sided = sign_by_mean(whole, _weight_s(time_s))
     share = f"{100 * abs(one_sided):.0f} % of the charge moved"
     if all(source.sign for source in sources):
         if sign >= 0 or time_s.size < _FEWEST_ROWS:
@@ -183,6 +183,15 @@ def _sign(
         [f'{why}; settle it with read.current_sign = "drawn_positive" or "drawn_negative"'],
         {"current_sign": "drawn_negative (ROS)"},
     )
+
+
+def _weight_s(time_s: Floats) -> Floats:
+    """Return the time that each row stands for [s]; beside a hole no more than usual, or one row would outweigh a run."""
+    if time_s.size < 2:
+        return np.ones_like(time_s)
+    between = np.gradient(time_s)
+    weight: Floats = np.clip(between, 0.0, 3.0 * float(np.median(between)))
+    return weight
 
 
 def _whole_current(rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:

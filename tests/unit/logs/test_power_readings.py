@@ -181,6 +181,19 @@ def test_single_values_that_no_battery_has_are_set_aside() -> None:
     assert "2 voltages outside 5 to 78 V and 1 currents above 1000 A are set aside" in found.warnings[-1]
 
 
+@pytest.mark.parametrize("topic", [("/status", HUSKY_STATUS), ("/battery", BATTERY_STATE)])
+def test_a_row_beside_a_hole_does_not_tell_the_sign(topic: tuple[str, str]) -> None:
+    """Twelve hours without messages, and the row before them feeds back a little."""
+    columns = husky_status() if topic[1] == HUSKY_STATUS else battery(VOLT, AMP.copy())
+    hole = {"log_time_ns": TIMES["log_time_ns"] + np.where(np.arange(N) > 20, 43_200_000_000_000, 0)}
+    currents = [name for name in columns if name.endswith("driver_current") or name == "current"]
+    braking = {name: np.where(np.arange(N) == 20, -1.0, columns[name]) for name in currents}
+    found = read_power({topic[0]: (topic[1], {**columns, **hole, **braking})}, ROBOTS["husky"])
+    watt = power_watt(found)
+    assert np.sum(watt > 0) == N - 1
+    assert not any("refused" in line for line in found.warnings)
+
+
 def test_a_current_against_its_type_is_refused_until_the_recipe_says_how_it_counts() -> None:
     columns = husky_status()
     columns = {**columns, **{name: -value for name, value in columns.items() if name.endswith("driver_current")}}
