@@ -18,7 +18,7 @@ FINE = 50
 
 @st.composite
 def drives(draw):
-    """Return a track with stops, turns, reversing, command changes, holes and clock steps, and its true horizontal length [m]."""
+    """Return a track with stops, turns, reversing, command changes, holes, clock steps and a jump, and its true horizontal length [m]."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     seconds, fine_s = draw(st.integers(5, 60)), 0.05 / FINE
     t = np.arange(seconds * 20 * FINE + 1) * fine_s
@@ -39,6 +39,8 @@ def drives(draw):
     straight = np.hypot(*np.diff(position[rows, :2], axis=0).T)
     whole = (np.diff(kept) == 1) & (np.diff(epoch) == 0)
     true_m = np.where(whole, np.diff(way[rows]), straight).sum()
+    if draw(st.booleans()) and whole.any():  # fixes that move elsewhere: nobody drove that
+        position[rows[draw(st.sampled_from(np.flatnonzero(whole).tolist())) + 1] :] += (300.0, -40.0, 5.0)
     track = make_track(
         position[rows],
         velocity[rows],
