@@ -12,7 +12,7 @@ class DropReason(IntFlag):
     """Why a row of the track is not used; 0 means kept. Order is precedence in the loss ledger."""
 
     GAP = 1 << 0
-    """No usable motion or power estimate: sensor gap, power gap, clock epoch, or relative position error too large."""
+    """No usable motion or power estimate: sensor gap, power gap, clock epoch, a jump, or relative position error too large."""
     STANDING = 1 << 1
     """|v| < 0.05 m/s and |yaw rate| < 0.05 rad/s."""
     STUCK = 1 << 2
@@ -47,7 +47,7 @@ class Quality(IntFlag):
     VOLTAGE_OUT_OF_RANGE = 1 << 7
     """The voltage leaves the range of the robot profile."""
     CLOCK_DOUBTFUL = 1 << 8
-    """A clock of the segment's run stepped or seems constantly off, or the recorder's time had to be used."""
+    """A clock of the segment's run stepped, drifts or seems constantly off, or the recorder's time had to be used."""
     PHYSICS_OUTLIER = 1 << 9
     """The power is more than four robust standard deviations from what rolling resistance and grade, fitted on the run, predict."""
     NOT_AT_LIMIT = 1 << 10
