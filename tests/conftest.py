@@ -1,7 +1,11 @@
 """Random tests draw the same examples on every machine; ``pytest --hypothesis-profile explore`` draws new ones."""
 
+import os
+
 from hypothesis import settings
 
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None, max_examples=500)
 settings.load_profile("fixed")
+
+os.environ.setdefault("KERAS_BACKEND", "torch")  # else Keras looks for another one, and its tests would be skipped

@@ -121,11 +121,18 @@ def evaluate(
         "ablation": list(_ablation(ours, sets, config, trained)),
         "energy": _energy(ours, data, sets, said, trained if config.baselines else None),
         "time": _time(ours, sets, said),
-        "repeatability": data.card.get("repeatability"),
+        "repeatability": _repeatability(data.card),
         "warnings": _warnings(ours, data, sets),
         "plots": {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
     }
     return dict(plain(values))
+
+
+def _repeatability(card: Mapping[str, Any]) -> dict[str, Any]:
+    """Return how well each label repeats itself where ground was driven twice, as the dataset's card has it; None where it was not."""
+    columns = {"w": "power_watt", "v": card["label"]["columns"][1], "T": "duration_s", "E": "energy_joule"}
+    found = card.get("balance", {}).get("repeatability", {})
+    return {quantity: found.get(column) for quantity, column in columns.items()}
 
 
 def _split_values(found: Measured, said: Mapping[str, Any], plant: PlantCosts | None) -> dict[str, Any]:

@@ -111,6 +111,10 @@ def _by_class(values: Mapping[str, Any]) -> list[Section]:
                     if floor in part:
                         noise = [_figure(part[floor][quantity].get(entry), measure, quantity) for entry in classes]
                         rows.append(("", said, *noise))
+                repeats = values["repeatability"][quantity]
+                if measure == "rmse" and repeats is not None:
+                    blank = [""] * len(part["classes"])
+                    rows.append(("", "repeats to, driven again", *blank, f"{repeats['std']:.{_DIGITS[quantity]}f}"))
         header = (
             "",
             "",

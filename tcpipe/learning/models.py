@@ -47,12 +47,18 @@ class Model:
 
     name: str
     card: ModelCard
-    network: Any
-    """The Keras model: patches (N, px, px, depth) to outputs over ``card.scale``."""
+    place: Path
     checksum: str
     """Of card and weights: what rules its predictions."""
     residuals: Mapping[str, NDArray[Any]] = field(default_factory=dict)
     """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
+
+    @cached_property
+    def network(self) -> Any:
+        """Return the Keras model, patches (N, px, px, depth) to outputs over ``card.scale``; Keras is imported for it."""
+        network = resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
+        set_weights(network, read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
+        return network
 
     @property
     def classes(self) -> ClassTable:
@@ -136,7 +142,7 @@ def write_model(place: Path, *, card: ModelCard, network: Any, residuals: pa.Tab
 
 
 def load_model(path: str | Path) -> Model:
-    """Open a model that ``tcpipe train`` wrote.
+    """Open a model that ``tcpipe train`` wrote; its network is made when it is first asked.
 
     Parameters
     ----------
@@ -157,11 +163,9 @@ def load_model(path: str | Path) -> Model:
             raise ModelError(
                 f"{place / name}: gone, cut short or damaged (its checksum is not the card's); train the model again"
             )
-    network = resnet18(card.architecture, seed=0, start=[0.0] * card.architecture.outputs)
-    set_weights(network, read_arrays(place / WEIGHTS), str(place / WEIGHTS))
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
-    return Model(str(path), card, network, digest(found), residuals)
+    return Model(str(path), card, place, digest(found), residuals)
 
 
 def read_model_card(place: Path) -> dict[str, Any]:

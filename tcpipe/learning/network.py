@@ -87,6 +87,5 @@ def _basic_block(layers: Any, values: Any, name: str, filters: int, stride: int)
 
 def named_weights(network: Any) -> dict[str, NDArray[np.float32]]:
     """Return every weight by its path in the network, in the network's order."""
-    return {
-        variable.path: np.array(value) for variable, value in zip(network.weights, network.get_weights(), strict=True)
-    }
+    to_numpy = load_keras().ops.convert_to_numpy
+    return {variable.path: np.array(to_numpy(variable.value)) for variable in network.weights}
