@@ -28,9 +28,13 @@ def export(
     Units of columns and the definition of the message stand in the files' metadata. What OUT holds already of the same
     log is left alone.
     """
+    import resource
+
     from tcpipe.cli.output import print_json
     from tcpipe.pipeline.export import export as run
 
+    most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # the file of every topic is open at once
     exported = run(log, Path(out), topics=(*topics, *names), message_definitions=Path(msgdef) if msgdef else None)
     exit_code = 3 if exported.damage else 0
     if as_json:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -56,6 +57,7 @@ MAX_SHAPE_BYTES = 1 << 27
 MAX_CONTIGUOUS_BYTES = 1 << 30
 """A larger table stays in pieces: Arrow's lists and strings count their values in 31 bits."""
 
+_NUMBER = re.compile(r"\d+")
 _TIMES_BYTES = 24
 _FEW = 32
 _PADDING = [bytes(-length % 8) for length in range(8)]
@@ -103,6 +105,8 @@ class TopicTable:
         self.schema = arrow_schema(message_type.wire)
         self._fields = pa.schema(list(self.schema)[2:])
         self.undecodable: dict[str, int] = {}
+        """Messages left out by reason; those that differ in numbers only go by the first."""
+        self._first_reason: dict[str, str] = {}
         self.replaced_texts = 0
         self.late = 0
         """Messages that came after a table for later times was taken."""
@@ -369,7 +373,9 @@ class TopicTable:
         self._add_part(np.array(kept, np.int64), columns)
 
     def _leave_out(self, reason: str, count: int) -> None:
-        self.undecodable[reason] = self.undecodable.get(reason, 0) + count
+        kind = _NUMBER.sub("#", reason)  # else a broken topic would give as many reasons as messages
+        first = self._first_reason.setdefault(kind, reason)
+        self.undecodable[first] = self.undecodable.get(first, 0) + count
 
     def _add_part(self, rows: _Int64, columns: list[pa.Array]) -> None:
         if len(rows):

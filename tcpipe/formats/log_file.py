@@ -403,7 +403,7 @@ def _open_directory(directory: Path, stack: ExitStack) -> _OpenFiles:
 
 
 def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
-    magic = _magic(path)
+    magic, given = _magic(path), path
     if magic.startswith(ZSTD_MAGIC):
         path = decompressed_file(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tcpipe-"))))
         magic = _magic(path)
@@ -415,7 +415,8 @@ def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
     elif magic.startswith(sqlite_log.MAGIC):
         part = MessageDecompressing(SqlitePart(path, name))
     else:
-        raise LogError(f"{path}: not a log: {_described(path, magic)}; {_WANTED}")
+        held = "" if path == given else "what it holds, decompressed: "
+        raise LogError(f"{given}: not a log: {held}{_described(path, magic)}; {_WANTED}")
     stack.callback(part.close)
     return part
 

@@ -35,6 +35,7 @@ from tcpipe.logs.wire_types import (
     Text,
     WireType,
     fixed_elements,
+    is_boundless,
     record,
 )
 
@@ -158,6 +159,10 @@ class TypeLibrary:
         if elements > MAX_FIXED_ELEMENTS:
             what = f"holds {elements} texts or messages in arrays of fixed length, more than {MAX_FIXED_ELEMENTS}"
             raise DefinitionError(f"type {type_name} {what}")
+        if is_boundless(wire, empty_bytes=0 if ros1 else 1):
+            raise DefinitionError(
+                f"type {type_name} holds an array of messages that take no bytes: nothing bounds its length"
+            )
         return MessageType(wire, source, definitions)
 
     def _known(self, type_name: str, definition: str, schema_encoding: str) -> tuple[_Definitions, Source]:

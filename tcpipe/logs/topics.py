@@ -61,9 +61,7 @@ class Damage:
         """Return one plain line."""
         topic = f", topic {self.topic}" if self.topic else ""
         lost = [
-            f"{count} {unit}"
-            for count, unit in ((self.messages_lost, "messages"), (self.bytes_lost, "bytes"))
-            if count is not None
+            f"{count} {unit}" for count, unit in ((self.messages_lost, "messages"), (self.bytes_lost, "bytes")) if count
         ]
         return f"{self.where}{topic}: {self.what}" + (f" ({', '.join(lost)} lost)" if lost else "")
 

@@ -102,6 +102,33 @@ def fixed_elements(wire_type: WireType) -> int:
             return 0
 
 
+def least_bytes(wire_type: WireType, *, empty_bytes: int) -> int:
+    """Return how many bytes a value takes at least, alignment aside; a message without fields takes ``empty_bytes``."""
+    match wire_type:
+        case Scalar():
+            return 1
+        case Text() | Array(length=None):
+            return 4
+        case Record():
+            if not wire_type.fields:
+                return empty_bytes
+            return sum(least_bytes(of, empty_bytes=empty_bytes) for _, of in wire_type.fields)
+        case Array():
+            return (wire_type.length or 0) * least_bytes(wire_type.element, empty_bytes=empty_bytes)
+
+
+def is_boundless(wire_type: WireType, *, empty_bytes: int) -> bool:
+    """Return whether a message could hold any number of elements in no bytes at all."""
+    match wire_type:
+        case Record():
+            return any(is_boundless(of, empty_bytes=empty_bytes) for _, of in wire_type.fields)
+        case Array():
+            weightless = wire_type.length is None and not least_bytes(wire_type.element, empty_bytes=empty_bytes)
+            return weightless or is_boundless(wire_type.element, empty_bytes=empty_bytes)
+        case _:
+            return False
+
+
 def record(name: str, fields: tuple[tuple[str, WireType], ...]) -> Record:
     """Make a record; whether it is fixed and how wide it unfolds follow from its fields."""
     return Record(name, fields, all(is_fixed(of) for _, of in fields), sum(leaf_count(of) for _, of in fields))

@@ -91,6 +91,8 @@ def export(
         if wanted and not any(entry["file"] for entry in written.values()):
             raise LogError(f"{log_path}: nothing to export: no topic can be read", *map(str, log.damage))
         damage = [str(damage) for damage in log.damage if damage.is_loss]
+        if not wanted:
+            return Exported("done", (), tuple(damage), tuple(log.remarks))
         said = {"made_from": made_from, "damage": damage, "remarks": log.remarks}
         entries = {name: {**said, **entry} for name, entry in written.items()}
     write_json(out / INDEX, {**index, "topics": {**index["topics"], **entries}})

@@ -219,6 +219,29 @@ def test_lengths_and_counts_of_2_to_the_32(tmp_path, bounded, encoding):
     assert sum(finding.messages_lost for finding in damage) == 20
 
 
+@pytest.mark.parametrize("nothing", ["", "float64[0] none\n"])
+def test_arrays_whose_elements_take_no_bytes_are_refused(tmp_path, bounded, nothing):
+    definition = "Nothing[] many\n" + "=" * 80 + f"\nMSG: acme_msgs/Nothing\n{nothing}"
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = McapWriter(file)
+        writer.start(profile="ros1", library="test")
+        schema = writer.register_schema("acme_msgs/Thing", "ros1msg", definition.encode())
+        writer.add_message(writer.register_channel("/evil", "ros1", schema), 1, b"\xff\xff\xff\xff", 1)
+        writer.finish()
+    tables, damage = read(path)
+    assert tables == {}
+    assert ["take no bytes" in finding.what for finding in damage] == [True]
+
+
+def test_reasons_that_differ_in_numbers_only_are_one_finding(tmp_path):
+    kind = "std_msgs/msg/String"
+    odd = [Message("/text", kind, START_NS + n, b"\0\1\0\0" + struct.pack("<I", 1000 + n), None) for n in range(300)]
+    tables, damage = read(write_mcap(tmp_path / "a.mcap", odd))
+    assert tables["/text"].num_rows == 0
+    assert [finding.messages_lost for finding in damage] == [300]
+
+
 def test_topics_that_differ_by_a_leading_slash_stay_two(tmp_path):
     messages = random_messages(7, count=10, types=TYPES)
     twins = [

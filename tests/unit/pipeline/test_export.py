@@ -123,6 +123,13 @@ def test_topics_of_which_none_can_be_read_are_an_error(tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def test_a_damaged_log_without_topics_is_told_as_damaged(tmp_path):
+    (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + b"\xff" * 1000)
+    exported = export(tmp_path / "a.mcap", tmp_path / "out")
+    assert exported.topics == ()
+    assert len(exported.damage) == 2
+
+
 def test_names_that_make_one_file_name_get_files_of_their_own(tmp_path):
     messages = random_messages(5, count=5, types=("std_msgs/msg/ColorRGBA",))
     path = write_mcap(tmp_path / "a.mcap", renamed(messages, "/a/b", "a/b", "/A_b", "/" + 300 * "x", "/.x"))
