@@ -108,6 +108,14 @@ def by_time(*streams: Iterator[Message]) -> Iterator[Message]:
     return heapq.merge(*streams, key=lambda message: message[0])
 
 
+def repeated(messages: Iterator[Message], seconds: float, times: int) -> Iterator[Message]:
+    """Yield the messages of so many seconds again and again, each time later; what they hold stays as it is."""
+    held = list(messages)
+    for turn in range(times):
+        later_ns = turn * round(seconds * 1e9)
+        yield from ((log_time_ns + later_ns, topic, payload) for log_time_ns, topic, payload in held)
+
+
 def write_mcap(
     path: Path, messages: Iterator[Message], *, compression: str, crcs: bool = True, camera_apart: bool = False
 ) -> Path:

@@ -21,6 +21,10 @@ MESSAGE_HEAD = 22
 CHUNK_HEAD = 40
 """Bytes of a chunk's content before its data, without the name of its compression."""
 _INDEX_HEAD = struct.Struct("<BQHI")
+_CHUNK_INDEX_HEAD, _CHUNK_INDEX_MIDDLE, _CHUNK_INDEX_TAIL = (
+    struct.Struct(f"<{form}") for form in ("QQQQI", "QI", "QQ")
+)
+_CHANNEL_OFFSET = struct.Struct("<HQ")
 FOOTER = 20
 """Bytes of a footer's content."""
 
@@ -129,7 +133,7 @@ class Fields:
             raise DamageError("a record ends before its fields do")
         found = self._content[self._position : self._position + whole]
         self._position += whole
-        return dict(struct.iter_unpack("<HQ", found))
+        return dict(_CHANNEL_OFFSET.iter_unpack(found))
 
     def text(self) -> str:
         """Return a text; bytes that are no UTF-8 are kept visible, so that different names stay different."""
@@ -162,13 +166,17 @@ def parse_chunk_head(content: bytes | memoryview, offset: int) -> Chunk:
 
 def parse_chunk_index(content: bytes | memoryview) -> Chunk:
     """Return a chunk as the summary describes it."""
-    fields = Fields(content)
-    start_ns, end_ns, offset, length, map_bytes = fields.take("QQQQI")
-    index = fields.pairs(map_bytes)
-    (index_bytes,) = fields.take("Q")
-    compression = fields.text()
-    size, uncompressed = fields.take("QQ")
-    data_offset = offset + RECORD_HEAD + CHUNK_HEAD + len(compression.encode())
+    try:
+        start_ns, end_ns, offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(content)
+        at = _CHUNK_INDEX_HEAD.size + map_bytes
+        index = dict(_CHANNEL_OFFSET.iter_unpack(content[_CHUNK_INDEX_HEAD.size : at]))
+        index_bytes, name_bytes = _CHUNK_INDEX_MIDDLE.unpack_from(content, at)
+        at += _CHUNK_INDEX_MIDDLE.size + name_bytes
+        compression = bytes(content[at - name_bytes : at]).decode(errors="backslashreplace")
+        size, uncompressed = _CHUNK_INDEX_TAIL.unpack_from(content, at)
+    except struct.error:
+        raise DamageError("a record ends before its fields do") from None
+    data_offset = offset + RECORD_HEAD + CHUNK_HEAD + name_bytes
     if data_offset + size != offset + length:
         raise DamageError("a chunk index contradicts itself")
     return Chunk(offset, data_offset, size, compression, uncompressed, start_ns, end_ns, index or None, index_bytes)
