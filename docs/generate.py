@@ -14,6 +14,7 @@ import click
 
 from tcpipe.cli import cli
 from tcpipe.formats.recipe_toml import commented_toml
+from tcpipe.planning.path_table import PIECES
 from tcpipe.tables.columns import TableSchema
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -51,7 +52,7 @@ def _columns() -> str:
         _NOTE,
         f"# Columns\n\nData model {DATA_MODEL_VERSION}. The same unit, frame and meaning stand in every file's Arrow field metadata.\n",
     ]
-    tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
+    tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES, PIECES)
     parts += [_table(table) for table in tables]
     return "\n".join(parts)
 

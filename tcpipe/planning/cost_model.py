@@ -21,7 +21,7 @@ from tcpipe.terrain.tiles import MapReader
 
 Floats = NDArray[np.float64]
 
-_BATCH = 2_048
+BATCH_PATCHES = 2_048
 """Patches whose tensors exist at once: 40 MB."""
 
 
@@ -123,4 +123,4 @@ def predict_patches(model: CostModel, patches: Patches, asked: NDArray[np.bool_]
 
 
 def _batches(rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
-    yield from (rows[first : first + _BATCH] for first in range(0, rows.size, _BATCH))
+    yield from (rows[first : first + BATCH_PATCHES] for first in range(0, rows.size, BATCH_PATCHES))

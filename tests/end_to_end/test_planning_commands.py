@@ -1,0 +1,89 @@
+"""predict-path, cost-map and plan-path as a user runs them, with a model folder and a map in a store."""
+
+import json
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv
+import pytest
+from installed_command import plain_lines, tcpipe
+from map_worlds import World
+
+from tcpipe.pipeline.maps import add_map
+
+pytestmark = [
+    pytest.mark.skipif(find_spec("keras") is None, reason="keras, of the extra train, is not installed"),
+    pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning"),  # keras, with numpy 2
+]
+
+_ONE_THREAD = {"OMP_NUM_THREADS": "1"}
+_FROM, _TO = "14.99990,46.95345", "15.00010,46.95360"
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    """A directory with a store of one map, a model, and a path."""
+    from made_models import CARD, made_model  # needs keras
+
+    from tcpipe.learning.model_card import Seen
+
+    here = tmp_path_factory.mktemp("planning")
+    layers = World("EPSG:32633", 500_000.0, 5_200_000.0, 30.0).write(here, 0.1)
+    add_map("site", **layers, store=here / "tcpipe-store")
+    ranges = {"slope_rad": (-0.5, 0.5), "cross_slope_rad": (-0.5, 0.5), "relief_m": (0.0, 1.0)}
+    made_model(here / "model", seen=Seen(CARD.seen.class_counts | {5: 10}, (4, 5, 6, 7), ranges))
+    line = {"type": "LineString", "coordinates": [[14.9999, 46.9534], [15.0001, 46.9535]]}
+    (here / "path.geojson").write_text(json.dumps(line))
+    return here
+
+
+def _run(*arguments: str | Path, cwd: Path, code: int = 0) -> str:
+    done = tcpipe(*arguments, cwd=cwd, env=_ONE_THREAD)
+    assert done.returncode == code, done.stderr
+    return done.stdout
+
+
+def test_a_path_is_costed_and_its_pieces_add_up(place: Path):
+    command = ("predict-path", "model", "--path", "path.geojson", "--out", "pieces.csv")
+    said = json.loads(_run(*command, "--json", cwd=place))
+    table = pyarrow.csv.read_csv(place / "pieces.csv")
+    assert table.num_rows == said["pieces"] == 19
+    for name in ("duration_s", "energy_joule"):
+        assert np.sum(table.column(name).to_numpy()) == pytest.approx(said[name], rel=1e-9)
+    assert said["energy_interval_joule"][0] < said["energy_interval_joule"][1]
+    before = (place / "pieces.csv").stat().st_mtime_ns
+    assert "nothing to do" in _run(*command, cwd=place)
+    assert (place / "pieces.csv").stat().st_mtime_ns == before
+
+
+def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
+    assert "cells with a cost" in _run("cost-map", "model", "costs", "--step", "2", cwd=place)
+    plan = ("plan-path", "model", "--from", _FROM, "--to", _TO, "--objective", "time", "--cost-map", "costs")
+    outputs = ("--out", "plan.geojson", "--picture", "plan.png")
+    said = json.loads(_run(*plan, *outputs, "--json", cwd=place))
+    assert list(said["plans"]) == ["time", "energy", "distance"]
+    assert (place / "plan.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads((place / "plan.geojson").read_text())["features"][0]
+    assert found["geometry"]["coordinates"][0] == pytest.approx([14.9999, 46.95345], abs=1e-8)
+    costed = json.loads(_run("predict-path", "model", "--path", "plan.geojson", "--json", cwd=place))
+    assert costed["duration_s"] == pytest.approx(found["properties"]["duration_s"], rel=1e-4)
+    assert costed["energy_joule"] == pytest.approx(said["plans"]["time"]["energy_joule"], rel=1e-4)
+    assert "nothing to do" in _run(*plan, *outputs, cwd=place)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (("predict-path", "none", "--path", "path.geojson"), 1, "no such model"),
+        (("predict-path", "model", "--path", "none.geojson"), 1, "cannot be read"),
+        (("predict-path", "model", "--path", "path.geojson", "--out", "pieces.txt"), 2, "ends in .csv"),
+        (("plan-path", "model", "--from", "15.0", "--to", _TO), 2, "wanted LON,LAT"),
+        (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
+        (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
+        (("cost-map", "model", "--step", "0"), 2, "--step"),
+    ],
+)
+def test_bad_input_is_one_line(place: Path, arguments, code, words):
+    done = tcpipe(*arguments, cwd=place, env=_ONE_THREAD)
+    assert words in plain_lines(done, code, most=1)

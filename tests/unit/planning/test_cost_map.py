@@ -1,0 +1,179 @@
+"""Cost maps: right everywhere, each tile decoded once, whole or resumable, and readable by others."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+import rasterio
+from map_worlds import ArrayMap
+from physics_model import PhysicsModel, energy_joule, power_watt, velocity_mps
+from planning_worlds import plane
+from ruamel.yaml import YAML
+
+from tcpipe.errors import MapError, ModelError, UsageError
+from tcpipe.planning.cost_grid import blocks, grid_over
+from tcpipe.planning.cost_map import cost_map_key, make_cost_map, open_cost_map, read_cost_map_card
+from tcpipe.planning.courses import ANGLES_DEG
+from tcpipe.planning.reasons import Reason
+
+MODEL = PhysicsModel()
+
+
+@dataclass(frozen=True)
+class CountingMap(ArrayMap):
+    """Counts what is read, and says what it is, as a map in a store does."""
+
+    reads: Counter = None
+
+    def read(self, layer, row0, row1, col0, col1):
+        self.reads[layer, row0, col0] += 1
+        return super().read(layer, row0, row1, col0, col1)
+
+    def summary(self):
+        return {"name": self.name}
+
+
+def _map(**options):
+    made = plane(**options)
+    return CountingMap(made.grid, made.arrays, made.tile_px, reads=Counter())
+
+
+def _trees(east, north):
+    return np.where((east > 15.0) & (north > 12.0), 2, np.where(east < 8.0, 5, 4))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A cost map of a slope with mud, grass and trees, and the map."""
+    source = _map(rise_east=0.2, rise_north=0.1, classes=_trees)
+    out = tmp_path_factory.mktemp("costs") / "cost-map"
+    return source, make_cost_map(MODEL, source, out, step_m=1.0)
+
+
+def test_every_course_of_every_cell_costs_what_physics_says(made):
+    _, result = made
+    costs = open_cost_map(result.path, read_cost_map_card(result.path))
+    angle = np.radians(ANGLES_DEG)
+    slope = (0.2 * np.cos(angle) + 0.1 * np.sin(angle)) * 0.9996
+    for (row, col), class_id in {(12, 4): 5, (12, 12): 4}.items():
+        np.testing.assert_allclose(costs.power_watt[:, row, col], power_watt(class_id, slope), rtol=4e-3)
+        np.testing.assert_allclose(costs.velocity_mps[:, row, col], velocity_mps(class_id, slope), rtol=4e-3)
+        assert (costs.reasons[:, row, col] == 0).all()
+    assert (costs.reasons[:, 5, 20] == Reason.NOT_TRAVERSABLE | Reason.OBSTACLE | Reason.CLASS_NOT_SEEN).all()
+    assert np.isnan(costs.power_watt[:, 5, 20]).all()
+    assert costs.height_m[12, 12] == pytest.approx(50.0 + 0.2 * 12.5 + 0.1 * 11.5, abs=0.03)
+
+
+def test_every_tile_is_decoded_once(made):
+    source, _ = made
+    assert set(source.reads.values()) == {1}
+    assert len(source.reads) == 3 * 16
+
+
+def test_blocks_hold_every_wanted_cell_once():
+    source = plane(side_m=30.0)
+    grid = grid_over(source, 0.7)
+    wanted = np.random.default_rng(0).random((grid.rows, grid.cols)) < 0.6
+    cells = np.concatenate(list(blocks(source, MODEL, grid, wanted)))
+    assert sorted(cells) == np.flatnonzero(wanted).tolist()
+
+
+def test_bands_say_what_they_are_and_the_last_three_sum_up_the_courses(made):
+    _, result = made
+    with rasterio.open(result.path / "energy.tif") as dataset:
+        assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+        assert dataset.descriptions[:2] == ("course 0.0 deg", "course 26.6 deg")
+        assert dataset.descriptions[16:] == ("min", "mean", "best course, ccw from grid east")
+        assert dataset.units[0] == "J/m"
+        assert dataset.transform[:6] == (1.0, 0.0, 500_000.0, 0.0, -1.0, 5_200_000.0)
+        assert dataset.crs.to_epsg() == 32633
+        energy = dataset.read()
+    known = energy[:, 12, 12]
+    assert known[16] == known[:16].min()
+    assert known[17] == pytest.approx(known[:16].mean(), rel=1e-6)
+    assert known[18] == pytest.approx(ANGLES_DEG[known[:16].argmin()], rel=1e-6)
+    downhill = np.degrees(np.arctan2(-0.1, -0.2)) % 360.0
+    assert abs(known[18] - downhill) < 14.0
+    with rasterio.open(result.path / "velocity.tif") as dataset:
+        velocity = dataset.read()[:, 12, 12]
+    assert velocity[18] == pytest.approx(ANGLES_DEG[velocity[:16].argmax()])
+
+
+def test_nav2_finds_a_scale_map_with_trees_that_are_lethal(made):
+    _, result = made
+    about = YAML(typ="safe").load((result.path / "energy.yaml").read_text())
+    assert about["mode"] == "scale"
+    assert about["origin"] == [500_000.0, 5_200_000.0 - 24.0, 0.0]
+    grey = matplotlib.image.imread(result.path / about["image"])
+    occupied = (255 - grey.astype(float)) / 255.0
+    cost = np.where(occupied >= about["occupied_thresh"], 100, np.rint(100.0 * occupied))  # as Nav2's map_io does
+    assert grey.shape == (24, 24)
+    assert cost[5, 20] == 100
+    assert cost[12, 12] < 100
+    assert cost[12, 4] > cost[12, 12]
+    scale = result.card["nav2_scale"]["energy"]
+    angle = np.radians(ANGLES_DEG)
+    mean = energy_joule(4, (0.2 * np.cos(angle) + 0.1 * np.sin(angle)) * 0.9996).mean()
+    assert scale["lowest"] + cost[12, 12] / 99 * (scale["highest"] - scale["lowest"]) == pytest.approx(mean, rel=0.02)
+
+
+@dataclass(frozen=True)
+class _Asked(PhysicsModel):
+    """Counts what it is asked; stops like a user after so many calls."""
+
+    patches: list = None
+    most: int = 10**9
+
+    def predict(self, patches):
+        if len(self.patches) == self.most:
+            raise KeyboardInterrupt
+        self.patches.append(len(patches))
+        return super().predict(patches)
+
+
+def test_an_interrupted_map_goes_on_where_it_was_and_ends_the_same(made, tmp_path: Path, monkeypatch):
+    source, whole = made
+    monkeypatch.setattr("tcpipe.planning.cost_map._BLOCKS_KEPT", 1)
+    stopped, going_on = _Asked(patches=[], most=4), _Asked(patches=[])
+    with pytest.raises(KeyboardInterrupt):
+        make_cost_map(stopped, source, tmp_path / "cost-map", step_m=1.0)
+    assert not (tmp_path / "cost-map").exists()
+    again = make_cost_map(going_on, source, tmp_path / "cost-map", step_m=1.0)
+    asked = int(np.count_nonzero(~np.isnan(open_cost_map(again.path, again.card).velocity_mps)))
+    assert sum(stopped.patches) + sum(going_on.patches) == asked
+    assert again.card["key"] == whole.card["key"]
+    for path in sorted(whole.path.iterdir()):
+        assert (again.path / path.name).read_bytes() == path.read_bytes(), path.name
+    assert [entry.name for entry in tmp_path.iterdir()] == ["cost-map"]
+
+
+def test_a_second_call_does_nothing_and_another_step_replaces_it(tmp_path: Path):
+    source, out = _map(side_m=6.0), tmp_path / "c"
+    assert make_cost_map(MODEL, source, out, step_m=2.0).status == "done"
+    before = (out / "cost-map.json").stat().st_mtime_ns
+    second = make_cost_map(MODEL, source, out, step_m=2.0)
+    assert second.status == "unchanged"
+    assert "nothing to do" in str(second)
+    assert (out / "cost-map.json").stat().st_mtime_ns == before
+    assert make_cost_map(MODEL, source, out, step_m=3.0).card["grid"]["rows"] == 2
+    assert (
+        cost_map_key(replace(MODEL, checksum="1" * 64), source, 3.0)
+        != json.loads((out / "cost-map.json").read_text())["key"]
+    )
+
+
+def test_what_cannot_be_mapped_is_one_line(tmp_path: Path):
+    source = _map(side_m=6.0)
+    with pytest.raises(MapError, match="smaller than one cell"):
+        make_cost_map(MODEL, source, tmp_path / "c", step_m=7.0)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "mine.txt").write_text("mine")
+    with pytest.raises(UsageError, match="is no cost map"):
+        make_cost_map(MODEL, source, tmp_path / "full", step_m=1.0)
+    del source.arrays["terrain"]
+    with pytest.raises(ModelError, match="has no terrain"):
+        make_cost_map(MODEL, source, tmp_path / "c", step_m=1.0)

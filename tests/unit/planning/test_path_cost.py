@@ -1,0 +1,127 @@
+"""What a path costs, against a model and worlds of closed form."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from physics_model import PhysicsModel, energy_joule, made_residuals, velocity_mps
+from planning_worlds import lonlat, plane
+
+from tcpipe.errors import ModelError, PathError
+from tcpipe.planning.path_cost import cost_of_path
+from tcpipe.planning.reasons import Reason
+from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+
+MODEL = PhysicsModel()
+SCALE = 1.0 / 0.9996
+"""Ground metres a map metre on the central meridian of a UTM zone."""
+
+
+def _cost(source, *points, model=MODEL):
+    return cost_of_path(model, source, lonlat(source, *points), where="path")
+
+
+def test_uphill_and_downhill_on_a_plane():
+    source = plane(rise_east=0.2)
+    slope = 0.2 / SCALE  # the map's rise a map metre, over ground metres
+    up, down = _cost(source, (2.0, 12.0), (22.0, 12.0)), _cost(source, (22.0, 12.0), (2.0, 12.0))
+    metres = 20.0 * SCALE
+    assert up.length_m == pytest.approx(metres, rel=1e-6)
+    assert up.duration_s == pytest.approx(metres / velocity_mps(4, slope), rel=2e-3)
+    assert up.energy_joule == pytest.approx(metres * energy_joule(4, slope), rel=2e-3)
+    assert down.energy_joule == pytest.approx(metres * energy_joule(4, -slope), rel=1e-2)
+    assert down.energy_joule < up.energy_joule
+
+
+def test_the_rest_of_a_path_is_paid_by_its_length():
+    source = plane()
+    found = _cost(source, (5.0, 5.0), (5.0 + 7.4 / SCALE, 5.0))
+    assert found.pieces.num_rows == 8
+    assert found.duration_s == pytest.approx(7.4 / velocity_mps(4, 0.0), rel=1e-4)
+
+
+def test_each_metre_has_the_class_under_it():
+    source = plane(classes=lambda east, _: np.where(east < 12.0, 4, 7))
+    found = _cost(source, (4.0, 12.0), (20.0, 12.0)).pieces
+    assert found.column("terrain_name").to_pylist()[:7] == ["grass"] * 7
+    assert found.column("terrain_class").to_pylist()[-4:] == [7] * 4
+    assert found.column("course_rad").to_numpy() == pytest.approx(0.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"class_counts": {5: 10}}, Reason.CLASS_NOT_SEEN),
+        ({"pixel_classes": (5, 6)}, Reason.CLASS_NOT_SEEN),
+        ({"seen": {"slope_rad": (-0.1, 0.1), "cross_slope_rad": (-1, 1), "relief_m": (0, 1)}}, Reason.SLOPE_NOT_SEEN),
+        (
+            {"seen": {"slope_rad": (-1, 1), "cross_slope_rad": (0.1, 1), "relief_m": (0, 1)}},
+            Reason.CROSS_SLOPE_NOT_SEEN,
+        ),
+        ({"seen": {"slope_rad": (-1, 1), "cross_slope_rad": (-1, 1), "relief_m": (0, 0.1)}}, Reason.RELIEF_NOT_SEEN),
+    ],
+)
+def test_ground_that_training_has_not_seen_is_marked_and_still_costed(changes, reason):
+    found = _cost(plane(rise_east=0.2), (4.0, 12.0), (9.0, 12.0), model=replace(MODEL, **changes))
+    assert found.reasons == {str(reason.name).lower(): found.pieces.num_rows}
+    assert found.complete
+
+
+def test_what_cannot_be_driven_has_no_cost_and_the_lane_beside_it_is_marked():
+    source = plane(classes=lambda _, north: np.where(np.abs(north - 12.0) < 0.9, 2, 4))
+    through = _cost(source, (12.0, 2.0), (12.0, 22.0))
+    assert 1 <= through.without_cost <= 3
+    assert through.without_cost == through.reasons["not_traversable"]
+    assert not through.complete
+    beside = _cost(source, (4.0, 13.1), (20.0, 13.1))
+    assert beside.complete
+    assert beside.reasons["obstacle"] == beside.pieces.num_rows
+
+
+def test_holes_and_the_map_s_edge_are_told_apart():
+    source = plane()
+    source.arrays["height"][100:120, 100:120] = np.nan
+    found = _cost(source, (4.0, 13.0), (30.0, 13.0))
+    names = found.pieces.column("reason_names").to_pylist()
+    assert found.pieces.num_rows == len(names) == 27
+    assert found.reasons["nodata"] >= 2
+    assert found.reasons["outside_map"] >= 6
+    assert found.without_cost == found.reasons["nodata"] + found.reasons["outside_map"]
+    assert np.isnan(found.pieces.column("energy_joule").to_numpy()[-1])
+
+
+def test_a_bend_sharper_than_any_segment_is_marked_and_paid_along_its_arc():
+    found = _cost(plane(), (4.0, 4.0), (8.5, 4.0), (8.5, 8.0))
+    assert found.reasons == {"curved": 1}
+    assert found.length_m == pytest.approx(8.5 * SCALE, rel=1e-4)
+
+
+def test_without_held_out_samples_there_are_no_intervals():
+    found = _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=replace(MODEL, residuals=made_residuals(5)))
+    assert found.energy_interval_joule is None
+    assert found.pieces.column("energy_low_joule").null_count == found.pieces.num_rows
+
+
+def test_bad_paths_are_one_line_each():
+    source = plane()
+    for points, words in [
+        (((4.0, 4.0), (4.3, 4.0)), "never 1 m from where it starts"),
+        (((4.0, 4.0), (4.0, 4.0)), "one point"),
+        (((400.0, 4.0), (420.0, 4.0)), "is not on map"),
+    ]:
+        with pytest.raises(PathError, match=words) as error:
+            _cost(source, *points)
+        assert len(error.value.problems) == 1
+    swapped = lonlat(source, (4.0, 4.0), (12.0, 4.0))[:, ::-1]
+    with pytest.raises(PathError, match="axes look swapped"):
+        cost_of_path(MODEL, source, swapped, where="path")
+
+
+def test_a_model_of_other_classes_or_layers_is_refused_at_once():
+    other = ClassTable(PAPER_CLASSES.classes[:-1])
+    with pytest.raises(ModelError, match="id 7 is paved road"):
+        _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=replace(MODEL, classes=other))
+    bare = plane()
+    del bare.arrays["ortho"]
+    with pytest.raises(ModelError, match="has no ortho"):
+        _cost(bare, (4.0, 4.0), (9.0, 4.0))

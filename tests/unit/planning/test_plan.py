@@ -1,0 +1,101 @@
+"""Plans: the ways that physics makes best, and the lines that say why there is none."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from physics_model import PhysicsModel, velocity_mps
+from planning_worlds import lonlat, plane
+
+from tcpipe.errors import PathError
+from tcpipe.planning.plan import plan_path
+from tcpipe.planning.survey import new_survey
+
+MODEL = PhysicsModel()
+
+
+def _plan(source, start, goal, objective, *, model=MODEL, survey=None, **options):
+    ends = lonlat(source, start, goal)
+    return plan_path(survey or new_survey(model, source, 1.0), ends[0], ends[1], objective, **options)
+
+
+def _wall(east, north):
+    """Trees from the south edge, with a way round in the north."""
+    return np.where((np.abs(east - 15.0) < 1.5) & (north < 22.0), 2, 4)
+
+
+def _road(east, north):
+    """Slow ground, and a fast road along the north."""
+    return np.where(north > 24.0, 4, 7)
+
+
+def test_on_open_ground_of_one_kind_every_objective_is_the_straight_line():
+    source = plane(30.0)
+    for objective in ("energy", "time", "distance"):
+        found = _plan(source, (3.2, 4.1), (26.7, 19.9), objective)
+        assert len(found.xy_m) == 2
+        straight = np.hypot(23.5, 15.8) / 0.9996
+        assert found.cost.length_m == pytest.approx(straight, rel=1e-5)
+        np.testing.assert_allclose(found.lonlat_deg, lonlat(source, (3.2, 4.1), (26.7, 19.9)), atol=1e-9)
+    assert found.predicted_cells == 0
+
+
+def test_the_way_round_a_wall_keeps_off_it():
+    found = _plan(plane(30.0, classes=_wall), (4.0, 4.0), (26.0, 4.0), "distance")
+    corner = np.array([(13.5, 22.0), (16.5, 22.0)]) + np.array([500_000.0, 5_200_000.0 - 30.0])
+    points = np.concatenate([found.xy_m[:1], corner, found.xy_m[-1:]])
+    least = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
+    assert least <= found.cost.length_m < least + 4.0
+    assert found.cost.complete
+    assert "obstacle" not in found.cost.reasons
+
+
+def test_the_fast_road_is_taken_for_time_and_the_ellipse_grows_to_find_it():
+    source = plane(36.0, classes=_road)
+    survey = new_survey(MODEL, source, 1.0)
+    slow, fast = float(velocity_mps(7, 0.0)), float(velocity_mps(4, 0.0))
+    found = _plan(source, (3.0, 22.0), (33.0, 22.0), "time", survey=survey)
+    assert found.xy_m[:, 1].max() > 5_200_000.0 - 36.0 + 24.0
+    x = np.linspace(0.01, 14.99, 2000)
+    best = (2.0 * np.hypot(x, 2.0) / slow + (30.0 - 2.0 * x) / fast).min() / 0.9996
+    assert best * 0.98 < found.cost.duration_s < best * 1.03
+    assert found.cost.duration_s < _plan(source, (3.0, 22.0), (33.0, 22.0), "distance", survey=survey).cost.duration_s
+
+
+def test_looking_at_less_of_the_map_finds_the_same_path():
+    source = plane(36.0, classes=_road, rise_east=0.05)
+    whole = new_survey(MODEL, source, 1.0)
+    whole.predict(np.ones_like(whole.predicted), lambda _, __: None)
+    for objective in ("energy", "time"):
+        lazy = new_survey(MODEL, source, 1.0)
+        one, other = (_plan(source, (4.0, 10.0), (16.0, 12.0), objective, survey=survey) for survey in (lazy, whole))
+        np.testing.assert_array_equal(one.xy_m, other.xy_m)
+        assert one.predicted_cells < 0.7 * other.predicted_cells
+
+
+def test_ends_that_cannot_be_used_are_named_together():
+    source = plane(30.0, classes=_wall)
+    with pytest.raises(PathError) as error:
+        _plan(source, (15.0, 4.0), (45.0, 4.0), "time")
+    assert len(error.value.problems) == 1
+    assert "--to" in error.value.problems[0]
+    with pytest.raises(PathError, match="stands on tree, which is not traversable"):
+        _plan(source, (15.0, 4.0), (4.0, 4.0), "time")
+    with pytest.raises(PathError, match=r"are 0\.\d+ m apart"):
+        _plan(source, (4.0, 4.0), (4.3, 4.0), "time")
+    swapped = lonlat(source, (4.0, 4.0), (26.0, 4.0))[:, ::-1]
+    with pytest.raises(PathError, match="axes look swapped") as error:
+        plan_path(new_survey(MODEL, source, 1.0), swapped[0], swapped[1], "time")
+    assert len(error.value.problems) == 2
+
+
+def test_no_way_says_what_would_open_one():
+    source = plane(24.0, classes=lambda east, _: np.where(np.abs(east - 12.0) < 1.5, 2, 4))
+    with pytest.raises(PathError, match="cannot be driven over"):
+        _plan(source, (4.0, 4.0), (20.0, 4.0), "distance")
+    mud = plane(24.0, classes=lambda east, _: np.where(np.abs(east - 12.0) < 1.5, 5, 4))
+    grass_only = replace(MODEL, class_counts={4: 100}, pixel_classes=(4,))
+    with pytest.raises(PathError, match="--allow-unseen crosses it"):
+        _plan(mud, (4.0, 4.0), (20.0, 4.0), "distance", model=grass_only)
+    found = _plan(mud, (4.0, 4.0), (20.0, 4.0), "time", model=grass_only, allow_unseen=True)
+    assert found.cost.reasons["class_not_seen"] >= 3

@@ -1,0 +1,134 @@
+"""Least-cost paths, against Bellman-Ford over steps that are found by hand."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as arrays
+
+from tcpipe.planning.cost_grid import CostGrid
+from tcpipe.planning.courses import COURSES, MOVES, touches
+from tcpipe.planning.search import best_potential, least_cost_path, steps_of
+from tcpipe.planning.straight import straightened
+from tcpipe.terrain.grid import MapGrid
+
+METRES = np.ones(COURSES)
+
+
+def _grid(power, velocity, height):
+    rows, cols = height.shape
+    shape = (COURSES, rows, cols)
+    grid = MapGrid("EPSG:32633", 0.0, float(rows), 1.0, rows, cols)
+    return CostGrid(
+        grid,
+        np.broadcast_to(power, shape).astype(np.float32),
+        np.broadcast_to(velocity, shape).astype(np.float32),
+        np.zeros(shape, np.uint16),
+        height.astype(np.float32),
+    )
+
+
+def _by_hand(costs, objective, open_, start):
+    """Bellman-Ford with every step written out."""
+    rows, cols = costs.grid.rows, costs.grid.cols
+    per_metre, edges = costs.per_metre(objective).astype(float), []
+    for course in range(COURSES):
+        east, north = MOVES[course].tolist()
+        for row in range(rows):
+            for col in range(cols):
+                cells = [(row - t.north, col + t.east, t.share) for t in touches(course)]
+                if all(0 <= r < rows and 0 <= c < cols and open_[course, r, c] for r, c, _ in cells):
+                    cost = np.hypot(east, north) * sum(s * per_metre[course, r, c] for r, c, s in cells if s)
+                    edges.append((row * cols + col, (row - north) * cols + col + east, cost))
+    best = np.full(rows * cols, np.inf)
+    best[start] = 0.0
+    for _ in range(rows * cols):
+        before = best.copy()
+        for a, b, cost in edges:
+            best[b] = min(best[b], best[a] + cost)
+        if np.array_equal(before, best):
+            break
+    return best
+
+
+@settings(max_examples=25)
+@given(
+    arrays.arrays(float, (COURSES, 5, 6), elements=st.floats(20.0, 300.0)),
+    arrays.arrays(bool, (5, 6), elements=st.sampled_from([True, True, True, False])),
+)
+def test_paths_are_as_cheap_as_can_be_round_any_obstacles(power, free):
+    costs = _grid(power, 0.8, np.zeros((5, 6)))
+    open_ = np.broadcast_to(free, (COURSES, 5, 6))
+    found = least_cost_path(steps_of(costs, "energy", open_, METRES), 30, 0, 29)
+    best = _by_hand(costs, "energy", open_, 0)[29]
+    if found is None:
+        assert np.isinf(best)
+    else:
+        assert found.cost == pytest.approx(best, rel=1e-6)
+        assert free.reshape(-1)[found.cells].all()
+
+
+def test_downhill_energy_that_comes_back_does_not_mislead_the_search():
+    """Friction and the whole grade, which downhill is less than nothing: the potential takes it out, and the best path is found."""
+    rng = np.random.default_rng(3)
+    height = np.cumsum(np.cumsum(rng.normal(0.0, 0.06, (7, 8)), axis=0), axis=1)
+    friction = rng.uniform(20.0, 60.0, (7, 8))
+    steps = steps_of(_grid(1.0, 1.0, height), "distance", np.ones((COURSES, 7, 8), bool), METRES)
+    middle = (friction.reshape(-1)[steps.begin] + friction.reshape(-1)[steps.end]) / 2.0
+    cost = middle * steps.length_m + 600.0 * steps.rise_m
+    assert cost.min() < 0.0
+    steps = type(steps)(steps.begin, steps.end, cost, steps.length_m, steps.rise_m)
+    found = least_cost_path(steps, 56, 0, 55)
+    best = np.full(56, np.inf)
+    best[0] = 0.0
+    for _ in range(56):
+        np.minimum.at(best, steps.end, best[steps.begin] + cost)
+    assert found.cost == pytest.approx(best[55], rel=1e-9)
+    assert found.negative_steps == 0
+    assert best_potential(steps) == pytest.approx(600.0, rel=0.1)
+
+
+def test_what_gives_back_more_than_it_was_lifted_for_is_counted():
+    steps = steps_of(_grid(-50.0, 1.0, np.zeros((4, 4))), "energy", np.ones((COURSES, 4, 4), bool), METRES)
+    found = least_cost_path(steps, 16, 0, 15)
+    assert found.negative_steps == steps.cost.size
+    assert found.cost < 0.0
+
+
+def _straight(costs, objective, start, goal, open_=None):
+    rows, cols = costs.grid.rows, costs.grid.cols
+    open_ = np.ones((COURSES, rows, cols), bool) if open_ is None else open_
+    found = least_cost_path(steps_of(costs, objective, open_, METRES), rows * cols, start, goal)
+    row, col = np.divmod(found.cells, cols)
+    points, cost = straightened(costs, objective, open_, METRES, np.stack([col, row], axis=1).astype(float))
+    assert cost <= found.cost * (1.0 + 1e-6)
+    return points, cost
+
+
+def test_open_ground_is_crossed_in_a_straight_line():
+    costs = _grid(100.0, 0.8, np.zeros((40, 60)))
+    points, length = _straight(costs, "distance", 3 * 60 + 2, 31 * 60 + 55)
+    assert len(points) == 2
+    assert length == pytest.approx(np.hypot(53, 28), rel=1e-9)
+
+
+def test_no_straight_line_cuts_through_what_is_closed():
+    free = np.ones((COURSES, 30, 30), bool)
+    free[:, 5:, 15] = False
+    costs = _grid(100.0, 0.8, np.zeros((30, 30)))
+    points, length = _straight(costs, "distance", 25 * 30 + 5, 25 * 30 + 25, free)
+    past = np.array([(15.0, 4.0)])
+    least = np.linalg.norm(past - points[0]) + np.linalg.norm(past - points[-1])
+    assert least <= length < 1.03 * least + 1.0
+
+
+def test_a_border_between_slow_and_fast_ground_bends_the_path_as_light():
+    """Snell's law gives the quickest time over a straight border; the path comes within half a per cent of it."""
+    rows = 80
+    velocity = np.where(np.arange(rows) < rows // 2, 1.0, 0.4)[:, None] * np.ones((1, rows))
+    costs = _grid(100.0, velocity, np.zeros((rows, rows)))
+    _, time = _straight(costs, "time", 10 * rows + 5, 70 * rows + 70)
+    border = rows / 2 - 0.5  # between the middles of the rows on its two sides
+    cross = np.linspace(5.0, 70.0, 65_001)
+    best = (np.hypot(cross - 5.0, border - 10.0) / 1.0 + np.hypot(70.0 - cross, 70.0 - border) / 0.4).min()
+    assert best * 0.999 <= time <= best * 1.005
