@@ -8,6 +8,7 @@ text, never by name alone: two logs, or two topics, may mean different things by
 from __future__ import annotations
 
 import functools
+import re
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable
@@ -60,6 +61,7 @@ _CODES = {
 }
 _MAX_LENGTH = 1 << 31
 _MAX_DEPTH = 64
+_TYPE_NAME, _FIELD_NAME = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*"), re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
 _PLACEHOLDER = "structure_needs_at_least_one_member"
 _IDL_SEPARATOR = "=" * 80 + "\n"
 
@@ -91,13 +93,7 @@ class MessageType:
         DefinitionError
             rosbags makes no type of the definition.
         """
-        store = Typestore()
-        try:
-            store.register(
-                {name: ([], fields) for name, (_, fields) in self.definitions.items()}
-            )  # constants take no bytes
-        except TypesysError as error:
-            raise DefinitionError(str(error)) from None
+        store = _typestore(self.definitions)
         name = self.wire.name
         deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
 
@@ -112,9 +108,22 @@ class MessageType:
 
     def text(self, *, ros1: bool) -> str:
         """Return the definition as text, without comments: for where the log holds none."""
-        store = Typestore()
-        store.register(self.definitions)
+        store = _typestore(self.definitions)
         return store.generate_msgdef(self.wire.name, ros_version=1 if ros1 else 2)[0]
+
+
+def _typestore(definitions: _Definitions) -> Typestore:
+    """Return rosbags' store of types; it makes Python code of their names and runs it, so that only plain names may reach it."""
+    odd = [name for name in definitions if not _TYPE_NAME.fullmatch(name)]
+    odd += [field for _, fields in definitions.values() for field, _ in fields if not _FIELD_NAME.fullmatch(field)]
+    if odd:
+        raise DefinitionError(f"{odd[0]!r} is no name that ROS allows")
+    store = Typestore()
+    try:
+        store.register({name: ([], fields) for name, (_, fields) in definitions.items()})  # constants take no bytes
+    except TypesysError as error:
+        raise DefinitionError(str(error)) from None
+    return store
 
 
 class TypeLibrary:

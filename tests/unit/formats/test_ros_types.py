@@ -33,6 +33,23 @@ def test_what_rosbags_makes_no_type_of_is_decoded_row_by_row_all_the_same():
     assert found.row_decoder("cdr")(b"\0\1\0\0\7") == {"value": 7}
 
 
+_ODD = "acme_msgs/Part';print('run');'"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("acme_msgs/msg/Thing:\n  pass\nprint('run')\nclass A", "uint8 x\n"),
+        ("acme_msgs/msg/Thing", f"{_ODD} part\n{SEPARATOR}MSG: {_ODD}\nuint8 x\n"),
+        ("acme_msgs/msg/Thing", f"{_ODD}[] parts\n{SEPARATOR}MSG: {_ODD}\nuint8 x\n"),
+    ],
+)
+def test_no_name_in_a_log_becomes_code(name, text, capsys):
+    with pytest.raises(DefinitionError):
+        resolve(text, name=name).row_decoder("cdr")
+    assert capsys.readouterr().out == ""
+
+
 def test_parts_that_the_log_leaves_out_come_from_the_bundled_definitions():
     header = resolve("std_msgs/Header header\nfloat32 value\n").wire.fields[0][1]
     assert isinstance(header, Record)
