@@ -106,12 +106,8 @@ def count_cells(
                 slope,
                 speed[0] if speed else None,
                 {name: int((split[rows] == name).sum()) for name in splits},
-                _least(xy_m[rows], correlations),
-                _least(xy_m[train], correlations),
+                effective_size(xy_m[rows], *correlations) if correlations else None,
+                effective_size(xy_m[train], *correlations) if correlations else None,
             )
         )
     return cells
-
-
-def _least(xy_m: Floats, correlations: Sequence[Correlation]) -> float | None:
-    return min((effective_size(xy_m, correlation) for correlation in correlations), default=None)

@@ -13,6 +13,7 @@ observations in an autocorrelated time series", 1946; Cressie 1993, section 1.3)
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,9 +31,9 @@ _LENGTHS = np.geomspace(0.25, 40.0, 120)
 _FEWEST_PAIRS = 30
 _FEWEST_FITTED = 12
 """Below so many samples a class is described by its mean, not by a parabola over slope."""
-_STRETCH, _MOST = 200, 4000
+_STRETCH, _MOST = 200, 2000
 """The semivariogram is made from whole stretches of so many samples, and from so many samples at most."""
-_MOST_IN_CELL = 2000
+_MOST_IN_CELL = 1000
 """Mean correlations are over the pairs of so many samples at most, the first ones: rows are in random order."""
 
 
@@ -58,13 +59,15 @@ def residuals(values: Floats, terrain_class: Ints, slope_rad: Floats) -> Floats:
     return left
 
 
-def correlation(residual: Floats, xy_m: Floats, run: Ints, start_ns: Ints, *, chord_m: float) -> Correlation | None:
-    """Return how residuals are correlated over distance; None where too few samples are near each other to say.
+def correlations(
+    residual_by_label: Mapping[str, Floats], xy_m: Floats, run: Ints, start_ns: Ints, *, chord_m: float
+) -> dict[str, Correlation | None]:
+    """Return how the residuals of each label are correlated over distance; None where too few samples are near each other to say.
 
     Parameters
     ----------
-    residual
-        Of `residuals`, shape (N,).
+    residual_by_label
+        Of `residuals`, shape (N,) each.
     xy_m
         Centres of the footprints [m], shape (N, 2).
     run, start_ns
@@ -75,17 +78,20 @@ def correlation(residual: Floats, xy_m: Floats, run: Ints, start_ns: Ints, *, ch
     """
     rows = _stretches(run, start_ns)
     apart = pdist(xy_m[rows]) / chord_m
-    half_squares = pdist(residual[rows, None], "sqeuclidean") / 2.0
-    bins = np.digitize(apart, _LAGS) - 1
-    size = len(_LAGS)
+    bins, size = np.digitize(apart, _LAGS) - 1, len(_LAGS)
     pairs = np.bincount(bins, minlength=size)[: size - 1]
     enough = pairs >= _FEWEST_PAIRS
-    if enough.sum() < 3 or not half_squares.any():
-        return None
-    lag = (np.bincount(bins, apart, size)[: size - 1][enough]) / pairs[enough]
-    gamma = np.bincount(bins, half_squares, size)[: size - 1][enough] / pairs[enough]
-    length, nugget, sill = _fit(lag, gamma, pairs[enough])
-    return Correlation(length * chord_m, sill / (nugget + sill), int(pairs.sum()))
+    if enough.sum() < 3:
+        return dict.fromkeys(residual_by_label)
+    lag = np.bincount(bins, apart, size)[: size - 1][enough] / pairs[enough]
+    found: dict[str, Correlation | None] = {}
+    for label, residual in residual_by_label.items():
+        half_squares = pdist(residual[rows, None], "sqeuclidean") / 2.0
+        gamma = np.bincount(bins, half_squares, size)[: size - 1][enough] / pairs[enough]
+        length, nugget, sill = _fit(lag, gamma, pairs[enough]) if gamma.any() else (0.0, 0.0, 0.0)
+        known = nugget + sill > 0.0
+        found[label] = Correlation(length * chord_m, sill / (nugget + sill), int(pairs.sum())) if known else None
+    return found
 
 
 def _stretches(run: Ints, start_ns: Ints) -> Ints:
@@ -108,10 +114,14 @@ def _fit(lag: Floats, gamma: Floats, pairs: Ints) -> tuple[float, float, float]:
     return best[1:]
 
 
-def effective_size(xy_m: Floats, found: Correlation) -> float:
-    """Return to how many independent samples those at ``xy_m`` [m], shape (n, 2), are worth: from 1 to n, 0 of none."""
+def effective_size(xy_m: Floats, *found: Correlation) -> float:
+    """Return to how many independent samples those at ``xy_m`` [m], shape (n, 2), are worth: from 1 to n, 0 of none.
+
+    Of several correlations, the one that leaves fewest counts.
+    """
     count = len(xy_m)
     if count <= 1:
         return float(count)
-    alike = found.share * float(np.exp(-pdist(xy_m[:_MOST_IN_CELL]) / found.length_m).mean())
+    apart_m = pdist(xy_m[:_MOST_IN_CELL])
+    alike = max(one.share * float(np.exp(apart_m / -one.length_m).mean()) for one in found)
     return count / (1.0 + (count - 1) * alike)

@@ -23,7 +23,7 @@ from tcpipe.balance.cells import (
     slope_ranges,
     speed_edges,
 )
-from tcpipe.balance.correlation import Correlation, correlation, residuals
+from tcpipe.balance.correlation import correlations, residuals
 from tcpipe.balance.repeats import Floor, repeatability, repeated_pairs
 from tcpipe.balance.thin_ground import CELL_M, CLOSED, Ground, Patch, cell_classes, cell_gradients, offered, thin_ground
 from tcpipe.formats.map_files import MapFile
@@ -101,8 +101,15 @@ def measure_balance(
 
     """
     samples = _samples(table, xy_m, velocity_column)
-    correlations = {name: _correlation(samples, name, chord_m) for name in ("power_watt", velocity_column)}
-    known = [found for found in correlations.values() if found is not None]
+    left = {name: residuals(values, samples.terrain, samples.slope) for name, values in samples.labels.items()}
+    alike = correlations(
+        {name: left[name] for name in ("power_watt", velocity_column)},
+        xy_m,
+        samples.run,
+        samples.start_ns,
+        chord_m=chord_m,
+    )
+    known = [found for found in alike.values() if found is not None]
     slopes, edges = slope_ranges(samples.slope), speed_edges(samples.labels[velocity_column])
     speeds = np.searchsorted(edges, samples.labels[velocity_column], side="right").astype(np.int64)
     pairs = count_cells((samples.terrain, slopes), samples.split, xy_m, known, splits=_USED)
@@ -114,19 +121,20 @@ def measure_balance(
         "slope_edges_deg": list(SLOPE_EDGES_DEG),
         "speed_edges_mps": list(edges),
         "enough_effective": ENOUGH,
-        "correlation": {name: None if found is None else asdict(found) for name, found in correlations.items()},
+        "correlation": {name: None if found is None else asdict(found) for name, found in alike.items()},
         "by_class_and_slope": rows,
         "cells": [_cell_json(cell, names, edges) for cell in cells],
-        "repeatability": {name: _floor_json(found) for name, found in _floors(samples, chord_m)},
+        "repeatability": {name: _floor_json(found) for name, found in _floors(samples, left, chord_m)},
     }
     return Balance(facts, {"type": "FeatureCollection", "features": features})
 
 
 def _samples(table: pa.Table, xy_m: Floats, velocity_column: str) -> _Samples:
     labels = ("power_watt", velocity_column, "duration_s", "energy_joule")
+    splits, runs = (table.column(name).combine_chunks().dictionary_encode() for name in ("split", "run_id"))
     return _Samples(
-        split=table.column("split").to_numpy().astype(np.str_),
-        run=np.unique(table.column("run_id").to_numpy().astype(np.str_), return_inverse=True)[1].reshape(-1),
+        split=np.array(splits.dictionary.to_pylist(), np.str_)[splits.indices.to_numpy()],
+        run=runs.indices.to_numpy().astype(np.int64),
         start_ns=integers(table, "start_ns"),
         course_rad=floats(table, "course_rad"),
         terrain=table.column("terrain_class").fill_null(0).to_numpy().astype(np.int64),
@@ -136,16 +144,10 @@ def _samples(table: pa.Table, xy_m: Floats, velocity_column: str) -> _Samples:
     )
 
 
-def _correlation(samples: _Samples, name: str, chord_m: float) -> Correlation | None:
-    left = residuals(samples.labels[name], samples.terrain, samples.slope)
-    return correlation(left, samples.xy_m, samples.run, samples.start_ns, chord_m=chord_m)
-
-
-def _floors(samples: _Samples, chord_m: float) -> Iterator[tuple[str, Floor | None]]:
+def _floors(samples: _Samples, left: Mapping[str, Floats], chord_m: float) -> Iterator[tuple[str, Floor | None]]:
     pairs = repeated_pairs(samples.xy_m, samples.course_rad, samples.terrain, chord_m=chord_m)
     for name, values in samples.labels.items():
-        left = residuals(values, samples.terrain, samples.slope)
-        yield name, repeatability(values, left, pairs, samples.xy_m, chord_m=chord_m)
+        yield name, repeatability(values, left[name], pairs, samples.xy_m, chord_m=chord_m)
 
 
 def _floor_json(found: Floor | None) -> dict[str, Any] | None:

@@ -3,13 +3,18 @@
 import numpy as np
 import pytest
 
-from tcpipe.balance.correlation import Correlation, correlation, effective_size, residuals
+from tcpipe.balance.correlation import Correlation, correlations, effective_size, residuals
 
 
 def track(n):
     """Centres of n consecutive samples on a winding path, 1 m apart."""
     course = np.cumsum(np.random.default_rng(5).normal(0.0, 0.15, n))
     return np.cumsum(np.column_stack([np.cos(course), np.sin(course)]), axis=0)
+
+
+def correlation(field, xy):
+    """Of a field along one run."""
+    return correlations({"w": field}, xy, np.zeros(len(xy), int), np.arange(len(xy)), chord_m=1.0)["w"]
 
 
 def covariance(xy, length_m, share):
@@ -24,14 +29,14 @@ def test_length_and_share_of_a_known_field_are_found(length_m, share):
     root = np.linalg.cholesky(covariance(xy, length_m, share) + 1e-9 * np.eye(len(xy)))
     for _ in range(12):
         field = 20.0 * root @ rng.standard_normal(len(xy))
-        found.append(correlation(field, xy, np.zeros(len(xy), int), np.arange(len(xy)), chord_m=1.0))
+        found.append(correlation(field, xy))
     assert np.median([one.length_m for one in found]) == pytest.approx(length_m, rel=0.25)
     assert np.median([one.share for one in found]) == pytest.approx(share, abs=0.1)
 
 
 def test_labels_without_any_likeness_are_worth_their_number():
     rng, xy = np.random.default_rng(2), track(2000)
-    found = correlation(rng.standard_normal(2000), xy, np.zeros(2000, int), np.arange(2000), chord_m=1.0)
+    found = correlation(rng.standard_normal(2000), xy)
     assert found.share < 0.1 or found.length_m < 0.5
     assert effective_size(xy, found) > 1000
 
@@ -45,6 +50,18 @@ def test_the_effective_size_is_that_of_the_variance_of_the_mean(length_m):
     assert found == pytest.approx(300**2 / cov.sum())
     means = (np.linalg.cholesky(cov + 1e-9 * np.eye(300)) @ rng.standard_normal((300, 4000))).mean(axis=0)
     assert found == pytest.approx(1.0 / means.var(), rel=0.1)
+
+
+def test_long_drives_are_judged_by_stretches_of_them():
+    xy = np.concatenate([track(2500), np.add(track(2500), (0.0, 5000.0))])
+    rng = np.random.default_rng(8)
+    field = np.empty(len(xy))
+    for part in np.array_split(np.arange(len(xy)), 10):  # 500 samples at a time, else the matrix is too large
+        root = np.linalg.cholesky(covariance(xy[part], 3.0, 0.9) + 1e-9 * np.eye(len(part)))
+        field[part] = root @ rng.standard_normal(len(part))
+    found = correlations({"w": field}, xy, np.repeat([0, 1], 2500), np.arange(5000), chord_m=1.0)["w"]
+    assert found.length_m == pytest.approx(3.0, rel=0.4)
+    assert found.share == pytest.approx(0.9, abs=0.1)
 
 
 def test_many_samples_are_judged_by_the_first_which_are_random():
@@ -62,7 +79,7 @@ def test_one_sample_is_one_and_none_is_none():
 
 def test_too_few_samples_or_labels_that_are_all_alike_say_nothing():
     for n, values in ((4, np.arange(4.0)), (500, np.zeros(500))):
-        assert correlation(values, track(n), np.zeros(n, int), np.arange(n), chord_m=1.0) is None
+        assert correlation(values, track(n)) is None
 
 
 def test_class_and_slope_are_taken_out_of_a_label():
