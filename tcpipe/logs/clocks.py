@@ -104,12 +104,23 @@ def settle_clocks(topics: Mapping[str, TopicTimes]) -> tuple[dict[str, Timeline]
     return {name: _timeline(topics[name], draft, reference) for name, draft in drafts.items()}, steps
 
 
-def is_simulated(times: TopicTimes) -> bool:
-    """Return whether a topic's headers count simulated time while the log counts the wall clock's."""
-    known = _is_set(times)
-    if times.header_ns is None or not known.any():
-        return False
-    return bool(np.median(times.header_ns[known]) < SIMULATED_NS < np.median(times.log_time_ns))
+def is_simulated(log_time_ns: Ints, header_ns: Ints | None) -> bool:
+    """Return whether headers count simulated time while the log counts the wall clock's; times [ns], shape (N,)."""
+    known = np.zeros(0, np.int64) if header_ns is None else header_ns[header_ns > 0]
+    return bool(len(known) and np.median(known) < SIMULATED_NS < np.median(log_time_ns))
+
+
+def about_simulated_time(log_time_ns: Ints, header_ns: Ints | None, ruling: Literal["header", "log"]) -> str | None:
+    """Return what a topic's durations mean where one of its clocks is simulated, None where none is; times [ns], shape (N,)."""
+    if is_simulated(log_time_ns, header_ns):
+        whose = "of the simulation (header)" if ruling == "header" else "of the wall clock (log time)"
+        return (
+            f"its headers count simulated time, the log the wall clock's: durations are those {whose}; if the simulation did not run "
+            "in real time, settle it in the recipe under [read.time]"
+        )
+    if ruling == "log" and len(log_time_ns) and np.median(log_time_ns) < SIMULATED_NS:
+        return "log time rules, and it is simulated: durations are those of the simulation"
+    return None
 
 
 def _is_set(times: TopicTimes) -> Mask:

@@ -75,7 +75,7 @@ def _read(log: Log) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
             "header_minus_log_s": timeline.offset_s,
             "moved_s": [moved for moved in timeline.moved_s if moved],
             "wrong_stamps": max(wrong, 0),
-            "simulated_time": is_simulated(clocks[name]),
+            "simulated_time": is_simulated(clocks[name].log_time_ns, clocks[name].header_ns),
         }
     return facts, {
         "clock_epochs": len(steps) + 1,

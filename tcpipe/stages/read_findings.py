@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.logs.clocks import Step, Timeline
+from tcpipe.logs.clocks import Step, Timeline, about_simulated_time
 from tcpipe.logs.power_readings import PowerReadings
 from tcpipe.logs.roles import Assignment
 from tcpipe.stages.read_sources import Source
@@ -60,6 +60,8 @@ def _warnings(source: Source, timeline: Timeline | None) -> Iterable[str]:
         yield lost + (": the track lies in a local frame and cannot be placed on a map" if nowhere else "")
     if timeline is None:
         return
+    if simulated := about_simulated_time(source.readings.log_time_ns, source.readings.header_ns, timeline.source):
+        yield f"{name}: {simulated}"
     if timeline.source == "log" and source.readings.header_ns is not None:
         yield f"{name}: log time rules, since {timeline.why}"
     if timeline.notes.get("stamps_replaced"):

@@ -1,8 +1,9 @@
 """Which stamp rules, where a clock steps, and in what order messages were measured."""
 
 import numpy as np
+import pytest
 
-from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
+from tcpipe.logs.clocks import Timeline, TopicTimes, about_simulated_time, settle_clocks
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -197,3 +198,22 @@ def test_a_header_that_does_not_rule_opens_no_epoch() -> None:
     found, steps = settle(bad=times(log, garbage), good=times(log, log))
     assert steps == []
     assert (found["bad"].source, found["good"].source) == ("log", "header")
+
+
+@pytest.mark.parametrize(
+    ("log_s", "header_s", "ruling", "said"),
+    [
+        (1_700_000_000, 5, "header", "durations are those of the simulation (header)"),
+        (1_700_000_000, 5, "log", "durations are those of the wall clock (log time)"),
+        (5, None, "log", "log time rules, and it is simulated"),
+        (5, 1_700_000_000, "header", None),
+        (1_700_000_000, 1_700_000_000, "header", None),
+        (1_700_000_000, 0, "log", None),
+        (1_700_000_000, None, "log", None),
+    ],
+)
+def test_simulated_time_is_told_from_the_wall_clock(log_s, header_s, ruling, said):
+    log_ns = log_s * 10**9 + np.arange(100) * 10**7
+    header_ns = None if header_s is None else np.where(header_s, header_s * 10**9 + np.arange(100) * 10**7, 0)
+    found = about_simulated_time(log_ns, header_ns, ruling)
+    assert found is None if said is None else said in found
