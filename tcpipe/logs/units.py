@@ -112,12 +112,14 @@ def field_units(of: Record) -> dict[str, str]:
 
 
 def _units(of: WireType, name: str, within: tuple[tuple[str, str], ...]) -> Iterator[tuple[str, str]]:
-    """Yield (name, unit) below ``name``; ``within`` holds the types around it and the name inside each of them."""
+    """Yield (name, unit) below ``name``; ``within`` holds those types around it that have units, and the name inside each."""
     if isinstance(of, Array):
         of = of.element
     if isinstance(of, Record):
         for field, inner in of.fields:
-            around = (*((kind, f"{path}.{field}") for kind, path in within), (of.name, field))
+            around = tuple((kind, f"{path}.{field}") for kind, path in within)
+            if of.name in UNITS:
+                around += ((of.name, field),)
             yield from _units(inner, f"{name}.{field}" if name else field, around)
         return
     units = (UNITS.get(kind, {}).get(part) for kind, path in within for part in _beginnings(path))
