@@ -40,12 +40,13 @@ class PlanRequest:
 class PlanResult:
     """What was found; ``str`` of it is what the command prints."""
 
+    objective: Objective
     out: Path
     picture: Path | None
     status: str
     """``done`` or ``unchanged``."""
     plans: Mapping[str, Mapping[str, Any]]
-    """Properties of each plan by objective; the one that was asked for comes first."""
+    """Properties of each plan by objective, the one that was asked for first."""
 
     def __str__(self) -> str:
         """Return what each path costs and where it is, as plain lines."""
@@ -89,7 +90,7 @@ def plan(
         {"model": model.checksum, "map": source.summary(), "request": request, "drawn": drawn, "version": VERSION}
     )
     if (found := _plans_of(out, picture, key)) is not None:
-        return PlanResult(out, picture, "unchanged", found)
+        return PlanResult(request.objective, out, picture, "unchanged", found)
     survey = _survey(model, source, request)
     wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
     plans = {
@@ -103,7 +104,7 @@ def plan(
     asked = plans[request.objective]
     who = {"model": model.name, "map": source.name, "robot": model.robot, "allow_unseen": request.allow_unseen}
     write_lines(out, [(asked.lonlat_deg, {**asked.properties(), **who})], {"tcpipe": about})
-    return PlanResult(out, picture, "done", properties)
+    return PlanResult(request.objective, out, picture, "done", properties)
 
 
 def _check_names(out: Path, picture: Path | None) -> None:
