@@ -228,7 +228,7 @@ class Recipe:
     __pydantic_config__ = _STRICT
 
     robot: str | None = None
-    """Robot profile (husky, jackal, warthog, generic); none finds it by message types and topic names."""
+    """Robot profile (husky, jackal, warthog, dingo, ridgeback, generic); none finds it by message types and topic names."""
     read: ReadConfig = field(default_factory=ReadConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
     gate: GateConfig = field(default_factory=GateConfig)

@@ -49,13 +49,15 @@ class PowerSource:
     """What a message type says about power.
 
     ``averaged``: over the message period, rather than sampled. ``sign``: +1 where a positive current is drawn, -1 where it charges, 0 where
-    robots disagree. ``includes``: what the current feeds besides the drives.
+    robots disagree. ``includes``: what the current feeds besides the drives. ``currents``: how many currents the message's list holds,
+    where its definition says so.
     """
 
     rails: tuple[RailFields, ...]
     averaged: bool = False
     sign: int = 1
     includes: str = ""
+    currents: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,11 +73,12 @@ BATTERY_STATE = "sensor_msgs/msg/BatteryState"
 HUSKY_STATUS = "husky_msgs/msg/HuskyStatus"
 CLEARPATH_POWER = "clearpath_platform_msgs/msg/Power"
 _PERCENTAGE = "percentage"
+_CURRENTS = "measured_currents"
 
 
 def _of_list(name: str, *currents: int, averaged: bool = True, includes: str = "") -> PowerSource:
     """Return the source of a message whose lists begin with the battery's voltage."""
-    fields = tuple(Field("measured_currents", index) for index in currents)
+    fields = tuple(Field(_CURRENTS, index) for index in currents)
     return PowerSource((RailFields(name, Field("measured_voltages", 0), fields),), averaged, includes=includes)
 
 
@@ -97,16 +100,17 @@ POWER_SOURCES: dict[tuple[str, str], PowerSource] = {
             for side in _HUSKY_DRIVERS
         )
     ),
-    (CLEARPATH_POWER, "A200"): _of_list("drive", 1, 2),
+    (CLEARPATH_POWER, "A200"): replace(_of_list("drive", 1, 2), currents=3),
     (CLEARPATH_POWER, "A200 drivers"): PowerSource(
         tuple(
-            RailFields(f"{side}_driver", Field("measured_voltages", index), (Field("measured_currents", index),))
+            RailFields(f"{side}_driver", Field("measured_voltages", index), (Field(_CURRENTS, index),))
             for index, side in enumerate(_HUSKY_DRIVERS, 1)
         ),
         averaged=True,
+        currents=3,
     ),
     (CLEARPATH_POWER, "J100"): _of_list("drive", 2),
-    (CLEARPATH_POWER, "W200"): _of_list("battery", 0, includes=_TOTAL),
+    **{(CLEARPATH_POWER, platform): _of_list("battery", 0, includes=_TOTAL) for platform in ("W200", "D100", "R100")},
     ("jackal_msgs/msg/Power", ""): _of_list("drive", 2),
     ("jackal_msgs/msg/Status", ""): PowerSource(
         (RailFields("drive", Field("measured_battery"), (Field("drive_current"),)),), averaged=True
@@ -116,7 +120,7 @@ POWER_SOURCES: dict[tuple[str, str], PowerSource] = {
     ),
     (BATTERY_STATE, ""): PowerSource((RailFields("", Field("voltage"), (Field("current"),)),), sign=0),
 }
-"""Power by message type and variant (platform; for a Husky also how its voltage is taken)."""
+"""Power by message type and variant (platform; for a Husky also how its voltage is taken). D100 is every Dingo."""
 
 PROPULSION_TYPES = (HUSKY_STATUS, CLEARPATH_POWER, "jackal_msgs/msg/Power", "jackal_msgs/msg/Status")
 """Message types that tell propulsion apart, best first."""
@@ -206,6 +210,11 @@ def read_rails(columns: Columns, source: PowerSource, topic: str) -> list[Rail] 
         width = columns[field.column].shape[1] if columns[field.column].ndim == 2 else None
         if field.index is not None and (width is None or width <= field.index):
             return f"{topic}: {field.column} holds {width or 0} values, the robot's platform needs {field.index + 1}"
+    held = columns[_CURRENTS].shape[1] if _CURRENTS in columns and columns[_CURRENTS].ndim == 2 else None
+    if source.currents is not None and held != source.currents:
+        return (
+            f"{topic}: {_CURRENTS} holds {held} values, this platform's {source.currents}; name the robot with --robot"
+        )
     rows = len(columns[fields[0].column])
     rails = []
     for rail in source.rails:

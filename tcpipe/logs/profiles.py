@@ -38,12 +38,16 @@ ROBOTS: dict[str, Robot] = {
         Robot("husky", 1.0, (20.0, 30.0), "A200", ("husky_msgs/msg/HuskyStatus",), r"husky|a200"),
         Robot("warthog", 5.0, (40.0, 60.0), "W200", ("warthog_msgs/msg/Status",), r"warthog|w200"),
         Robot("jackal", 2.0, (20.0, 30.0), "J100", ("jackal_msgs/msg/Status", "jackal_msgs/msg/Power"), r"jackal|j100"),
+        Robot("dingo", 1.3, None, "D100", (), r"dingo|d[do]?1[05]0"),
+        Robot("ridgeback", 1.1, None, "R100", (), r"ridgeback|r100"),
         GENERIC,
     )
 }
 """Profiles by name; the recipe key ``robot`` and ``--robot`` choose one."""
 
 _POWER_OF_ANY_CLEARPATH = "clearpath_platform_msgs/msg/Power"
+_SERIAL_NUMBER = re.compile(r"(?<![a-z0-9])([a-z]{1,2}\d{3})[_-]\d{4}(?!\d)")
+"""How Clearpath names a robot in its topics: by platform and number."""
 
 
 def find_robot(topics: Iterable[Topic], name: str | None) -> tuple[Robot, str]:
@@ -76,6 +80,8 @@ def find_robot(topics: Iterable[Topic], name: str | None) -> tuple[Robot, str]:
         return by_name[0], f"topic {by_name[1].name} is called so"
     for topic in listed:
         if topic.type_name == _POWER_OF_ANY_CLEARPATH:
+            if other := next((found for of in listed if (found := _SERIAL_NUMBER.search(of.name.lower()))), None):
+                return GENERIC, f"topics are named after the platform {other[1].upper()}, which no profile knows"
             return ROBOTS["husky"], f"topic {topic.name} is {topic.type_name}, and nothing names another platform"
     return GENERIC, "no topic tells the robot"
 

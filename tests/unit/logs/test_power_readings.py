@@ -62,6 +62,8 @@ def clearpath(voltages: tuple, currents: tuple) -> dict[str, np.ndarray]:
         ("husky", "drivers", (VOLT - 1) * AMP + (VOLT - 2) * 2 * AMP),
         ("jackal", "battery", VOLT * 2 * AMP),
         ("warthog", "battery", VOLT * 9.0),
+        ("dingo", "battery", VOLT * 9.0),
+        ("ridgeback", "battery", VOLT * 9.0),
     ],
 )
 def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarray) -> None:
@@ -70,14 +72,18 @@ def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarr
     found = read_power({"/power": (CLEARPATH_POWER, columns)}, ROBOTS[robot], husky_power=option)
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
     assert found.averaged
-    assert bool(found.warnings) == (robot == "warthog")  # its total current feeds the computers too
+    assert bool(found.warnings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
 
 
 def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
     two = clearpath((VOLT,), (AMP, AMP))
     assert "measured_currents holds 2 values" in read_power({"/p": (CLEARPATH_POWER, two)}, ROBOTS["husky"]).warnings[0]
+    four = clearpath((VOLT, VOLT, VOLT), (AMP, AMP, AMP, AMP))  # a Jackal's, whose second and third are no drivers'
+    assert (
+        "holds 4 values, this platform's 3" in read_power({"/p": (CLEARPATH_POWER, four)}, ROBOTS["husky"]).warnings[0]
+    )
     unknown = read_power({"/p": (CLEARPATH_POWER, two)}, ROBOTS["generic"])
-    assert "names its currents by platform (A200, J100, W200)" in unknown.warnings[0]
+    assert "names its currents by platform (A200, D100, J100, R100, W200)" in unknown.warnings[0]
     assert unknown.readings == {}
 
 

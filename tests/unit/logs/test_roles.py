@@ -264,7 +264,7 @@ def test_the_robot_is_found_by_types_then_by_names(topics: list[tuple[str, str]]
 
 def test_the_robot_given_rules_and_must_exist() -> None:
     assert assign(("/status", HUSKY), ("/odom", ODOMETRY), robot="warthog").robot.name == "warthog"
-    with pytest.raises(RecipeError, match="there are generic, husky, jackal, warthog"):
+    with pytest.raises(RecipeError, match="there are dingo, generic, husky, jackal, ridgeback, warthog"):
         assign(("/odom", ODOMETRY), robot="spot")
 
 
