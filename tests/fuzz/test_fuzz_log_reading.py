@@ -15,10 +15,10 @@ sys.modules[_spec.name] = fuzz_log_reading
 _spec.loader.exec_module(fuzz_log_reading)
 TARGETS = fuzz_log_reading.TARGETS
 
-CHANGES = 12
+CHANGES = 8
 """Changed copies of each input of a corpus."""
-RUNS = 1500
-"""Inputs of a run with atheris."""
+RUNS = {"containers": 150, "plans": 400, "definitions": 1000}
+"""Inputs of a run with atheris: each takes some seconds."""
 
 
 def changed(data, rng):
@@ -52,7 +52,8 @@ def test_inputs_and_changed_inputs_break_nothing(name, tmp_path):
 @pytest.mark.skipif(importlib.util.find_spec("atheris") is None, reason="atheris is not installed")
 @pytest.mark.parametrize("name", TARGETS)
 def test_a_run_guided_by_coverage_finds_nothing(name, tmp_path):
-    command = [sys.executable, "-W", "ignore", TARGET_FILE, name, f"--runs={RUNS}", "--seed=1", "--seconds=120"]
+    command = [sys.executable, "-W", "ignore", TARGET_FILE, name, f"--runs={RUNS[name]}", "--seed=1"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert f"DONE   {RUNS}" in done.stderr or "Done" in done.stderr, done.stderr[-3000:]
+    assert f"Done {RUNS[name]} runs" in done.stderr, done.stderr[-3000:]
+    assert list(tmp_path.iterdir()) == []
