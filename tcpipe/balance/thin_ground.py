@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import shapely
@@ -35,7 +35,8 @@ _WINDS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")
 class Ground:
     """Cells of a map, (R, C), row 0 in the north: class id or `CLOSED`, and gradient (metres up a metre east and north), (R, C, 2).
 
-    ``x_min_m`` and ``y_max_m`` are the outer corner of cell (0, 0), ``cell_m`` its side.
+    ``x_min_m`` and ``y_max_m`` are the outer corner of cell (0, 0), ``cell_m`` its side. ``up`` and ``down`` are the ranges of slope of its
+    fall line in both directions.
     """
 
     terrain_class: NDArray[np.int16]
@@ -43,6 +44,14 @@ class Ground:
     x_min_m: float
     y_max_m: float
     cell_m: float
+    up: NDArray[np.int8] = field(init=False)
+    down: NDArray[np.int8] = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Find the ranges of slope."""
+        steepest = np.arctan(np.hypot(self.gradient[..., 0], self.gradient[..., 1]))
+        object.__setattr__(self, "up", slope_ranges(steepest).astype(np.int8))
+        object.__setattr__(self, "down", slope_ranges(-steepest).astype(np.int8))
 
     def cells_of(self, xy_m: Floats) -> tuple[Ints, Ints, NDArray[np.bool_]]:
         """Return row and column of points, shape (N, 2) [m], and whether they lie on the map."""
@@ -66,8 +75,9 @@ class Patch:
 
 def offered(ground: Ground, terrain_class: int, slope: int) -> NDArray[np.bool_]:
     """Return which cells offer a class and a range of slope, (R, C): a cell offers the two slopes of its fall line."""
-    steepest = _sign(slope) * np.arctan(np.hypot(ground.gradient[..., 0], ground.gradient[..., 1]))
-    found: NDArray[np.bool_] = (ground.terrain_class == terrain_class) & (slope_ranges(steepest) == slope)
+    found: NDArray[np.bool_] = (ground.terrain_class == terrain_class) & (
+        (ground.up if _sign(slope) > 0 else ground.down) == slope
+    )
     return found
 
 
@@ -99,10 +109,11 @@ def _sign(slope: int) -> int:
 def _largest(free: NDArray[np.bool_]) -> list[tuple[Ints, Ints]]:
     """Return rows and columns of the largest connected patches of cells, the first in the map's order among equals."""
     numbers, count = label(free)
-    sizes = np.bincount(numbers.reshape(-1), minlength=count + 1)[1:]
-    chosen = np.argsort(-sizes, kind="stable")[:_PATCHES_EACH] + 1
-    order = np.argsort(numbers, axis=None, kind="stable")
-    ends = np.concatenate([[0], np.cumsum(np.bincount(numbers.reshape(-1), minlength=count + 1))])
+    cells = np.flatnonzero(free)
+    of = numbers.reshape(-1)[cells]
+    sizes = np.bincount(of, minlength=count + 1)[1:]
+    order, ends = cells[np.argsort(of, kind="stable")], np.append(0, np.cumsum(sizes))
+    chosen = np.argsort(-sizes, kind="stable")[:_PATCHES_EACH]
     parts = (order[ends[number] : ends[number + 1]] for number in chosen.tolist())
     return [(part // free.shape[1], part % free.shape[1]) for part in parts]
 

@@ -208,13 +208,13 @@ def _bounds_in(source: MapFile, crs: CRS) -> tuple[float, float, float, float]:
 
 
 def _close(ground: Ground, taken: Sequence[BaseGeometry]) -> None:
-    """Close the cells that touch any of the areas."""
+    """Close the cells that any of the areas reaches into."""
     rows, cols = np.nonzero(ground.terrain_class != CLOSED)
-    west, north = ground.x_min_m + cols * ground.cell_m, ground.y_max_m - rows * ground.cell_m
-    boxes = shapely.box(west, north - ground.cell_m, west + ground.cell_m, north)
+    x_m, y_m = ground.x_min_m + (cols + 0.5) * ground.cell_m, ground.y_max_m - (rows + 0.5) * ground.cell_m
     for area in taken:
-        shapely.prepare(area)
-        inside = shapely.intersects(area, boxes) & ~shapely.touches(area, boxes)
+        reached = shapely.buffer(area, ground.cell_m / np.sqrt(2.0))
+        shapely.prepare(reached)
+        inside = shapely.contains_xy(reached, x_m, y_m)
         ground.terrain_class[rows[inside], cols[inside]] = CLOSED
 
 
