@@ -1,0 +1,121 @@
+"""Evaluation: its figures against the arrays themselves, its files, and models that do not fit."""
+
+import csv
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_models import CARD, made_model
+
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import ModelError, UsageError
+from tcpipe.learning.evaluation import EvaluateConfig
+from tcpipe.learning.evaluation_files import run_evaluation
+from tcpipe.learning.models import load_model
+from tcpipe.learning.predictions import predicted_costs
+from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+
+pytest.importorskip("torch")
+pytest.importorskip("keras")
+
+CONFIG = EvaluateConfig(draws=2, baselines=False)
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    training = {"config": {"epochs": 1, "width": 4}, "samples": {"fitted": 100, "held out": 20}}
+    return made_model(tmp_path_factory.mktemp("made") / "model", training=training)
+
+
+@pytest.fixture(scope="module")
+def evaluated(model, dataset, tmp_path_factory):
+    place = tmp_path_factory.mktemp("evaluated") / "evaluation"
+    return place, run_evaluation(model, dataset, place, config=CONFIG).values
+
+
+def test_the_figures_are_the_arrays_own(evaluated, model, dataset):
+    _, values = evaluated
+    unseen = open_dataset(dataset)["unseen"]
+    said, labels = load_model(model).predict(unseen.patches).astype(float), unseen.labels.astype(float)
+    found = values["splits"]["unseen"]["errors"]
+    assert found["w"]["all"]["rmse"] == pytest.approx(np.sqrt(np.mean((said[:, 0] - labels[:, 0]) ** 2)), rel=1e-4)
+    energy, told = unseen.column("energy_joule"), said[:, 0] / said[:, 1]
+    assert found["E"]["all"]["mape_percent"] == pytest.approx(100 * np.mean(np.abs(told - energy) / energy), rel=1e-4)
+    mud = unseen.column("terrain_class") == 5
+    times, told = unseen.column("duration_s")[mud], 1.0 / said[mud, 1]
+    assert found["T"]["mud"]["rmse"] == pytest.approx(np.sqrt(np.mean((told - times) ** 2)), rel=1e-4)
+    expected = values["time"]["expected time"]["unseen"]
+    assert expected["mape_percent"] == pytest.approx(
+        100 * np.mean(np.abs(1.0 - unseen.column("duration_s")) / unseen.column("duration_s"))
+    )
+
+
+def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):
+    """Replacing a layer by hand gives the same figures; no noise gives the model's own."""
+    ours, test = load_model(model), open_dataset(dataset)["test"]
+    patches = test.patches.copy()
+    patches[..., 1] = np.random.default_rng([7, 1]).random(patches.shape[:3], np.float32)
+    by_hand = ours.predict(patches)[:, 0]
+    assert predicted_costs(ours, test, noise=["terrain"], seed=(7, 1))["w"] == pytest.approx(by_hand, rel=1e-5)
+    assert predicted_costs(ours, test)["w"] == pytest.approx(ours.predict(test.patches)[:, 0], rel=1e-5)
+
+
+def test_seven_input_sets(evaluated):
+    _, values = evaluated
+    rows = {"".join(row["layers"]): row for row in values["ablation"]}
+    assert list(rows) == ["OCH", "CH", "OH", "OC", "O", "C", "H"]
+    assert rows["OCH"]["test"]["w"] == values["splits"]["test"]["errors"]["w"]["all"]
+    assert rows["O"]["test"]["w"] != rows["OCH"]["test"]["w"]
+
+
+def test_its_files_say_the_same(evaluated):
+    place, values = evaluated
+    assert json.loads((place / "evaluation.json").read_text()) == values
+    with (place / "evaluation.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    row = next(
+        row
+        for row in rows
+        if (row["split"], row["what"], row["quantity"], row["class"]) == ("unseen", "errors", "E", "mud")
+    )
+    assert float(row["rmse"]) == values["splits"]["unseen"]["errors"]["E"]["mud"]["rmse"]
+    page = (place / "evaluation.html").read_text()
+    for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "<svg"):
+        assert told in page
+    assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
+        "http://creativecommons.org", ""
+    )
+
+
+def test_a_class_that_the_model_never_saw_is_said(evaluated):
+    _, values = evaluated
+    assert any(line.startswith("mud: ") and "the model never saw this class" in line for line in values["warnings"])
+    assert any("trained on another dataset" in line for line in values["warnings"])
+
+
+def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):
+    place, values = evaluated
+    monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", None)
+    assert run_evaluation(model, dataset, place, config=CONFIG).values == values
+
+
+def test_a_model_that_does_not_fit_is_told_every_reason(dataset, tmp_path):
+    grass = replace(PAPER_CLASSES.classes[3], name="lawn")
+    classes = ClassTable((*PAPER_CLASSES.classes[:3], grass, *PAPER_CLASSES.classes[4:]))
+    place = made_model(tmp_path / "other", classes=classes, chord_m=2.0, label_velocity="fused", training=CARD.training)
+    with pytest.raises(ModelError) as told:
+        run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
+    told = "\n".join(told.value.problems)
+    for reason in (
+        "id 4 is lawn",
+        "segment.chord_m is 2.0 in the model, 1.0 in the dataset",
+        "label.velocity is 'fused'",
+    ):
+        assert reason in told
+
+
+def test_a_folder_of_something_else_is_left_alone(model, dataset, tmp_path):
+    (tmp_path / "thesis.txt").write_text("important")
+    with pytest.raises(UsageError, match="exists and is no evaluation"):
+        run_evaluation(model, dataset, tmp_path, config=CONFIG)

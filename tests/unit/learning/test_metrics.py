@@ -1,0 +1,83 @@
+"""RMSE and MAPE, alone and combined, against hand calculations and against the samples pooled."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from tcpipe.learning.metrics import ALL, LEAST, combined, costs, errors, errors_by_class, label_floor, mean_of_draws
+
+_VALUES = st.floats(20.0, 500.0)
+
+
+def test_by_hand():
+    found = errors(np.array([110.0, 190.0]), np.array([100.0, 200.0]))
+    assert found.count == found.mape_count == 2
+    assert found.rmse == pytest.approx(10.0)
+    assert found.mape_percent == pytest.approx(7.5)
+
+
+def test_a_label_near_nothing_is_in_the_rmse_alone():
+    found = errors(np.array([110.0, 5.0]), np.array([100.0, -3.0]), LEAST["w"])
+    assert (found.count, found.mape_count) == (2, 1)
+    assert found.mape_percent == pytest.approx(10.0)
+    assert found.rmse == pytest.approx(np.sqrt((100.0 + 64.0) / 2.0))
+
+
+@given(
+    st.integers(1, 40).flatmap(
+        lambda n: st.tuples(
+            *(arrays(float, n, elements=_VALUES) for _ in range(2)), arrays(int, n, elements=st.integers(4, 7))
+        )
+    )
+)
+def test_all_is_the_samples_pooled(drawn):
+    predicted, measured, class_ids = drawn
+    names = {4: "grass", 5: "mud", 6: "unpaved road", 7: "paved road"}
+    by_class = errors_by_class({"E": predicted}, {"E": measured}, class_ids, names)["E"]
+    pooled = errors(predicted, measured, LEAST["E"])
+    assert by_class[ALL].count == len(predicted)
+    assert by_class[ALL].rmse == pytest.approx(pooled.rmse, rel=1e-9, abs=1e-9)
+    assert by_class[ALL].mape_percent == pytest.approx(pooled.mape_percent, rel=1e-9, abs=1e-9)
+    assert set(by_class) - {ALL} == {names[number] for number in class_ids}
+
+
+def test_the_papers_own_all_is_its_classes_combined():
+    """MAPE weighted by count, RMSE in quadrature: with the shares of classes in all its data its table I nearly gives its column All."""
+    from tcpipe.learning.metrics import Errors
+    from tcpipe.learning.paper_tables import BY_CLASS
+
+    shares = np.array([51, 9, 20, 20])
+    for quantity in "wE":
+        rmse, mape = (BY_CLASS["test", quantity, measure] for measure in ("rmse", "mape_percent"))
+        parts = [Errors(int(n), r, m, int(n)) for n, r, m in zip(shares, rmse[:4], mape[:4], strict=True)]
+        assert combined(parts).rmse == pytest.approx(rmse[4], rel=0.1)
+        assert combined(parts).mape_percent == pytest.approx(mape[4], rel=0.1)
+
+
+def test_nothing_combined_is_no_number():
+    assert np.isnan(combined([]).rmse)
+    assert np.isnan(combined([]).mape_percent)
+
+
+def test_draws_are_averaged():
+    draws = [errors(np.array([100.0 + d]), np.array([100.0])) for d in (1.0, 3.0)]
+    assert mean_of_draws(draws).rmse == pytest.approx(2.0)
+    assert mean_of_draws(draws).mape_percent == pytest.approx(2.0)
+
+
+def test_time_and_energy_follow_from_power_and_velocity():
+    found = costs(np.array([150.0]), np.array([0.75]), 1.5)
+    assert found["T"][0] == pytest.approx(2.0)
+    assert found["E"][0] == pytest.approx(300.0)
+
+
+def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
+    rng = np.random.default_rng(5)
+    truth, sigma = rng.uniform(100.0, 300.0, 200_000), rng.uniform(2.0, 9.0, 200_000)
+    labels, ids = truth + sigma * rng.standard_normal(truth.size), np.full(truth.size, 4)
+    told = label_floor({"w": sigma}, {"w": labels}, ids, {4: "grass"})["w"][ALL]
+    seen = errors(truth, labels, LEAST["w"])
+    assert told.rmse == pytest.approx(seen.rmse, rel=0.01)
+    assert told.mape_percent == pytest.approx(seen.mape_percent, rel=0.01)

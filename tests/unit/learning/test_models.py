@@ -1,0 +1,89 @@
+"""Model folders: what is read is what was written, and anything else is one plain line."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from made_models import CARD, made_model
+
+from tcpipe.errors import ModelError
+from tcpipe.learning.models import WEIGHTS, load_model
+
+pytest.importorskip("torch")
+pytest.importorskip("keras")
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return made_model(tmp_path_factory.mktemp("made") / "model")
+
+
+def _refused(place, match):
+    with pytest.raises(ModelError, match=match) as told:
+        load_model(place)
+    assert len(told.value.problems) == 1
+
+
+def test_it_predicts_the_same_in_any_company(place):
+    model = load_model(place)
+    assert model.card == CARD
+    patches = np.random.default_rng(3).random((300, 40, 40, 3), np.float32)
+    whole = model.predict(patches)
+    assert whole.shape == (300, 2)
+    assert whole.dtype == np.float32
+    assert model.predict(patches[7:8]) == pytest.approx(whole[7:8], rel=1e-4)
+    assert model.predict(patches[:0]).shape == (0, 2)
+    assert model.checksum == load_model(place).checksum
+
+
+def test_velocity_is_never_nothing(tmp_path):
+    slow = load_model(made_model(tmp_path / "slow", scale=(400.0, 1e-3)))
+    assert slow.predict(np.zeros((2, 40, 40, 3), np.float32))[:, 1] == pytest.approx(0.05)
+
+
+def test_patches_of_another_shape(place):
+    with pytest.raises(
+        ModelError, match=r"patches of shape \(40, 40, 2\), wanted \(40, 40, 3\): ortho, terrain, height"
+    ):
+        load_model(place).predict(np.zeros((1, 40, 40, 2), np.float32))
+
+
+def test_no_model_and_half_a_model(tmp_path, place):
+    _refused(tmp_path / "nowhere", "there is no such model; run 'tcpipe train' first")
+    _refused(tmp_path, "not a model: it has no model.json")
+    cut = made_model(tmp_path / "cut")
+    (cut / WEIGHTS).write_bytes((cut / WEIGHTS).read_bytes()[:-100])
+    _refused(cut, "weights.npz: gone, cut short or damaged")
+
+
+@pytest.mark.parametrize(
+    ("change", "match"),
+    [
+        ({"schema_version": 99}, "written by model schema 99, wanted 1; train the model again"),
+        ({"kind": "tcpipe dataset"}, "not the card of a tcpipe model"),
+        ({"scale": None}, "model.json: incomplete"),
+    ],
+)
+def test_another_card(tmp_path, change, match):
+    place = made_model(tmp_path / "model")
+    card = json.loads((place / "model.json").read_text())
+    (place / "model.json").write_text(json.dumps({**card, **change}))
+    _refused(place, match)
+
+
+def test_a_card_is_read_without_keras(place):
+    program = f"""
+import sys
+from tcpipe.learning.models import load_model
+assert load_model({str(place)!r}).class_counts == {{4: 60, 6: 25, 7: 15}}
+assert not {{"keras", "torch"}} & set(sys.modules)
+"""
+    subprocess.run([sys.executable, "-c", program], check=True)
+
+
+def test_without_keras_there_is_one_line(place, monkeypatch):
+    monkeypatch.setattr("tcpipe.learning.keras_backend.find_spec", lambda _: None)
+    with pytest.raises(ModelError, match=r"keras and torch not installed, .* pip install 'tcpipe\[train\]'"):
+        load_model(place).predict(np.zeros((1, 40, 40, 3), np.float32))

@@ -1,0 +1,42 @@
+"""The best predictor of simulated costs, against the simulator's own truth where nothing is hidden."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tcpipe.learning.plant_floor import plant_costs
+from tcpipe.simulation.drive import drive
+from tcpipe.simulation.paper_site import paper_site
+from tcpipe.simulation.route import Leg, Pause
+from tcpipe.simulation.scenarios import small_world
+from tcpipe.simulation.truth import true_cost
+
+
+class _Chords:
+    """Samples by the ends of their chords."""
+
+    def __init__(self, **columns):
+        self.column = columns.__getitem__
+
+
+def test_without_hidden_effects_the_truth_is_what_it_says():
+    robot = replace(paper_site().robot, resistance_noise=0.0, scrub_torque_nm=0.0)
+    world = replace(small_world(), resistance=())
+    plan = [Pause(1.0), Leg(((56.0, 52.0),)), Pause(1.0)]
+    truth = drive(world, plan, start_m=(6.0, 52.0), robot=robot, weave_m=0.0, rng=np.random.default_rng(0))
+    steady = np.flatnonzero((truth.command_velocity_mps > 0.99) & (truth.forward_velocity_mps > 0.5))[300:-600:100]
+    start = truth.stamp_ns[steady]
+    cost = true_cost(truth, start)
+    end = truth.at(cost.end_ns.astype(np.int64))
+    chords = _Chords(
+        start_lon_deg=truth.lon_deg[steady], start_lat_deg=truth.lat_deg[steady],
+        end_lon_deg=end.lon_deg, end_lat_deg=end.lat_deg,
+    )  # fmt: skip
+    told = plant_costs(world, robot, chords)
+    assert len(start) > 40
+    assert np.ptp(np.degrees(truth.slope_rad[steady])) > 20.0
+    assert told["v"] == pytest.approx(cost.velocity_mps, rel=0.02)
+    assert told["T"] == pytest.approx(cost.duration_s, rel=0.02)
+    assert told["E"] == pytest.approx(cost.energy_joule, rel=0.05)
+    assert np.median(np.abs(told["E"] / cost.energy_joule - 1.0)) < 0.01

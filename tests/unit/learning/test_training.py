@@ -1,0 +1,157 @@
+"""Training: seeded, stopped by a fold of train, gone on from a checkpoint as if nothing had happened."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import DatasetError, ModelError
+from tcpipe.formats.weights import read_arrays
+from tcpipe.learning import fitting
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
+from tcpipe.learning.training import Variant, train, training_task
+
+pytest.importorskip("torch")
+pytest.importorskip("keras")
+
+CONFIG = FitConfig(width=4, epochs=3, patience=3, learning_rate=1e-3)
+
+
+def _weights(place):
+    return read_arrays(place / WEIGHTS)
+
+
+def _same(one, other):
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+@pytest.fixture(scope="module")
+def trained(dataset, tmp_path_factory):
+    place = tmp_path_factory.mktemp("trained") / "model"
+    return place, train(dataset, place, config=CONFIG)
+
+
+def test_it_learns_and_says_how(trained):
+    place, result = trained
+    with (place / HISTORY).open() as stream:
+        history = list(csv.DictReader(stream))
+    held = [float(row["held_out_loss"]) for row in history]
+    assert len(history) == result.epochs == 3
+    assert result.best_epoch == 1 + int(np.argmin(held))
+    assert result.held_out_loss == pytest.approx(min(held))
+    assert float(history[-1]["loss"]) < float(history[0]["loss"])
+    assert 0.0 < result.spent.feeding_share < 1.0
+    assert not list(place.parent.glob("*.checkpoint"))
+
+
+def test_the_model_knows_what_it_was_trained_on(trained, dataset):
+    place, _ = trained
+    model, (fit, held) = load_model(place), open_dataset(dataset)["train"].fold(0)
+    ids, counts = np.unique(fit.column("terrain_class"), return_counts=True)
+    assert model.class_counts == dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    slopes = fit.column("slope_rad")
+    assert model.seen["slope_rad"] == (slopes.min(), slopes.max())
+    heights = fit.layers(np.arange(len(fit)))["height"].astype(float) * 0.0005
+    reliefs = heights.max(axis=(1, 2)) - heights.min(axis=(1, 2))
+    assert model.seen["relief_m"] == pytest.approx((reliefs.min(), reliefs.max()))
+    assert model.card.scale == pytest.approx(tuple(open_dataset(dataset)["train"].labels.max(axis=0)))
+    assert sorted(model.residuals["sample_id"]) == sorted(held.column("sample_id"))
+    order = np.argsort(np.argsort(held.column("sample_id")))
+    said = model.predict(held.patches)[np.argsort(held.column("sample_id"))][order]
+    by_id = dict(zip(model.residuals["sample_id"], model.residuals["power_predicted_watt"], strict=True))
+    assert said[:, 0] == pytest.approx([by_id[name] for name in held.column("sample_id")], rel=1e-4)
+
+
+def test_the_same_again_is_nothing_to_do(trained, dataset):
+    place, _ = trained
+    assert train(dataset, place, config=CONFIG).status == "unchanged"
+
+
+def test_a_stopped_training_goes_on_as_if_nothing_had_happened(trained, dataset, tmp_path, monkeypatch):
+    whole, real, epochs = trained[0], fitting.write_checkpoint, []
+
+    def write_and_stop(path, progress, parts):
+        real(path, progress, parts)
+        epochs.append(progress.epoch)
+        if progress.epoch == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(fitting, "write_checkpoint", write_and_stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, tmp_path / "model", config=CONFIG)
+    assert not (tmp_path / "model").exists()
+    monkeypatch.setattr(fitting, "write_checkpoint", real)
+    train(dataset, tmp_path / "model", config=CONFIG)
+    assert epochs == [1, 2]
+    assert _same(_weights(whole), _weights(tmp_path / "model"))
+    assert (whole / HISTORY).read_bytes() == (tmp_path / "model" / HISTORY).read_bytes()
+
+    checkpoint = tmp_path / "other.checkpoint"
+    monkeypatch.setattr(fitting, "write_checkpoint", write_and_stop)
+    with pytest.raises(KeyboardInterrupt):
+        train(dataset, tmp_path / "other", config=CONFIG)
+    monkeypatch.setattr(fitting, "write_checkpoint", real)
+    with pytest.raises(ModelError, match=r"other.checkpoint: of another dataset or other options; .* --fresh"):
+        train(dataset, tmp_path / "other", config=replace(CONFIG, seed=1))
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
+    with pytest.raises(
+        ModelError, match=r"other.checkpoint: cut short or damaged .*; remove it, or start anew with --fresh"
+    ) as told:
+        train(dataset, tmp_path / "other", config=CONFIG)
+    assert len(told.value.problems) == 1
+
+
+def test_another_seed_is_another_model(trained, dataset, tmp_path):
+    train(dataset, tmp_path / "model", config=replace(CONFIG, seed=1, epochs=1))
+    assert not _same(_weights(trained[0]), _weights(tmp_path / "model"))
+
+
+def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
+    """With all deviations alike weights change nothing; with one class's a hundred times larger they do."""
+    from tcpipe.dataset.split import Split
+
+    config = replace(CONFIG, epochs=1)
+    train(dataset, tmp_path / "plain", config=config)
+    real = Split.weights.fget
+    monkeypatch.setattr(Split, "weights", property(lambda split: np.ones_like(real(split))))
+    train(dataset, tmp_path / "alike", config=replace(config, weights=True))
+    assert _same(_weights(tmp_path / "plain"), _weights(tmp_path / "alike"))
+    monkeypatch.setattr(
+        Split,
+        "weights",
+        property(lambda split: np.where(split.column("terrain_class")[:, None] == 4, 1.0, 0.01).astype(np.float32)),
+    )
+    train(dataset, tmp_path / "unlike", config=replace(config, weights=True))
+    assert not _same(_weights(tmp_path / "plain"), _weights(tmp_path / "unlike"))
+
+
+def test_a_variant_has_its_own_channels_classes_and_output(dataset):
+    task = training_task(open_dataset(dataset), 0, Variant(channels=("height",), classes=(4,), energy_only=True))
+    assert task.fit.channels == ("height",)
+    assert set(task.fit.column("terrain_class")) == {4}
+    assert task.outputs == ("energy_joule",)
+    batch = next(iter(task.fit.batches(8, features=("energy_joule",))))
+    assert batch[0][0].shape == (8, 40, 40, 1)
+
+
+def test_the_fold_is_of_train_alone(dataset):
+    data = open_dataset(dataset)
+    task = training_task(data, 1, Variant())
+    train_ids = set(data["train"].column("sample_id"))
+    fit, held = set(task.fit.column("sample_id")), set(task.held.column("sample_id"))
+    assert fit | held == train_ids
+    assert not fit & held
+
+
+def test_what_cannot_be_trained_on(dataset, tmp_path):
+    with pytest.raises(DatasetError, match="fold 9 of train leaves"):
+        train(dataset, tmp_path / "model", config=replace(CONFIG, fold=9))
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("important")
+    with pytest.raises(ModelError, match="exists and is no model; it is left alone"):
+        train(dataset, tmp_path / "mine", config=CONFIG)
+    with pytest.raises(DatasetError, match="no labelled samples in split train"):
+        training_task(open_dataset(dataset), 0, Variant(classes=(1,)))
