@@ -88,13 +88,15 @@ def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, st
     turning : sensors whose yaw rate the gyroscope confirms: the robot does drive when they say so.
     """
     sensors = [name for name in found.chord_m if name != COMMAND]
-    voices = {name: sum(found.agree(name, other) for other in found.chord_m if other != name) for name in sensors}
+    heard = {name: [other for other in found.chord_m if other != name and found.agree(name, other)] for name in sensors}
     why: dict[str, str] = {}
     for slow, fast, ratio in _differing(found, sensors):
         still = ratio > 1 / _STILL
-        if still and fast == WHEELS and fast not in turning and not voices[fast]:
+        # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
+        for_fast = len(set(heard[fast]) - {COMMAND}) + (fast in turning) if still else len(heard[fast])
+        for_slow = len(heard[slow])
+        if still and fast == WHEELS and not for_fast:
             continue  # the wheels turn, the robot stands: stuck
-        for_fast, for_slow = voices[fast] + (still and fast in turning), voices[slow]
         doubt = ", and nothing tells which of the two is right" if for_fast == for_slow else ""
         if for_slow <= for_fast:
             why.setdefault(slow, _text(fast, 1 / ratio) + doubt + _radians(slow, 1 / ratio))
