@@ -162,6 +162,8 @@ class RasterLayer:
         if (low >= high).any():
             return
         values, valid = self.raster.read(int(low[1]), int(high[1]), int(low[0]), int(high[0]))
+        if not valid.any():  # the most of a survey that is laid across its bounding box
+            return
         ratio = _source_px_per_px(lattice)
         lattice -= low
         parts = math.ceil(ratio) if ratio > _MEAN_FROM else 1

@@ -164,4 +164,9 @@ def source_lattice(  # noqa: PLR0917
     j = col0 - step + step * np.arange(-(-cols // step) + 3)
     px = np.stack(np.broadcast_arrays(j[None, :].astype(np.float64), i[:, None].astype(np.float64)), axis=-1)
     xy_m = grid.xy_from_px(px)
-    return raster.px_from_xy(xy_m if projection is None else projection.inverse(xy_m))
+    if projection is None:
+        return raster.px_from_xy(xy_m)
+    xy = projection.inverse(xy_m)
+    if raster.crs.is_geographic:  # a raster across the antimeridian counts on beyond 180°
+        xy[..., 0] += 360.0 * np.round((raster.centre()[0] - xy[..., 0]) / 360.0)
+    return raster.px_from_xy(xy)

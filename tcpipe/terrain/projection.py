@@ -76,9 +76,14 @@ def metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
     a, e2 = _ellipsoid(crs)
     w = 1.0 - e2 * np.sin(latitude) ** 2
     per_degree = np.stack([a / np.sqrt(w) * np.cos(latitude), a * (1.0 - e2) / w**1.5]) * (math.pi / 180.0)
-    columns = [difference * per_degree / (2.0 * step) for difference in (east - west, north - south)]
+    columns = [_wrapped(ahead - behind) * per_degree / (2.0 * step) for ahead, behind in ((east, west), (north, south))]
     found = np.stack(columns, axis=-1).swapaxes(0, 1)
     return np.where(np.isfinite(found), found, np.nan)
+
+
+def _wrapped(lonlat_deg: FloatArray) -> FloatArray:
+    """Return differences of longitude and latitude, shape (2, N) [deg], the short way around the earth."""
+    return np.stack([(lonlat_deg[0] + 180.0) % 360.0 - 180.0, lonlat_deg[1]])
 
 
 def _ellipsoid(crs: CRS) -> tuple[float, float]:

@@ -7,6 +7,7 @@ import numpy as np
 import pyproj
 import pytest
 import rasterio
+import rasterio.shutil
 from map_worlds import World, write_tif
 from rasterio import Affine
 from rasterio.control import GroundControlPoint
@@ -118,6 +119,49 @@ def test_a_raster_that_is_not_metric_goes_to_its_utm_zone(tmp_path, crs):
     _, source = built(tmp_path, height=tmp_path / "h.tif")
     assert source.grid.crs == "EPSG:32633"
     assert source.grid.pitch_m == pytest.approx(0.4, rel=0.02)
+
+
+@pytest.mark.parametrize("west_deg", [179.9999, -180.0001])
+def test_a_raster_across_the_antimeridian_is_whole(tmp_path, west_deg):
+    """In degrees, 21 m wide; heights rise by 1 m a pixel of 1e-6 degrees from one side to the other."""
+    affine = Affine(1e-6, 0.0, west_deg, 0.0, -1e-6, -16.5)
+    values = np.tile(np.arange(200, dtype=np.float32), (1, 200, 1))
+    write_tif(tmp_path / "h.tif", values, "EPSG:4326", affine)
+    summary, source = built(tmp_path, height=tmp_path / "h.tif")
+    assert summary.covered["height"] > 0.9
+    x, y = centres(source.grid)
+    lon, _ = pyproj.Transformer.from_crs(source.grid.crs, "EPSG:4326", always_xy=True).transform(x, y)
+    wanted = ((lon - west_deg + 180.0) % 360.0 - 180.0) / 1e-6 - 0.5
+    found = heights(source)
+    assert np.nanmax(np.abs(found - wanted)) < 0.01
+
+
+def test_heights_that_are_none_are_told_from_metres(tmp_path):
+    values = raster_of(plane, NORTH_UP)
+    values[0, :9] = -9999.0
+    path = write_tif(tmp_path / "h.tif", values, WORLD.crs, NORTH_UP)
+    with pytest.raises(MapError, match=r"say in the file that -9999 is no data \(gdal_edit -a_nodata -9999\)"):
+        built(tmp_path, height=path)
+
+
+FORMATS = ("AAIGrid", "HFA", "VRT", "ENVI", "COG", "GPKG")
+
+
+@pytest.mark.parametrize("driver", FORMATS)
+def test_what_gdal_reads_is_a_raster(tmp_path, driver):
+    path = write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    rasterio.shutil.copy(path, tmp_path / "copy.x", driver=driver)
+    _, source = built(tmp_path, height=tmp_path / "copy.x")
+    assert check_plane(source).all()
+
+
+@pytest.mark.parametrize(("options", "value"), [({"nbits": 1}, 1), ({"photometric": "YCBCR", "compress": "jpeg"}, 120)])
+def test_orthophotos_of_odd_kinds_become_grey(tmp_path, options, value):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    bands = 3 if "photometric" in options else 1
+    write_tif(tmp_path / "o.tif", np.full((bands, 400, 400), value, np.uint8), WORLD.crs, NORTH_UP, **options)
+    _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "o.tif")
+    assert np.unique(source.read("ortho", 0, 400, 0, 400)).tolist() == [255 if bands == 1 else value]
 
 
 def test_layers_on_other_grids_are_put_on_the_finest(tmp_path):
