@@ -1,10 +1,10 @@
 """Reading a log into tables: CPU time against rosbags, rerun and the mere reading and decompressing of the chunks ("floor").
 
-Run by hand: ``python benchmarks/read_logs.py [--quick] [--rerun PYTHON] [--huge GB] [--only PART]``. Logs are made in a temporary
-directory; reads alternate in one process, the least of some times counts; what is read is compared before anything is timed.
-``--quick`` takes a log of one minute instead of ten: all is done in some two minutes, but what is paid once a log weighs more.
-``--rerun`` names the Python of an environment in which rerun-sdk is installed; without it those lines say so. ``--huge`` adds the
-memory that reading a log of so many GB takes, which needs as much room on the disk.
+Run by hand: ``python benchmarks/read_logs.py [--quick | --minutes M] [--rerun PYTHON] [--huge GB] [--only PART]``.
+Logs are made in a temporary directory; reads alternate in one process, the least of some times counts; what is read is compared
+before anything is timed. ``--quick`` takes logs of one minute instead of ten: all is done in some two minutes on an idle machine, but
+what is paid once a log weighs more. ``--rerun`` names the Python of an environment in which rerun-sdk is installed; without it those
+lines say so. ``--huge`` adds the memory that reading a log of so many GB takes, which needs as much room on the disk.
 """
 
 import argparse
@@ -355,25 +355,25 @@ def memory_rows(directory: Path, gigabytes: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser()
-    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="length of the logs")
+    parser.add_argument("--quick", action="store_const", dest="minutes", const=QUICK_MINUTES)
     parser.add_argument("--rerun", metavar="PYTHON")
     parser.add_argument("--huge", type=float, metavar="GB")
     parser.add_argument("--only", default="", metavar="PART", help="mcap, zstd, other, start or huge")
     parser.add_argument("--scratch", type=Path, metavar="DIR", help="where to make the logs")
     given = parser.parse_args()
-    minutes = QUICK_MINUTES if given.quick else MINUTES
     rerun = Rerun(given.rerun)
     with tempfile.TemporaryDirectory(dir=given.scratch) as scratch:
         directory = Path(scratch)
         parts: dict[str, Callable[[], None]] = {
-            "mcap": lambda: mcap_rows(directory, minutes, rerun),
-            "zstd": lambda: zstd_rows(directory, minutes, rerun),
-            "other": lambda: other_rows(directory, minutes, rerun),
+            "mcap": lambda: mcap_rows(directory, given.minutes, rerun),
+            "zstd": lambda: zstd_rows(directory, given.minutes, rerun),
+            "other": lambda: other_rows(directory, given.minutes, rerun),
             "start": start_up,
         }
         if given.huge:
             parts["huge"] = lambda: memory_rows(directory, given.huge)
-        print(f"{minutes:g} min of log, least CPU time of {REPEATS} alternating reads")
+        print(f"{given.minutes:g} min of log, least CPU time of {REPEATS} alternating reads")
         print(f"{'figure':66s} {'target':>8s} {'found':>9s}")
         for name, run in parts.items():
             if given.only in name:
