@@ -21,6 +21,13 @@ help:
 	$(PIP) install --quiet --require-hashes -r requirements-dev.lock
 	@touch $@
 
+# PyTorch is pinned by version alone, since its CPU and CUDA builds differ in hash; `make test TORCH=` leaves out what needs it.
+TORCH ?= torch==2.13.0
+.venv/installed-train: .venv/installed-dev requirements-train.lock
+	$(PIP) install --quiet --require-hashes -r requirements-train.lock
+	$(PIP) install --quiet $(TORCH)
+	@touch $@
+
 demo: .venv/installed
 	$(BIN)/tcpipe demo tcpipe-demo
 
@@ -30,14 +37,17 @@ check: .venv/installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-test: check
+test: check $(if $(TORCH),.venv/installed-train)
 	$(BIN)/pytest -n 2 --dist loadfile
 
 # The locks: hashes, no registry address. Needs uv; run it when pyproject.toml's dependencies change.
-UV_LOCK := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet
+# The one for training holds Keras and what PyTorch needs beside itself.
+UV_LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet
 lock:
-	$(UV_LOCK) --extra build --output-file requirements.lock
-	$(UV_LOCK) --extra build --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+	$(UV_LOCK) pyproject.toml --extra build --output-file requirements.lock
+	$(UV_LOCK) pyproject.toml --extra build --extra dev --constraint requirements.lock --output-file requirements-dev.lock
+	printf '%s\n' 'keras>=3.8' filelock fsspec jinja2 networkx setuptools sympy typing-extensions | \
+	  $(UV_LOCK) - --constraint requirements-dev.lock --output-file requirements-train.lock
 
 schemas: .venv/installed
 	$(BIN)/tcpipe schemas schemas

@@ -9,7 +9,9 @@ from pathlib import Path
 COMMAND = Path(sys.executable).parent / "tcpipe"
 
 
-def tcpipe(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+def tcpipe(
+    *arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None, timeout_s: float = 300.0
+) -> subprocess.CompletedProcess[str]:
     """Run the command; nothing of the caller's TCPIPE_ environment reaches it."""
     clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")}
     return subprocess.run(
@@ -18,7 +20,7 @@ def tcpipe(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = No
         env={**clean, **(env or {})},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=timeout_s,
         check=False,
     )
 

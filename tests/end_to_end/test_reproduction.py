@@ -1,0 +1,86 @@
+"""Train, evaluate and reproduce through the installed command, from a simulated site to the claims."""
+
+import json
+import os
+
+import pytest
+from installed_command import plain_lines, tcpipe
+
+pytest.importorskip("torch")
+pytest.importorskip("keras")
+
+ENV = {"OMP_NUM_THREADS": "1", "KERAS_BACKEND": os.environ["KERAS_BACKEND"]}
+
+
+@pytest.fixture(scope="module")
+def reproduced(tmp_path_factory):
+    here = tmp_path_factory.mktemp("reproduced")
+    done = tcpipe(
+        "reproduce", "here", "--quick", cwd=here, env=ENV, timeout_s=1200.0
+    )  # one and a half minutes on an idle machine
+    assert done.returncode == 0, done.stderr
+    return here, done
+
+
+def test_every_claim_is_printed_as_it_stands(reproduced):
+    here, done = reproduced
+    found = json.loads((here / "here" / "reproduction.json").read_text())
+    lines = done.stdout.splitlines()
+    assert "simulated" in lines[0]
+    verdicts = [line.partition(":")[0] for line in lines if line.startswith(("held:", "NOT held:", "not measured:"))]
+    assert [verdict == "held" for verdict in verdicts] == [claim["held"] for claim in found["claims"]]
+    assert len(verdicts) == 13
+    assert f"{sum(claim['held'] for claim in found['claims'])} of 13 claims held" in lines
+    for claim in found["claims"]:
+        if claim["ratio"] is not None:
+            assert claim["held"] == (
+                claim["ratio"] >= claim["wanted"] if claim["at_least"] else claim["ratio"] <= claim["wanted"]
+            )
+
+
+def test_every_page_says_that_the_data_are_simulated(reproduced):
+    here, _ = reproduced
+    for page in ("reproduction.html", "seed-0/evaluation/evaluation.html"):
+        assert "The data are simulated" in (here / "here" / page).read_text()
+
+
+def test_even_a_quick_network_learns_that_slope_costs_time(reproduced):
+    here, _ = reproduced
+    values = json.loads((here / "here" / "seed-0" / "evaluation" / "evaluation.json").read_text())
+    for split in ("test", "unseen"):
+        ours, expected = (values["time"][who][split]["mape_percent"] for who in ("ours", "expected time"))
+        assert ours < expected
+        floor = values["splits"][split]["simulation_floor"]["E"]["all"]
+        assert floor["mape_percent"] < values["splits"][split]["errors"]["E"]["all"]["mape_percent"]
+
+
+def test_again_is_nothing_to_do(reproduced):
+    here, first = reproduced
+    before = (here / "here" / "reproduction.json").read_bytes()
+    again = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)
+    assert again.returncode == 0
+    assert "epoch" not in again.stderr
+    assert (here / "here" / "reproduction.json").read_bytes() == before
+    assert again.stdout.splitlines()[:-2] == first.stdout.splitlines()[:-2]
+
+
+def test_train_and_evaluate_by_hand(reproduced):
+    here, _ = reproduced
+    trained = tcpipe("train", "here/dataset", "model", "--width", "4", "--epochs", "1", cwd=here, env=ENV)
+    assert trained.returncode == 0, trained.stderr
+    assert "% of the time feeding" in trained.stdout
+    done = tcpipe("evaluate", "model", "here/dataset", "--no-baselines", "--draws", "1", "--json", cwd=here, env=ENV)
+    assert set(json.loads(done.stdout)["splits"]) == {"test", "unseen"}
+    page = (here / "evaluation" / "evaluation.html").read_text()
+    assert "The data are simulated" not in page  # a dataset does not say so of itself
+
+
+def test_bad_input_is_one_plain_line(reproduced):
+    here, _ = reproduced
+    assert "there is no such directory" in plain_lines(tcpipe("train", "nowhere", cwd=here, env=ENV), 1)
+    assert "run 'tcpipe train' first" in plain_lines(
+        tcpipe("evaluate", "nowhere", "here/dataset", cwd=here, env=ENV), 1
+    )
+    (here / "mine").mkdir()
+    (here / "mine" / "thesis.txt").write_text("important")
+    assert "is no reproduction" in plain_lines(tcpipe("reproduce", "mine", "--quick", cwd=here, env=ENV), 2)
