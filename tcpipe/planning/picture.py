@@ -13,15 +13,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from tcpipe.formats.atomic import atomic_file
 from tcpipe.planning.plan import Plan
-from tcpipe.report.figures import CLASS_COLOURS
 from tcpipe.tables.columns import floats
-from tcpipe.terrain.overviews import factor_for
-from tcpipe.terrain.tiles import MapReader, read_window
+from tcpipe.terrain.tiles import MapReader, level_for, read_window
 
 Array = NDArray[Any]
 
@@ -29,6 +28,12 @@ _INK, _FAINT = "#1d2830", "#7b8893"
 _COLOURS = {"energy": "#d4600c", "time": "#1668b8", "distance": "#4a4f55"}
 _LINES = {"energy": "-", "time": "-", "distance": (0, (5, 2))}
 _PANEL_PX = 900
+_TINTS = ("#b4535f", "#1f5a33", "#5d7f3a", "#93c46c", "#7a4b22", "#dcbc7e", "#a3a8b0")
+"""Of the paper's classes in order: obstacle, tree, vegetation, grass, mud, unpaved, paved; other tables go round."""
+
+_PANEL_WIDTH_IN = 4.4
+_REST_IN = 3.3
+_TITLE_IN = 0.4
 _MARGIN = 0.14
 _LEAST_SIDE_M = 40.0
 _ASPECT = 1.12
@@ -54,20 +59,27 @@ def draw_plans(path: Path, source: MapReader, plans: Sequence[Plan]) -> None:
     known = known[np.isfinite(known)]
     scale = Normalize(*(np.percentile(known, (2.0, 98.0)) if known.size else (0.0, 1.0)))
     with mpl.rc_context(_STYLE):
-        figure = Figure(figsize=(15.0, 7.6), layout="constrained", facecolor="white")
+        left, bottom, right, top = bounds
+        tall = _PANEL_WIDTH_IN * (top - bottom) / (right - left)
+        free = 1.0 - _TITLE_IN / (tall + _REST_IN)
+        figure = Figure(
+            figsize=(15.0, tall + _REST_IN),
+            layout=ConstrainedLayoutEngine(rect=(0.0, 0.0, 1.0, free)),
+            facecolor="white",
+        )
         FigureCanvasAgg(figure)
-        grid = figure.add_gridspec(2, len(plans), height_ratios=(4.3, 1.25))
+        grid = figure.add_gridspec(2, len(plans), height_ratios=(tall + 0.6, 1.35), hspace=0.03)
         panels = [figure.add_subplot(grid[0, column]) for column in range(len(plans))]
         for axes, plan, values in zip(panels, plans, spent, strict=True):
             backdrop.draw(axes)
             for other in plans:
                 if other is not plan:
-                    axes.plot(*other.xy_m.T, color="white", lw=1.4, ls=(0, (1.5, 1.5)), alpha=0.9)
+                    axes.plot(*other.xy_m.T, color="white", lw=1.6, ls=(0, (1.2, 1.6)), alpha=0.95)
             line = _draw_path(axes, plan, values, scale)
             _draw_ends(axes, plan)
             _title(axes, plan, plans)
         _scale_bar(panels[0], bounds)
-        bar = figure.colorbar(line, ax=panels, shrink=0.82, pad=0.01, aspect=32)
+        bar = figure.colorbar(line, ax=panels, shrink=0.7, pad=0.008, aspect=28)
         bar.set_label("energy a metre along the path [J/m]")
         bar.outline.set_visible(False)
         _draw_profiles(figure.add_subplot(grid[1, :]), backdrop, plans)
@@ -102,7 +114,7 @@ class _Backdrop:
 
     def __init__(self, source: MapReader, bounds: tuple[float, float, float, float]) -> None:
         left, bottom, right, top = bounds
-        level = source.at(factor_for(source.factors, source.grid.pitch_m, max(right - left, top - bottom) / _PANEL_PX))
+        level = level_for(source, max(right - left, top - bottom) / _PANEL_PX)
         corners = level.grid.px_from_xy(np.array([(left, top), (right, bottom)])) + 0.5
         (col0, row0), (col1, row1) = np.floor(corners[0]).astype(int), np.ceil(corners[1]).astype(int)
         step = max(1, max(row1 - row0, col1 - col0) // _PANEL_PX)
@@ -146,7 +158,7 @@ class _Backdrop:
 
 
 def _colour(class_id: int) -> str:
-    return CLASS_COLOURS[(class_id - 1) % len(CLASS_COLOURS)]
+    return _TINTS[(class_id - 1) % len(_TINTS)]
 
 
 def _shade(height_m: Array, pitch_m: float) -> Array:
@@ -187,9 +199,8 @@ def _draw_path(axes: Any, plan: Plan, values: Array, scale: Normalize) -> LineCo
     ends = np.r_[floats(plan.cost.pieces, "distance_m"), plan.cost.length_m]
     at = ends / ends[-1] * length[-1]
     cuts = np.stack([np.interp(at, length, points[:, axis]) for axis in (0, 1)], axis=1)
-    axes.plot(*points.T, color="white", lw=6.2, solid_capstyle="round", solid_joinstyle="round")
-    axes.plot(*points.T, color=_INK, lw=4.4, solid_capstyle="round", solid_joinstyle="round")
-    line = LineCollection(list(np.stack([cuts[:-1], cuts[1:]], axis=1)), cmap=_COST_MAP, norm=scale, linewidths=3.2)
+    axes.plot(*points.T, color="white", lw=7.0, solid_capstyle="round", solid_joinstyle="round")
+    line = LineCollection(list(np.stack([cuts[:-1], cuts[1:]], axis=1)), cmap=_COST_MAP, norm=scale, linewidths=4.2)
     line.set_array(np.ma.masked_invalid(values))
     line.set_capstyle("round")
     axes.add_collection(line)
@@ -215,14 +226,14 @@ def _draw_ends(axes: Any, plan: Plan) -> None:
 
 
 def _title(axes: Any, plan: Plan, plans: Sequence[Plan]) -> None:
-    axes.text(
-        0.0, 1.075, f"Least {plan.objective}", transform=axes.transAxes, fontsize=15, weight="bold",
-        color=_COLOURS[plan.objective],
-    )  # fmt: skip
+    colour = _COLOURS[plan.objective]
+    axes.set_title(f"Least {plan.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
     best = {name: min(other.cost.summary()[name] for other in plans) for name in _SHOWN}
     mine = plan.cost.summary()
     parts = [_said(name, mine[name], best[name]) for name in _SHOWN]
-    axes.text(0.0, 1.02, "     ".join(parts), transform=axes.transAxes, fontsize=10.5)
+    axes.annotate(
+        "     ".join(parts), (0.0, 1.0), (0, 9), xycoords="axes fraction", textcoords="offset points", fontsize=10.5
+    )
 
 
 _SHOWN = ("energy_joule", "duration_s", "length_m")

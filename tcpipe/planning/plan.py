@@ -158,6 +158,21 @@ class _Search:
         if problems:
             raise PathError(*problems)
 
+    def _check_open(self) -> None:
+        """Raise `PathError` for an end from which no course can be driven; both at once."""
+        bits = self.survey.costs.reasons.reshape(len(self.survey.costs.reasons), -1)[:, self._cells]
+        problems = []
+        for label, own in zip(("--from", "--to"), (bits & (BARRED if self.allow_unseen else 0xFFFF)).T, strict=True):
+            if own.all():
+                common = int(np.bitwise_and.reduce(own)) or int(np.bitwise_or.reduce(own))
+                words = ", ".join(name.replace("_", " ") for name in names_of(common))
+                hint = "" if self.allow_unseen or common & BARRED else ", or cross such ground with --allow-unseen"
+                problems.append(
+                    f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"
+                )
+        if problems:
+            raise PathError(*problems)
+
     def _ellipse(self, bound_m: float) -> Mask:
         """Return the cells over which a path from start to goal need not be longer than ``bound_m``, and those beside the ends."""
         grid = self.survey.costs.grid
@@ -185,6 +200,7 @@ class _Search:
         while True:
             ellipse = self._ellipse(bound_m)
             self.survey.judge(ellipse, self.step)
+            self._check_open()
             found = self._found("distance", self.survey.judged)
             if found is not None and (found.cost <= bound_m or ellipse.all()):
                 return found.cost, found
@@ -216,15 +232,7 @@ class _Search:
         return costs.grid.xy_from_px(kept), cost
 
     def _no_way(self) -> str:
-        """Say why there is no way: what start and goal stand on, or what lies between."""
-        reasons = self.survey.costs.reasons.reshape(len(self.survey.costs.reasons), -1)
-        forbidden = BARRED if self.allow_unseen else 0xFFFF
-        for name, cell in zip(("from", "to"), self._cells.tolist(), strict=True):
-            shut = [int(bits) & forbidden for bits in reasons[:, cell]]
-            if all(shut):
-                common = names_of(int(np.bitwise_and.reduce(shut))) or names_of(int(np.bitwise_or.reduce(shut)))
-                words = ", ".join(reason.replace("_", " ") for reason in common)
-                return f"--{name}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point"
+        """Say why there is no way."""
         text = f"there is no way from start to goal on map {self.survey.source.name}"
         if not self.allow_unseen:
             other = _Search(self.survey, self.ends_xy_m, self.ends_deg, allow_unseen=True, step=self.step)

@@ -74,7 +74,9 @@ def test_every_tile_is_decoded_once(made):
     assert len(source.reads) == 3 * 16
 
 
-def test_blocks_hold_every_wanted_cell_once():
+@pytest.mark.parametrize("strip", [1, 2, 29])
+def test_blocks_hold_every_wanted_cell_once(monkeypatch, strip):
+    monkeypatch.setattr("tcpipe.planning.cost_grid._STRIP_TILES", strip)
     source = plane(side_m=30.0)
     grid = grid_over(source, 0.7)
     wanted = np.random.default_rng(0).random((grid.rows, grid.cols)) < 0.6

@@ -2,13 +2,15 @@
 
 from dataclasses import replace
 
+import matplotlib.image
 import numpy as np
 import pytest
 from physics_model import PhysicsModel, velocity_mps
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import PathError
-from tcpipe.planning.plan import plan_path
+from tcpipe.planning.picture import draw_plans
+from tcpipe.planning.plan import OBJECTIVES, plan_path
 from tcpipe.planning.survey import new_survey
 
 MODEL = PhysicsModel()
@@ -99,3 +101,25 @@ def test_no_way_says_what_would_open_one():
         _plan(mud, (4.0, 4.0), (20.0, 4.0), "distance", model=grass_only)
     found = _plan(mud, (4.0, 4.0), (20.0, 4.0), "time", model=grass_only, allow_unseen=True)
     assert found.cost.reasons["class_not_seen"] >= 3
+
+
+def test_an_end_on_ground_that_is_not_known_says_so_before_all_the_map_is_looked_at():
+    source = plane(40.0, classes=lambda east, _: np.where(east > 30.0, 5, 4))
+    survey = new_survey(replace(MODEL, class_counts={4: 100}, pixel_classes=(4,)), source, 1.0)
+    with pytest.raises(PathError, match=r"--to: .*class not seen.*--allow-unseen"):
+        _plan(source, (22.0, 4.0), (33.0, 4.0), "time", survey=survey)
+    assert survey.judged.mean() < 0.5
+    assert not survey.predicted.any()
+
+
+def test_a_model_of_heights_alone_needs_no_other_layer_and_its_plans_can_be_drawn(tmp_path):
+    source = plane(30.0, rise_east=0.3)
+    del source.arrays["ortho"], source.arrays["terrain"]
+    survey = new_survey(replace(MODEL, channels=("height",)), source, 2.0)
+    plans = [_plan(source, (4.0, 4.0), (26.0, 20.0), objective, survey=survey) for objective in OBJECTIVES]
+    for name in ("one.png", "two.png"):
+        draw_plans(tmp_path / name, source, plans)
+    assert (tmp_path / "one.png").read_bytes() == (tmp_path / "two.png").read_bytes()
+    picture = matplotlib.image.imread(tmp_path / "one.png")
+    assert picture.shape[1] == 1950
+    assert np.ptp(picture[..., :3]) > 0.9
