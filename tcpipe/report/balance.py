@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from tcpipe.balance.cells import SLOPE_NAMES
@@ -15,24 +15,52 @@ def balance_sections(card: Mapping[str, Any]) -> Iterator[Section]:
     """Yield the sections; nothing for a dataset of before."""
     balance = card.get("balance")
     if balance:
-        yield _cells(balance)
+        yield _by_class(balance)
+        yield _by_speed(balance)
         yield _repeatability(balance)
 
 
-def _cells(balance: Mapping[str, Any]) -> Section:
-    seen = {row["slope"] for row in balance["by_class_and_slope"]}
-    slopes = [name for name in SLOPE_NAMES if name in seen]
-    by_class: dict[str, dict[str, str]] = {}
-    for row in balance["by_class_and_slope"]:
-        by_class.setdefault(row["class"] or "any", {})[row["slope"]] = _cell_text(row)
-    rare = sum(row["rare"] for row in balance["by_class_and_slope"])
+def _by_class(balance: Mapping[str, Any]) -> Section:
+    cells = balance["by_class_and_slope"]
     text = (
         f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_alike(balance)}). "
-        f"{rare} of {len(balance['by_class_and_slope'])} cells are worth fewer than {balance['enough_effective']:g} and marked with *; "
-        "– is ground of the map that nobody drove. drive-next.geojson holds where to drive for them; open it in a GIS."
+        f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells are worth fewer than {balance['enough_effective']:g} and marked "
+        "with *; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them; open it in a GIS."
     )
-    rows = [(name, *(cells.get(slope, "") for slope in slopes)) for name, cells in by_class.items()]
-    return Section("Balance of class and slope", text, header=("class", *slopes), rows=rows)
+    header, rows = _table(cells, "class", [(cell["class"] or "any",) for cell in cells])
+    return Section("Balance of class and slope", text, header=header, rows=rows)
+
+
+def _by_speed(balance: Mapping[str, Any]) -> Section:
+    cells = balance["cells"]
+    keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in cells]
+    header, rows = _table(cells, "class, speed [m/s]", keys)
+    return Section(
+        "Balance of class, slope and speed", "The same by the velocity that is the label.", header=header, rows=rows
+    )
+
+
+def _table(
+    cells: Sequence[Mapping[str, Any]], name: str, keys: Sequence[tuple[str, ...]]
+) -> tuple[list[str], list[list[str]]]:
+    """Return header and rows: one row a key, in order of appearance, one column a range of slope."""
+    seen = {cell["slope"] for cell in cells}
+    slopes = [slope for slope in SLOPE_NAMES if slope in seen]
+    texts = {(key, cell["slope"]): _cell_text(cell) for key, cell in zip(keys, cells, strict=True)}
+    return [name, *slopes], [
+        [", ".join(key), *(texts.get((key, slope), "") for slope in slopes)] for key in _in_order(keys)
+    ]
+
+
+def _in_order(keys: Sequence[tuple[str, ...]]) -> list[tuple[str, ...]]:
+    """Return each key once: classes as they come, which is by id, and under each its ranges of speed, rising."""
+    classes = list(dict.fromkeys(key[0] for key in keys))
+    return sorted(dict.fromkeys(keys), key=lambda key: (classes.index(key[0]), *map(_lower_end, key[1:])))
+
+
+def _lower_end(speeds: str) -> tuple[float, bool]:
+    words = speeds.split()
+    return float(words[-1] if words[0] == "above" else words[0]), words[0] == "above"
 
 
 def _cell_text(row: Mapping[str, Any]) -> str:

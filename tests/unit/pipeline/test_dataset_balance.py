@@ -1,6 +1,7 @@
 """The balance of a dataset from a store with an analytic map: card, page, and where to drive next."""
 
 import json
+import re
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -60,6 +61,15 @@ def test_what_was_driven_twice_gives_the_noise_that_was_put_in(balance):
     assert found["pairs"] > 100
     assert found["std_low"] < NOISE_WATT < found["std_high"]
     assert found["std"] == pytest.approx(NOISE_WATT, rel=0.15)
+
+
+def test_the_page_shows_every_cell_by_class_and_by_speed(built, balance):
+    page = (built / "report.html").read_text()
+    by_class, by_speed = page.split("Balance of class and slope")[1].split("Balance of class, slope and speed")
+    by_speed = by_speed.split("Repeatability: no model can beat this")[0]
+    for cells, shown in ((balance["by_class_and_slope"], by_class), (balance["cells"], by_speed)):
+        found = [int(count) for count in re.findall(r"<td[^>]*>(\d+) \(\d+\)\*?</td>", shown)]
+        assert sorted(found) == sorted(sum(cell["samples"].values()) for cell in cells if any(cell["samples"].values()))
 
 
 def test_where_to_drive_next_is_geojson_that_a_gis_takes(built, balance):
