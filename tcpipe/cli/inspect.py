@@ -173,6 +173,8 @@ def _print_run(found: Mapping[str, Any]) -> None:
     say(f"{found['run_id']}: from {' + '.join(found['source'].get('paths', ['an unknown log']))}")
     if found["tags"]:
         say("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found["tags"].items())))
+    for line in found["remarks"]:
+        say(f"remark: {line}")
     for run in found["recipes"]:
         ledger = run["ledger_m"]
         say("")

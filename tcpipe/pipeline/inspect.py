@@ -105,6 +105,7 @@ def _run(path: Path, store: Store, runs: list[RunDirectory]) -> dict[str, Any]:
         "run_id": run_id,
         "source": known.get("source", {}),
         "tags": known.get("tags", {}),
+        "remarks": known.get("remarks", []),
         "recipes": [
             {
                 **_line(run),
