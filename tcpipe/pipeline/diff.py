@@ -12,7 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files
+from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
 from tcpipe.formats.json_files import plain
 from tcpipe.pipeline.explain import flat_recipe
 from tcpipe.splits.assignment import SPLITS
@@ -71,13 +71,14 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     """
     first, second = Path(a), Path(b)
     cards = read_card(first), read_card(second)
-    tables = read_samples(first), read_samples(second)
+    there = [sample_columns(directory) for directory in (first, second)]
+    shared = [name for name in there[0] if name in there[1]]
+    tables = tuple(read_samples(directory, ["sample_id", "split", *_LABELS]) for directory in (first, second))
     at = pc.index_in(tables[0].column("sample_id"), value_set=tables[1].column("sample_id").combine_chunks())
     row = at.to_numpy(zero_copy_only=False)  # of b for each of a, NaN where it is not there
     in_a = np.flatnonzero(np.isfinite(row))
     in_b = row[in_a].astype(np.int64)
-    both = tables[0].take(pa.array(in_a)), tables[1].take(pa.array(in_b))
-    shared = [name for name in tables[0].column_names if name in tables[1].column_names]
+    both = ((first, in_a), (second, in_b))
     counts = {
         "only in a": tables[0].num_rows - len(in_a),
         "only in b": tables[1].num_rows - len(in_a),
@@ -87,7 +88,7 @@ def diff(a: str | Path, b: str | Path) -> Difference:
         "other patches": _other_patches((first, second), cards, tables, in_a, in_b),
         "other fold": _other(both, [name for name in shared if name == "fold"]),
     }
-    moved = _moved(*(table.column("split").to_numpy() for table in both))
+    moved = _moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
     shifts = {name: _shift(*(_values(table, name) for table in tables)) for name in _LABELS}
     return Difference(first, second, tuple(_causes(*cards)), counts, moved, plain(shifts))
 
@@ -97,11 +98,11 @@ def _values(table: pa.Table, name: str) -> NDArray[np.float64]:
     return values
 
 
-def _other(both: tuple[pa.Table, pa.Table], names: Sequence[str]) -> int:
-    """Return how many rows differ in any of the columns; what is missing in both is the same."""
-    other = np.zeros(both[0].num_rows, np.bool_)
-    for name in names:
-        ours, theirs = (table.column(name) for table in both)
+def _other(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> int:
+    """Return how many of the given rows of two datasets differ in any of the columns; what is missing in both is the same."""
+    other = np.zeros(len(both[0][1]), np.bool_)
+    for name in names:  # one at a time: a large dataset has gigabytes of them
+        ours, theirs = (read_samples(directory, [name]).column(name).take(pa.array(rows)) for directory, rows in both)
         one_null = pc.xor(pc.is_null(ours), pc.is_null(theirs))
         other |= pc.coalesce(pc.not_equal(ours, theirs), one_null).to_numpy()
     return int(other.sum())
@@ -110,7 +111,7 @@ def _other(both: tuple[pa.Table, pa.Table], names: Sequence[str]) -> int:
 def _other_patches(
     directories: tuple[Path, Path],
     cards: tuple[Mapping[str, Any], Mapping[str, Any]],
-    tables: tuple[pa.Table, pa.Table],
+    tables: Sequence[pa.Table],
     in_a: Ints,
     in_b: Ints,
 ) -> int:
