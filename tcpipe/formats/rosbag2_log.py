@@ -42,22 +42,15 @@ def rosbag2_files(directory: Path) -> Rosbag2Files:
         The directory holds no ROS 2 bag.
     """
     present = storage_files(directory)
-    if not (directory / METADATA).is_file():
-        kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
-        if len(kinds) != 1:
-            found = "no .db3 or .mcap file" if not kinds else "both .db3 and .mcap files"
-            raise LogError(f"{directory}: not a ROS 2 bag: it has no {METADATA} and {found}")
-        return Rosbag2Files(
-            present,
-            (
-                Damage(
-                    directory.name,
-                    f"{METADATA} is missing; files are read in the order of their names",
-                    messages_lost=0,
-                ),
-            ),
-        )
     information = _bag_information(directory / METADATA)
+    if information is None:
+        kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
+        what = "is broken" if (directory / METADATA).is_file() else "is missing"
+        if len(kinds) != 1:
+            found = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
+            raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {what}, and {found}")
+        why = f"{METADATA} {what}; files are read in the order of their names"
+        return Rosbag2Files(present, (Damage(directory.name, why, messages_lost=0),))
     named = information.get("relative_file_paths")
     listed = [Path(name).name for name in named if isinstance(name, str)] if isinstance(named, list) else []
     paths, damage = [], []
@@ -196,15 +189,14 @@ def _unframed(frame: memoryview) -> bytes | None:
     return b"".join(pieces)
 
 
-def _bag_information(path: Path) -> dict[str, Any]:
+def _bag_information(path: Path) -> dict[str, Any] | None:
+    """Return what metadata.yaml says of the bag; None where it is missing or broken, as a recorder that is killed leaves it."""
     try:
         document = YAML(typ="safe").load(path.read_text(errors="replace"))
         information = document["rosbag2_bagfile_information"]
-    except (YAMLError, KeyError, TypeError, ValueError):
-        information = None
-    if not isinstance(information, dict):
-        raise LogError(f"{path}: not the {METADATA} of a ROS 2 bag: it holds no rosbag2_bagfile_information")
-    return information
+    except (YAMLError, KeyError, TypeError, ValueError, FileNotFoundError, IsADirectoryError, RecursionError):
+        return None
+    return information if isinstance(information, dict) else None
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

@@ -149,6 +149,8 @@ class SqlitePart:
                 start_ns,
                 end_ns,
             )
+        for number in sorted(spans.keys() - channels.keys()):
+            self._note(f"messages of topic {number}, which nothing declares", messages_lost=spans[number][0])
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -168,13 +170,12 @@ class SqlitePart:
                 return self._table.spans()
             except UnusualError:
                 self._table = None
-        query = "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages GROUP BY topic_id"
+        query = (
+            "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages "
+            "WHERE typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' GROUP BY topic_id"
+        )
         try:
-            return {
-                topic: (count, start, end)
-                for topic, count, start, end in self._database.execute(query)
-                if isinstance(start, int) and isinstance(end, int)
-            }
+            return {topic: (count, start, end) for topic, count, start, end in self._database.execute(query)}
         except _BROKEN:
             spans: dict[int, tuple[int, int, int]] = {}
             for rows in self._reachable("SELECT id, topic_id, timestamp, timestamp, x'' FROM messages WHERE TRUE"):
@@ -205,7 +206,8 @@ class SqlitePart:
         for rows in self._until_broken(f"{query} AND id > ? AND id < ? ORDER BY id DESC", low, high):
             high = rows[-1][0]
             above.append(rows[::-1])
-        span = f"between message {low} and {'the end' if high == _ABOVE else f'message {high}'}"
+        start = "the beginning" if low == _BELOW else f"message {low}"
+        span = f"between {start} and {'the end' if high == _ABOVE else f'message {high}'}"
         self._note(f"messages {span} cannot be read ({broken})")
         yield from above[::-1]
 

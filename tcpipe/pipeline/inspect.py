@@ -42,6 +42,8 @@ def inspect(
         with copied(str(path), wanted=belongs_to_a_log) as copy:
             return _named(_logs_at(copy, recipe, **how), str(copy), str(path).rstrip("/"))
     path = Path(path)
+    if not path.exists():
+        raise LogError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
         return {**read_json(path / "dataset.json"), "kind": "dataset", "path": str(path)}
     if is_store(path):

@@ -1,5 +1,6 @@
 """Generated logs, broken in known places: what is intact before and after comes back, the rest is counted."""
 
+import sqlite3
 import struct
 from dataclasses import replace
 
@@ -259,3 +260,32 @@ def test_a_cut_chunk_of_an_unknown_compression_is_lost_by_name(tmp_path):
     tables, damage = read(path)
     assert tables == {}
     assert any("'lz8' is unknown" in finding.what for finding in damage)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\0garbage: [", b"rosbag2_bagfile_information:\n", b"a: &a [*a]\n"])
+def test_a_broken_metadata_file_costs_nothing(tmp_path, content):
+    messages = random_messages(4, count=20, types=TYPES)
+    bag = write_rosbag2(tmp_path / "run", messages)
+    (bag / "metadata.yaml").write_bytes(content)
+    tables, damage = read(bag)
+    assert [(finding.what.split(";")[0], finding.is_loss) for finding in damage] == [("metadata.yaml is broken", False)]
+    for topic in tables:
+        assert_same(tables[topic], expected_columns(messages, topic))
+
+
+def test_rows_that_are_no_messages_cost_only_themselves(tmp_path):
+    messages = random_messages(5, count=20, types=("std_msgs/msg/ColorRGBA",))
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE messages SET timestamp = 'abc' WHERE id = 3")
+        database.execute("UPDATE messages SET data = 'text' WHERE id = 5")
+        database.execute("UPDATE messages SET topic_id = 99 WHERE id IN (7, 8)")
+    database.close()
+    with open_log(path) as log:
+        assert log.topics["/ColorRGBA"].message_count == 17
+        assert log.table("/ColorRGBA").num_rows == 16
+        said = {finding.what: finding.messages_lost for finding in log.damage}
+    assert said == {
+        "messages of topic 99, which nothing declares": 2,
+        "rows that are no messages, or whose end is lost": 2,
+    }

@@ -260,10 +260,10 @@ def test_what_is_no_log_is_refused_in_one_line(tmp_path, name, content, said):
 def test_directories_that_are_no_bag_are_refused(tmp_path):
     with pytest.raises(LogError, match="no log in this directory"):
         find_logs(tmp_path)
-    with pytest.raises(LogError, match=r"not a ROS 2 bag: it has no metadata\.yaml and no \.db3"):
+    with pytest.raises(LogError, match=r"not a ROS 2 bag: metadata\.yaml is missing, and no \.db3"):
         open_log(tmp_path)
     (tmp_path / "metadata.yaml").write_text("something: else\n")
-    with pytest.raises(LogError, match="holds no rosbag2_bagfile_information"):
+    with pytest.raises(LogError, match=r"not a ROS 2 bag: metadata\.yaml is broken, and no \.db3"):
         open_log(tmp_path)
     with pytest.raises(LogError, match="no such file"):
         open_log(tmp_path / "nowhere.mcap")

@@ -4,9 +4,11 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from tcpipe.errors import LogError
 from tcpipe.formats.log_file import open_log
 from tcpipe.formats.log_writing import MessageStream, write_mcap
 from tcpipe.pipeline import log_stamps
+from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_inspection import inspect_log
 from tcpipe.recipe import Recipe
 
@@ -141,3 +143,9 @@ def test_what_repeats_is_compared_in_every_kind_of_column():
     for row in range(5):
         stamps.add(table[row : row + 1])
     assert (stamps.facts()["duplicates"], stamps.facts()["repeated_stamps"]) == (2, 2)
+
+
+def test_a_link_that_leads_to_itself_is_refused(tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    with pytest.raises(LogError, match="there is no such file"):
+        inspect(tmp_path / "loop", recipe=Recipe())
