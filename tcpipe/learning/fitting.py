@@ -182,7 +182,9 @@ def _epoch(network: Any, task: Task, config: FitConfig, *, scale: Floats, number
 def _optimizer_arrays(network: Any) -> Arrays:
     """Return the optimiser's memory: its step, and two moments a weight."""
     to_numpy = load_keras().ops.convert_to_numpy
-    return {f"{number:04d}": np.array(to_numpy(value.value)) for number, value in enumerate(network.optimizer.variables)}
+    return {
+        f"{number:04d}": np.array(to_numpy(value.value)) for number, value in enumerate(network.optimizer.variables)
+    }
 
 
 def _restore(network: Any, parts: dict[str, Arrays], checkpoint: Path) -> None:
