@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ _FEWEST_WINDOWS = 3
 _FACTOR = 2.0
 _STILL = 0.05
 _BEND_M = 0.3
+_UNLIKE_M = 1.0
+_UNLIKE_SHARE = 0.3
+_UNLIKE_WINDOWS = 0.3
 _CLEARLY = 3.0
 _KMH = (3.2, 4.0)
 _RADIANS = (1 / 75, 1 / 30)
@@ -105,27 +109,32 @@ def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, st
     return why
 
 
-def mirrored(gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]) -> bool | None:
-    """Return whether the path of the fixes is the mirror image of what an odometry adds up to; None where bends are too few to tell.
+def path_of_fixes(
+    gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]
+) -> Literal["alike", "mirrored", "unlike"] | None:
+    """Return how the path of the fixes lies to what an odometry adds up to; None where there is too little to tell.
 
-    In every window the fixes are laid on the odometry's path by rotation and scale, and again on its mirror image.
+    In every window the fixes are laid on the odometry's path by rotation and scale, and again on its mirror image. Unlike is what fits
+    neither way, by more than the fixes' noise, what slip bends, and a metre.
     """
     fixes, path = fix_places(gnss, at_ns), _dead_reckoned(twist)
-    as_it_is = as_mirrored = 0.0
-    windows = 0
+    left, bound = [], []
+    noise_m2 = _SURE**2 * float(np.median(gnss.variance_m2[:, :2]))
     for first in range(0, at_ns.size - 2 * _WINDOW, _WINDOW):
         rows = slice(first, first + 2 * _WINDOW)
         if np.isfinite(fixes[rows] + path[rows]).all():
             a, b = fixes[rows] - fixes[rows].mean(), path[rows] - path[rows].mean()
-            as_it_is += _unlike_m2(a, b)
-            as_mirrored += _unlike_m2(a, np.conj(b))
-            windows += 1
-    noise_m2 = _SURE**2 * float(np.median(gnss.variance_m2[:, :2]))
-    if not windows or max(as_it_is, as_mirrored) / windows < _BEND_M**2 + noise_m2:
+            left.append((_unlike_m2(a, b), _unlike_m2(a, np.conj(b))))
+            bound.append(_UNLIKE_M**2 + noise_m2 + _UNLIKE_SHARE**2 * float(np.mean(np.abs(b) ** 2)))
+    if len(left) < _FEWEST_WINDOWS:
         return None
-    if max(as_it_is, as_mirrored) < _CLEARLY * min(as_it_is, as_mirrored):
+    as_it_is, as_mirrored = np.array(left).T
+    if np.mean(as_it_is > bound) > _UNLIKE_WINDOWS and np.mean(as_mirrored > bound) > _UNLIKE_WINDOWS:
+        return "unlike"
+    most, least = max(as_it_is.sum(), as_mirrored.sum()), min(as_it_is.sum(), as_mirrored.sum())
+    if most / len(left) < _BEND_M**2 + noise_m2 or most < _CLEARLY * least:
         return None
-    return as_mirrored < as_it_is
+    return "alike" if as_it_is.sum() < as_mirrored.sum() else "mirrored"
 
 
 def _unlike_m2(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> float:

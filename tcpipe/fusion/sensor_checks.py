@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.distances import COMMAND, Distances, contradictions, find_distances, mirrored
+from tcpipe.fusion.distances import COMMAND, Distances, contradictions, find_distances, path_of_fixes
 from tcpipe.fusion.frozen import frozen_sensors
 from tcpipe.fusion.gridded_motion import course_rate, fix_velocity, on_grid, twist_on_grid
 from tcpipe.fusion.lags import Floats, averaged
@@ -112,7 +112,7 @@ def check_sensors(
     _check_directions(checks, twists, at_ns, command=command, looks=looks, stated=stated)
     _check_distances(checks, found.without(frozen))
     if gnss is not None:
-        _check_mirrored(checks, gnss, twists, at_ns)
+        _check_path(checks, gnss, _turning_as_felt(checks, twists, measurements.imu, at_ns), at_ns)
     return checks
 
 
@@ -136,20 +136,42 @@ def _check_distances(checks: Checks, found: Distances) -> None:
     checks.refusals += [Refusal(role, text) for role, text in why.items() if role not in refused]
 
 
-def _check_mirrored(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> None:
-    """Check that the fixes bend the way the odometries do; one odometry that no gyroscope confirms is as doubtful as they are."""
+def _turning_as_felt(
+    checks: Checks, twists: Mapping[str, Floats], imu: InertialMeasurements | None, at_ns: NDArray[np.int64]
+) -> dict[str, Floats]:
+    """Return the twists with the yaw rate of the gyroscope where it confirms theirs: wheels that skid turn by too much."""
+    confirmed = {role for role, axis in checks.facts.get("yaw_axis", {}).items() if axis["axis"][2] > -_OTHER_WAY}
+    if imu is None or any(refusal.role == IMU for refusal in checks.refusals):
+        return dict(twists)
+    felt = on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns)[:, 2]
+    return {
+        role: np.column_stack((twist[:, 0], np.where(np.isfinite(felt), felt, twist[:, 1])))
+        if role in confirmed
+        else twist
+        for role, twist in twists.items()
+    }
+
+
+def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> None:
+    """Check that the fixes go the way the odometries do; one odometry that no gyroscope confirms is as doubtful as they are."""
     refused = {refusal.role for refusal in checks.refusals}
-    told = {role: mirrored(gnss, twist, at_ns) for role, twist in twists.items() if role not in refused}
-    against = [role for role, is_mirrored in told.items() if is_mirrored]
-    if GNSS in refused or not against or False in told.values():
+    told = {role: path_of_fixes(gnss, twist, at_ns) for role, twist in twists.items() if role not in refused}
+    against = [role for role, how in told.items() if how in {"mirrored", "unlike"}]
+    if GNSS in refused or not against or "alike" in told.values():
         return
-    exchanged = f"its path is the mirror image of that by {' and '.join(against)} (latitude and longitude exchanged?)"
-    if len(against) > 1 or against[0] in checks.facts.get("yaw_axis", {}):
-        checks.refusals.append(Refusal(GNSS, exchanged))
+    confirmed = len(against) > 1 or against[0] in checks.facts.get("yaw_axis", {})
+    doubt = "" if confirmed else ", and nothing tells which of the two is right"
+    by = " and ".join(against)
+    if "unlike" in told.values():
+        if confirmed:
+            checks.refusals.append(Refusal(GNSS, f"its path is not that by {by} (another clock, drive or receiver?)"))
         return
-    doubt = "and nothing tells which of the two is right"
-    checks.refusals.append(Refusal(GNSS, f"{exchanged}, {doubt}"))
-    checks.refusals.append(Refusal(against[0], f"its yaw rate has the opposite sign of {GNSS}, {doubt}", turned_by=YAW))
+    exchanged = f"its path is the mirror image of that by {by} (latitude and longitude exchanged?)"
+    checks.refusals.append(Refusal(GNSS, exchanged + doubt))
+    if doubt:
+        checks.refusals.append(
+            Refusal(against[0], f"its yaw rate has the opposite sign of {GNSS}{doubt}", turned_by=YAW)
+        )
 
 
 def _check_imu(

@@ -23,6 +23,8 @@ from tcpipe.logs.profiles import Robot
 
 _OF_USUAL_VOLTAGE = (0.2, 3.0)
 """A battery's voltage stays within these shares of its median."""
+_FEWEST_MESSAGES = 3
+_SLOWEST_S = 10.0
 _FEWEST_ROWS = 20
 """Fewer rows say nothing against the sign of their type."""
 
@@ -74,6 +76,7 @@ def read_power(
             refused.append(str(found))
             continue
         refused += [why for rail in found if (why := why_refused(rail, columns)) is not None]
+        refused += _too_seldom(topic, np.asarray(columns[LOG_TIME], np.float64))
         sources.append(source)
         rails[topic] = found
     rails = _paired(rails)
@@ -124,6 +127,14 @@ def _incomplete(rails: list[Rail]) -> list[str]:
             if not any(np.isfinite(value).any() for value in values):
                 missing.append(f"{name}: it carries no {what}")
     return missing
+
+
+def _too_seldom(topic: str, log_time_ns: Floats) -> list[str]:
+    """Return why a topic cannot tell what a metre costs: too few messages, or too far apart."""
+    if log_time_ns.size < _FEWEST_MESSAGES:
+        return [f"{topic}: it holds {log_time_ns.size} messages only"]
+    period_s = float(np.median(np.diff(log_time_ns))) / 1e9
+    return [f"{topic}: it comes every {period_s:.0f} s only"] if period_s > _SLOWEST_S else []
 
 
 def _believable(rails: Mapping[str, list[Rail]]) -> tuple[dict[str, list[Rail]], list[str]]:

@@ -77,5 +77,6 @@ def label_segments(
     facts = label_facts(
         table, rails_by_epoch, joules, segments.ledger_m, variance_j2, rule=rule, velocity=config.velocity
     )
-    info = with_findings(segments.info, "label", label_warnings(facts), {**facts, "physics": physics})
+    facts["physics"] = physics
+    info = with_findings(segments.info, "label", label_warnings(facts), facts)
     return LabelledSegments(table, info, segments.ledger_m)

@@ -15,6 +15,9 @@ from tcpipe.stages.label_power import rail_facts
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats
 
+_MUCH_STANDING = 0.5
+_FEW_WATT = 20.0
+
 
 def label_facts(
     table: pa.Table,
@@ -48,6 +51,7 @@ def label_facts(
         "rails": {str(epoch): [rail_facts(each) for each in rails[epoch]] for epoch in rails if rails[epoch]},
         "segments": table.num_rows,
         "segments_without_power": int(np.isnan(energy).sum()),
+        "median_power_watt": _median(floats(table, "power_watt")),
         "relative_std_median": {
             name: _median(floats(table, f"{name}_std_{unit}") / floats(table, f"{name}_{unit}"))
             for name, unit in (("duration", "s"), ("velocity", "mps"), ("power", "watt"), ("energy", "joule"))
@@ -68,7 +72,7 @@ def _budget(
 
 
 def label_warnings(facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what a person should look at."""
+    """Return what a person should look at; ``facts`` are `label_facts`'s and ``physics`` of `label_physics`."""
     warnings = []
     if facts["quality"]["low_power_rate"] and facts["segments_without_power"] < facts["segments"]:
         rates = [
@@ -81,6 +85,12 @@ def label_warnings(facts: Mapping[str, Any]) -> tuple[str, ...]:
     if facts["energy_joule"] is not None and facts["segments"] and facts["segments_without_power"]:
         count = f"{facts['segments_without_power']} of {facts['segments']} segments"
         warnings.append(f"{count} have no label: the power record does not reach over them")
+    standing, driving = facts["physics"].get("standing_watt"), facts["median_power_watt"]
+    if standing is not None and driving is not None and standing > max(_MUCH_STANDING * driving, _FEW_WATT):
+        warnings.append(
+            f"power: {standing:.0f} W are drawn while standing, of {driving:.0f} W while driving: an offset of the current, or more "
+            "than propulsion; labels hold all of it"
+        )
     return tuple(warnings)
 
 

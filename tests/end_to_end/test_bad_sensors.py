@@ -319,6 +319,13 @@ def test_fixes_at_zero_zero_are_no_places(drive, tmp_path):
     assert any("null_island" in warning for warning in labelled.info.findings.warnings)
 
 
+def test_a_current_with_an_offset_is_said(drive, tmp_path):
+    other = drive.changed("power", lambda c: {n: v + 50.0 for n, v in c.items() if "current" in n})
+    (warning,) = [w for w in run(other, tmp_path).info.findings.warnings if w.startswith("power: ")]
+    assert "are drawn while standing" in warning
+    assert not any("while standing" in w for w in run(drive, tmp_path).info.findings.warnings)
+
+
 def test_fixes_without_altitude_still_say_where(drive, tmp_path):
     labelled = run(drive.changed("gnss", lambda c: {"altitude": np.full_like(c["altitude"], np.nan)}), tmp_path)
     assert labelled.info.datum is not None

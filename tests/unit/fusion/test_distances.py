@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tcpipe.fusion.distances import COMMAND, contradictions, find_distances, mirrored
+from tcpipe.fusion.distances import COMMAND, contradictions, find_distances, path_of_fixes
 from tcpipe.fusion.lags import GRID_NS, GRID_S
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
 from tcpipe.fusion.windows import liveliest_ns, windows_ns
@@ -56,11 +56,20 @@ def test_wheels_that_turn_while_the_robot_stands_are_stuck_not_wrong():
     assert list(judged(path(STILL), moving, wheel_odometry=TWIST)) == ["gnss"]
 
 
-@pytest.mark.parametrize("mirror", [False, True])
-def test_a_mirrored_path_shows_in_its_bends(mirror):
-    assert mirrored(path(TWIST, mirror=mirror), TWIST * [1.1, 1.2], AT_NS) is mirror
+@pytest.mark.parametrize(("mirror", "how"), [(False, "alike"), (True, "mirrored")])
+def test_a_mirrored_path_shows_in_its_bends(mirror, how):
+    assert path_of_fixes(path(TWIST, mirror=mirror), TWIST * [1.1, 1.2], AT_NS) == how
     straight = TWIST * [1, 0]
-    assert mirrored(path(straight, mirror=mirror), straight, AT_NS) is None
+    assert path_of_fixes(path(straight, mirror=mirror), straight, AT_NS) is None
+
+
+def test_a_path_of_another_drive_is_unlike_but_slip_noise_and_a_late_clock_are_not():
+    other = np.column_stack((TWIST[:, 0], 0.4 * np.cos(0.17 * T)))
+    assert path_of_fixes(path(TWIST), other, AT_NS) == "unlike"
+    slipping = TWIST * np.column_stack((1.2 + 0.2 * np.sin(T / 5), np.full(T.size, 1.4)))
+    assert path_of_fixes(path(TWIST), slipping, AT_NS) != "unlike"
+    assert path_of_fixes(path(TWIST, std_m=2.0), other, AT_NS) is None
+    assert path_of_fixes(path(np.roll(TWIST, 50, axis=0)), TWIST, AT_NS) != "unlike"
 
 
 def test_an_hour_of_standing_is_not_what_is_judged():

@@ -175,6 +175,23 @@ def test_a_warthogs_negative_currents_come_as_unsigned(robot: str) -> None:
     assert any("currents above 1000 A are set aside" in line for line in found.warnings) == (robot == "generic")
 
 
+@pytest.mark.parametrize(
+    ("log_time_s", "why"),
+    [
+        ([0.0, 95.0], "holds 2 messages only"),
+        (15.0 * np.arange(N), "comes every 15 s only"),
+        ([], "holds 0 messages only"),
+    ],
+)
+def test_power_that_comes_too_seldom_is_refused(log_time_s, why: str) -> None:
+    count = len(log_time_s)
+    columns = {"log_time_ns": np.asarray(log_time_s) * 1e9, "voltage": VOLT[:count], "current": AMP[:count]}
+    columns["percentage"] = np.full(count, np.nan)
+    found = read_power({"/b": (BATTERY_STATE, columns)}, ROBOTS["generic"])
+    assert found.readings == {}
+    assert any(why in line for line in found.warnings)
+
+
 def test_single_values_that_no_battery_has_are_set_aside() -> None:
     columns = battery(VOLT.copy(), AMP.copy())
     columns["voltage"][[4, 9]] = 65.535e3, 0.0
