@@ -42,6 +42,8 @@ class Difference:
     """Samples of both by the splits that they moved between, ``train to test`` …."""
     labels: Mapping[str, Mapping[str, float]]
     """For every label: means, deviations and the largest gap between the two distribution functions, over all samples."""
+    labels_of_train: Mapping[str, Mapping[str, float]]
+    """The same over train alone."""
 
     @property
     def same(self) -> bool:
@@ -89,8 +91,15 @@ def diff(a: str | Path, b: str | Path) -> Difference:
         "other fold": _other(both, [name for name in shared if name == "fold"]),
     }
     moved = _moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
-    shifts = {name: _shift(*(_values(table, name) for table in tables)) for name in _LABELS}
-    return Difference(first, second, tuple(_causes(*cards)), counts, moved, plain(shifts))
+    train = [table.filter(pc.equal(table.column("split"), "train")) for table in tables]
+    return Difference(first, second, tuple(_causes(*cards)), counts, moved, _shifts(tables), _shifts(train))
+
+
+def _shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
+    found: dict[str, dict[str, float]] = plain(
+        {name: _shift(*(_values(table, name) for table in tables)) for name in _LABELS}
+    )
+    return found
 
 
 def _values(table: pa.Table, name: str) -> NDArray[np.float64]:
@@ -228,9 +237,14 @@ def _lines(found: Difference) -> Iterator[str]:
     )
     if found.moved:
         yield "splits: " + ", ".join(f"{count} from {name}" for name, count in found.moved.items())
-    for name, shift in found.labels.items():
-        if shift and shift["largest_gap"] > 0.0:
-            yield (
-                f"{name}: mean {shift['mean_a']:.4g} → {shift['mean_b']:.4g}, deviation {shift['std_a']:.4g} → "
-                f"{shift['std_b']:.4g}, distributions up to {shift['largest_gap']:.1%} apart"
-            )
+    for part, shifts in (("", found.labels), (" in train", found.labels_of_train)):
+        yield from (
+            _shift_line(f"{name}{part}", shift) for name, shift in shifts.items() if shift.get("largest_gap", 0.0) > 0.0
+        )
+
+
+def _shift_line(name: str, shift: Mapping[str, float]) -> str:
+    return (
+        f"{name}: mean {shift['mean_a']:.4g} → {shift['mean_b']:.4g}, deviation {shift['std_a']:.4g} → "
+        f"{shift['std_b']:.4g}, distributions up to {shift['largest_gap']:.1%} apart"
+    )
