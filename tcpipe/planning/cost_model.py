@@ -112,12 +112,23 @@ def check_model(model: CostModel, source: MapReader) -> None:
 
 
 def predict_patches(model: CostModel, patches: Patches, asked: NDArray[np.bool_]) -> Predicted:
-    """Return what the model says of the patches that it is asked about, shape (N,); tensors are formed batch by batch."""
+    """Return what the model says of the patches that it is asked about, shape (N,); tensors are formed batch by batch.
+
+    Raises
+    ------
+    ModelError
+        It gives something else than power and velocity.
+    """
     form = TensorForm(model.channels, model.classes.count)
     pixels = {layer: getattr(patches, layer) for layer in LAYERS if layer in form.layers}
     out = np.full((asked.size, 2), np.nan)
     for rows in _batches(np.flatnonzero(asked)):
-        out[rows] = model.predict(form.form(pixels, rows))
+        said = model.predict(form.form(pixels, rows))
+        if said.shape != (rows.size, 2):
+            raise ModelError(
+                f"{model.name}: gives {said.shape[-1]} numbers a patch, wanted two: power and velocity; train it on both labels"
+            )
+        out[rows] = said
     out[~(np.isfinite(out).all(axis=1) & (out[:, 1] > 0.0))] = np.nan
     return Predicted(out[:, 0].copy(), out[:, 1].copy())
 

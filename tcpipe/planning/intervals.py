@@ -19,7 +19,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import correlate
 
 Floats = NDArray[np.float64]
 
@@ -67,7 +66,8 @@ class Errors:
     def _half_width(self, width: Floats) -> float:
         if not width.size:
             return 0.0
-        pairs = correlate(width, width, mode="full", method="auto")[width.size - 1 :]
+        spectrum = np.fft.rfft(width, 2 * width.size)
+        pairs = np.fft.irfft(np.abs(spectrum) ** 2, 2 * width.size)[: width.size]  # sums of a_i a_j by lag
         lag = np.arange(width.size, dtype=np.float64)
         correlation = self.correlation[np.clip(np.searchsorted(self.lag_m, lag, side="right") - 1, 0, None)]
         return float(np.sqrt(max(pairs[0] + 2.0 * float(pairs[1:] @ correlation[1:]), 0.0)))

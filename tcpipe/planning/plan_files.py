@@ -17,7 +17,6 @@ from tcpipe.formats.map_files import MapFile
 from tcpipe.planning.cost_map import cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_files import cost_text
-from tcpipe.planning.picture import draw_plans
 from tcpipe.planning.plan import OBJECTIVES, Objective, plan_path
 from tcpipe.planning.survey import Survey, new_survey, survey_from
 
@@ -99,6 +98,8 @@ def plan(
     properties: dict[str, dict[str, Any]] = {name: found.properties() for name, found in plans.items()}
     about = {"key": key, "plans": properties, "order": list(properties)}
     if picture is not None:
+        from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw
+
         draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
         about["picture_sha256"] = file_checksum(picture)[1]
     asked = plans[request.objective]

@@ -102,6 +102,29 @@ def test_without_held_out_samples_there_are_no_intervals():
     assert found.pieces.column("energy_low_joule").null_count == found.pieces.num_rows
 
 
+class _Stuck(PhysicsModel):
+    def predict(self, patches):
+        said = super().predict(patches)
+        said[3:5, 1] = 0.0, np.nan
+        return said
+
+
+class _EnergyAlone(PhysicsModel):
+    def predict(self, patches):
+        return super().predict(patches)[:, :1]
+
+
+def test_where_the_model_says_that_nothing_moves_there_is_no_cost():
+    found = _cost(plane(), (4.0, 4.0), (12.0, 4.0), model=_Stuck())
+    assert found.reasons == {"no_motion": 2}
+    assert np.flatnonzero(np.isnan(found.pieces.column("energy_joule").to_numpy())).tolist() == [3, 4]
+
+
+def test_a_model_of_something_else_is_refused():
+    with pytest.raises(ModelError, match="gives 1 numbers a patch, wanted two"):
+        _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=_EnergyAlone())
+
+
 def test_bad_paths_are_one_line_each():
     source = plane()
     for points, words in [

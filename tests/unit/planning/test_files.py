@@ -1,0 +1,141 @@
+"""What predict-path and plan-path write: once, whole, and again only when something changed."""
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pyarrow.csv
+import pyarrow.parquet
+import pytest
+from map_worlds import ArrayMap
+from physics_model import PhysicsModel
+from planning_worlds import lonlat, plane
+
+from tcpipe.errors import ModelError, PathError, UsageError
+from tcpipe.formats.geojson_lines import read_line, write_lines
+from tcpipe.planning.cost_map import make_cost_map
+from tcpipe.planning.path_files import predict_path, summary_path
+from tcpipe.planning.plan_files import PlanRequest, plan
+
+MODEL = PhysicsModel()
+
+
+@dataclass(frozen=True)
+class StoredMap(ArrayMap):
+    """A map that says what it is, as one in a store does."""
+
+    def summary(self):
+        return {"name": self.name}
+
+
+@pytest.fixture
+def source() -> StoredMap:
+    made = plane(24.0, rise_east=0.1)
+    return StoredMap(made.grid, made.arrays, made.tile_px)
+
+
+@pytest.fixture
+def path(source, tmp_path: Path) -> Path:
+    write_lines(tmp_path / "path.geojson", [(lonlat(source, (3.0, 12.0), (20.0, 14.0)), {})], {})
+    return tmp_path / "path.geojson"
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet", "json"])
+def test_the_table_is_the_same_in_every_format(source, path, ending):
+    out = path.with_name(f"pieces.{ending}")
+    found = predict_path(MODEL, source, path, out)
+    assert found.status == "done"
+    assert found.exit_code == 0
+    rows = {
+        "csv": lambda: pyarrow.csv.read_csv(out).to_pylist(),
+        "parquet": lambda: pyarrow.parquet.read_table(out).to_pylist(),
+        "json": lambda: json.loads(out.read_text())["pieces"],
+    }[ending]()
+    assert len(rows) == found.summary["pieces"] == 18
+    assert sum(row["energy_joule"] for row in rows) == pytest.approx(found.summary["energy_joule"], rel=1e-9)
+    assert rows[0]["terrain_name"] == "grass"
+    assert json.loads(summary_path(out).read_text())["duration_s"] == found.summary["duration_s"]
+
+
+def test_parquet_says_units_and_what_the_bits_mean(source, path):
+    out = path.with_name("pieces.parquet")
+    predict_path(MODEL, source, path, out)
+    schema = pyarrow.parquet.read_schema(out)
+    assert schema.field("energy_joule").metadata[b"unit"] == b"J"
+    assert json.loads(schema.field("reasons").metadata[b"flags"])["2"] == "nodata"
+
+
+def test_a_second_call_does_nothing_until_something_changes(source, path):
+    out = path.with_name("pieces.csv")
+    first = predict_path(MODEL, source, path, out)
+    second = predict_path(MODEL, source, path, out)
+    assert second.status == "unchanged"
+    assert "nothing to do" in str(second)
+    assert second.summary["energy_joule"] == first.summary["energy_joule"]
+    out.write_text(out.read_text()[:-30])
+    assert predict_path(MODEL, source, path, out).status == "done"
+    assert predict_path(replace(MODEL, checksum="1" * 64), source, path, out).status == "done"
+
+
+def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
+    write_lines(tmp_path / "off.geojson", [(lonlat(source, (12.0, 12.0), (30.0, 12.0)), {})], {})
+    found = predict_path(MODEL, source, tmp_path / "off.geojson", None)
+    assert found.exit_code == 3
+    assert "outside map" in str(found)
+    assert f"without {found.summary['pieces_without_cost']} of {found.summary['pieces']} pieces" in str(found)
+
+
+def _request(source, **options) -> PlanRequest:
+    start, goal = lonlat(source, (3.0, 3.0), (20.0, 18.0)).tolist()
+    return PlanRequest(tuple(start), tuple(goal), **options)
+
+
+def test_a_plan_is_found_once_and_again_when_its_picture_is_gone(source, tmp_path):
+    out, picture = tmp_path / "plan.geojson", tmp_path / "plan.png"
+    request = _request(source, objective="distance", step_m=2.0)
+    first = plan(MODEL, source, request, out=out, picture=picture)
+    assert list(first.plans) == ["distance", "energy", "time"]
+    assert len(read_line(out)) == 2
+    second = plan(MODEL, source, request, out=out, picture=picture)
+    assert second.status == "unchanged"
+    assert list(second.plans) == list(first.plans)
+    assert "nothing to do" in str(second)
+    picture.unlink()
+    assert plan(MODEL, source, request, out=out, picture=picture).status == "done"
+    other = _request(source, objective="time", step_m=2.0)
+    assert plan(MODEL, source, other, out=out, picture=None).status == "done"
+    found = json.loads(out.read_text())["features"][0]["properties"]
+    assert found["objective"] == "time"
+    assert found["complete"]
+
+
+def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(source, tmp_path):
+    costs = tmp_path / "costs"
+    make_cost_map(MODEL, source, costs, step_m=2.0)
+    plans = [
+        plan(MODEL, source, _request(source, step_m=2.0, cost_map=given), out=tmp_path / name, picture=None)
+        for name, given in (("with.geojson", costs), ("without.geojson", None))
+    ]
+    ours, theirs = (found.plans["energy"] for found in plans)
+    assert ours["energy_joule"] == pytest.approx(theirs["energy_joule"], rel=1e-9)
+    with pytest.raises(ModelError, match="made from another model or map"):
+        plan(
+            replace(MODEL, checksum="1" * 64),
+            source,
+            _request(source, cost_map=costs),
+            out=tmp_path / "p.json",
+            picture=None,
+        )
+    with pytest.raises(ModelError, match="not a cost map"):
+        plan(MODEL, source, _request(source, cost_map=tmp_path), out=tmp_path / "p.json", picture=None)
+
+
+def test_names_and_points_that_cannot_be_are_one_line(source, path, tmp_path):
+    with pytest.raises(UsageError, match=r"ends in \.csv"):
+        predict_path(MODEL, source, path, tmp_path / "pieces.xlsx")
+    with pytest.raises(UsageError, match=r"ends in \.geojson"):
+        plan(MODEL, source, _request(source), out=tmp_path / "plan.kml", picture=None)
+    with pytest.raises(UsageError, match=r"ends in \.png"):
+        plan(MODEL, source, _request(source), out=tmp_path / "plan.json", picture=tmp_path / "plan.svg")
+    with pytest.raises(PathError, match="no lon, lat"):
+        plan(MODEL, source, PlanRequest((200.0, 47.0), (15.0, 47.0)), out=tmp_path / "plan.json", picture=None)
