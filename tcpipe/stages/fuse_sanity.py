@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pyarrow.compute as pc
@@ -13,6 +15,8 @@ from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import Inputs
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import Findings, Sensor, Streams
+
+_MOST_REFUSED = 0.5
 
 _STATED = ("recipe", "tf_static", "same frame")
 
@@ -26,12 +30,34 @@ def sane_inputs(inputs: Inputs, streams: Streams) -> tuple[Inputs, Findings]:
     checks = check_sensors(
         inputs.measurements[epoch], command=_command(streams, epoch), stated=stated, felt=_felt(streams)
     )
-    refused = frozenset(refusal.role for refusal in checks.refusals)
+    return _left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
+
+
+def without_lost_gnss(
+    inputs: Inputs, sanity: Findings, stretches: Sequence[Mapping[str, Any]], streams: Streams
+) -> tuple[Inputs, Findings] | None:
+    """Return the inputs without GNSS, and why, where the estimate refused most of its fixes; None where it did not.
+
+    A filter that refuses a sensor throughout is led by it all the same, each time that its gate reopens.
+    """
+    total, refused = (sum(stretch[name].get(GNSS, 0) for stretch in stretches) for name in ("measurements", "rejected"))
+    others = any(m.wheels is not None or m.visual is not None for m in inputs.measurements.values())
+    if not others or refused <= _MOST_REFUSED * total:
+        return None
+    why = f"{refused} of its {total} fixes contradict all other sensors (another clock, drive or receiver?)"
+    return _left_out(inputs, sanity, [Refusal(GNSS, why)], streams)
+
+
+def _left_out(
+    inputs: Inputs, before: Findings, refusals: Sequence[Refusal], streams: Streams
+) -> tuple[Inputs, Findings]:
+    refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
-    facts = {**checks.facts, "refused": {refusal.role: refusal.why for refusal in checks.refusals}}
-    warnings = tuple(_warning(refusal, streams.sensors[refusal.role]) for refusal in checks.refusals)
+    reasons = {**before.facts.get("refused", {}), **{refusal.role: refusal.why for refusal in refusals}}
+    warnings = (*before.warnings, *(_warning(refusal, streams.sensors[refusal.role]) for refusal in refusals))
     datum = None if GNSS in refused else inputs.datum_deg_m
-    return replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused), Findings(warnings, facts)
+    inputs = replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused)
+    return inputs, Findings(warnings, {**before.facts, "refused": reasons})
 
 
 def _without(refused: frozenset[str], m: Measurements) -> Measurements:

@@ -197,7 +197,14 @@ def constant(names: str, value: float | None = None) -> Callable[[Columns], Colu
     }
 
 
+def astray(columns: Columns) -> Columns:
+    """Fixes that wander off by a metre a second, each as sure of itself as before."""
+    steps = np.random.default_rng(6).normal(0.0, 0.3 / 111e3, (2, columns["latitude"].size))
+    return {n: columns[n] + walk for n, walk in zip(("latitude", "longitude"), steps.cumsum(axis=1), strict=True)}
+
+
 UNLIKE = {
+    "fixes that go astray": ("gnss", astray, "contradict all other sensors"),
     "fixes that never change": ("gnss", constant(("latitude", "longitude", "altitude")), "same place"),
     "places in radians": ("gnss", lambda c: {n: np.radians(c[n]) for n in ("latitude", "longitude")}, "radians?"),
     "exchanged axes": ("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]}, "exchanged?"),
