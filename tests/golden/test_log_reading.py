@@ -11,7 +11,6 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from shared_data import shared_data
 
-from tcpipe.errors import LogError
 from tcpipe.formats.log_file import find_logs, open_log
 from tcpipe.formats.mcap_log import McapPart
 
@@ -126,9 +125,16 @@ def test_what_cannot_be_decoded_is_named_and_counted():
             ("/test_topic", 3),
         }
         assert all("wrong_format" in damage.what for damage in log.damage)
-    services = shared_data("peers/rosbag2/rosbag2_cpp/test/rosbag2_cpp/bags/only_services.mcap")
-    with open_log(services) as log, pytest.raises(LogError, match="that of a service, not of a message"):
-        log.table("/add_two_ints/_service_event")
+
+
+def test_the_events_of_a_service_are_read_by_the_services_definition():
+    path = shared_data("peers/rosbag2/rosbag2_cpp/test/rosbag2_cpp/bags/only_services.mcap")
+    with open_log(path) as log:
+        events = log.table("/add_two_ints/_service_event").to_pylist()
+    asked = {e["info.sequence_number"]: e["request"][0] for e in events if e["request"]}
+    answered = {e["info.sequence_number"]: e["response"][0]["sum"] for e in events if e["response"]}
+    assert len(asked) == 6
+    assert answered == {number: pair["a"] + pair["b"] for number, pair in asked.items()}
 
 
 @pytest.fixture(scope="module")

@@ -67,6 +67,17 @@ def test_one_name_may_mean_two_things():
     assert kinds == [(("x", Scalar("f4")),), (("y", Scalar("f8")),)]
 
 
+def test_the_events_of_a_service_follow_from_its_definition():
+    text = "Point at\n---\nbool done\n" + SEPARATOR + "MSG: acme_msgs/Point\nfloat64 x\n"
+    text = text.replace("Point at", "acme_msgs/Point at")
+    found = resolve(text, "acme_msgs/srv/Go_Event").wire
+    assert [name for name, _ in found.fields] == ["info", "request", "response"]
+    info, request, response = (of for _, of in found.fields)
+    assert [name for name, _ in info.fields] == ["event_type", "stamp", "client_gid", "sequence_number"]
+    assert [name for name, _ in request.element.fields] == ["at"]
+    assert response.element.fields == (("done", Scalar("?")),)
+
+
 def test_idl():
     text = (
         "module acme_msgs { module msg {\n  struct Thing {\n    double x;\n    sequence<float> values;\n"
