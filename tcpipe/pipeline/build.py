@@ -89,7 +89,9 @@ class BuildResult:
         ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
         floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
-        return "\n".join((head, *audit_lines(self.audit), ledger, *floor, *(f"warning: {text}" for text in self.warnings)))
+        return "\n".join(
+            (head, *audit_lines(self.audit), ledger, *floor, *(f"warning: {text}" for text in self.warnings))
+        )
 
 
 def build_dataset(

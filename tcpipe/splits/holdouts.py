@@ -84,14 +84,14 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
     kept = np.full(len(ranks), UNDECIDED) if kept is None else kept
     test: Mask = kept == 1
     order = np.lexsort((ranks, arrival))
-    ends = np.append(np.flatnonzero(np.diff(arrival[order])) + 1, len(order)) if len(order) else []
+    ends: list[int] = [*(np.flatnonzero(np.diff(arrival[order])) + 1).tolist(), len(order)]
     missing, first = -int(test.sum()), 0
     for end in ends:
-        missing += math.ceil(exact * int(end)) - math.ceil(exact * first)
+        missing += math.ceil(exact * end) - math.ceil(exact * first)
         free = order[first:end][kept[order[first:end]] == UNDECIDED]
         chosen = free[: max(missing, 0)]
         test[chosen] = True
-        missing, first = missing - len(chosen), int(end)
+        missing, first = missing - len(chosen), end
     rest = np.flatnonzero((kept == UNDECIDED) & ~test)
     test[rest[np.argsort(ranks[rest], kind="stable")][: max(missing, 0)]] = True
     return test

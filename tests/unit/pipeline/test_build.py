@@ -8,6 +8,7 @@ from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file,
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError
 from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
 from tcpipe.store import Store
 
@@ -129,6 +130,7 @@ def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_
     assert result.ledger_m["recorded_twice"] == pytest.approx(20)
     assert any("20 of " in line and "the same drive; used once" in line for line in result.warnings)
     assert sum(result.ledger_m.values()) == pytest.approx(30 + 27 + 5)
+    assert verify(tmp_path / "out").problems == ()
 
 
 def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it_too(store, tmp_path):
@@ -328,6 +330,7 @@ _FULL_DISK = """
 import resource, sys
 import tcpipe.report.figures  # fonts are cached before the disk is full
 from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.verify import verify
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.recipe import Recipe
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
