@@ -108,6 +108,8 @@ def blocks(
 ) -> Iterator[Cells]:
     """Yield flat indices of cells, at most `CELLS_OF_BLOCK` together, by tile of the map, so that each tile is decoded once.
 
+    A map wider than 29 tiles is cut into strips; the tiles at their borders are decoded twice.
+
     Parameters
     ----------
     source, model, grid

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.ground_kernel import class_facts, relief_steps
+from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_STEP_M
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.tiles import MapReader
@@ -106,6 +107,7 @@ def _class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: CostMode
     traversable = model.classes.traversable()
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
+    bits[patches.terrain_class == NODATA_ID] |= np.uint16(Reason.NODATA)
     seen, known = np.zeros(256, np.bool_), np.zeros(256, np.uint8)
     seen[[class_id for class_id, count in model.class_counts.items() if count > 0]] = True
     known[list(model.pixel_classes)] = 1
