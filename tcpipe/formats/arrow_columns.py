@@ -7,8 +7,10 @@ proves it for the others; columns are strided views of the bytes. What is too ir
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import mmap
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -59,6 +61,8 @@ MAX_CONTIGUOUS_BYTES = 1 << 30
 
 _NUMBER = re.compile(r"\d+")
 _TIMES_BYTES = 24
+_ALIGNED_BYTES = 64
+_OWN_BYTES = 1 << 17
 _FEW = 32
 _PADDING = [bytes(-length % 8) for length in range(8)]
 _BEFORE_ALL = -(2**63)
@@ -98,11 +102,15 @@ def _unit_metadata(name: str, units: Mapping[str, str]) -> dict[str, str] | None
 class TopicTable:
     """Collects the messages of one topic and one definition, and gives them as tables in the order of log time.
 
-    ``expected_rows`` is about how many there will be: if it is right, values are copied into their place at once.
+    ``expected_rows`` is about how many there will be: if it is right, values are copied into their place at once. With ``in_pieces``
+    tables will be taken again and again.
     """
 
-    def __init__(self, message_type: MessageType, encoding: str, *, expected_rows: int = 0) -> None:
+    def __init__(
+        self, message_type: MessageType, encoding: str, *, expected_rows: int = 0, in_pieces: bool = False
+    ) -> None:
         self.schema = arrow_schema(message_type.wire)
+        self._in_pieces = in_pieces
         self._fields = pa.schema(list(self.schema)[2:])
         self.undecodable: dict[str, int] = {}
         """Messages left out by reason; those that differ in numbers only go by the first."""
@@ -262,7 +270,7 @@ class TopicTable:
                 return
             fits = same_shape(fresh, payloads)
             if fits.sum() >= MIN_GROUP or self._seen < MIN_GROUP:
-                known.append(_Shape(fresh, self._wire))
+                known.append(_Shape(fresh, self._wire, in_pieces=self._in_pieces))
                 self._keep(known[-1], rows[fits], payloads[fits])
             else:
                 misses += 1
@@ -392,8 +400,9 @@ class _Shape:
     ``nodes`` are the columns, each with its type.
     """
 
-    def __init__(self, layout: Layout, wire: Record) -> None:
+    def __init__(self, layout: Layout, wire: Record, *, in_pieces: bool) -> None:
         self.layout = layout
+        self._in_pieces = in_pieces
         self.nodes = list(_flat_nodes(layout.root, wire))
         self.held_bytes = 0
         self._leaves = [leaf for node, _ in self.nodes for leaf in _leaves(node)]
@@ -425,12 +434,23 @@ class _Shape:
         most = least + MAX_SHAPE_BYTES // max(self._row_bytes, 1)
         self._room = max(least, 2 * self._room, min(expected, most))
         before = self._values
-        self._values = [
-            np.empty((self._room, *(n for n, _ in repeats)), dtype.newbyteorder("="))
-            for _, dtype, repeats in self._leaves
-        ]
+        self._values = _empty(
+            [((self._room, *(n for n, _ in repeats)), dtype.newbyteorder("=")) for _, dtype, repeats in self._leaves],
+            own=self._in_pieces and self._room * self._row_bytes > _OWN_BYTES,
+        )
         for old, new in zip(before, self._values, strict=False):
             new[: self._count] = old[: self._count]
+
+
+def _empty(kinds: Sequence[tuple[tuple[int, ...], np.dtype[np.generic]]], *, own: bool) -> list[NDArray[np.generic]]:
+    """Return an array to be filled of each shape and type.
+
+    With ``own`` their memory goes back to the system with the last of them: the heap would be left full of holes, and grow with the log.
+    """
+    sizes = [-(-math.prod(shape) * dtype.itemsize // _ALIGNED_BYTES) * _ALIGNED_BYTES for shape, dtype in kinds]
+    memory = mmap.mmap(-1, sum(sizes)) if own else np.empty(sum(sizes), np.uint8)
+    starts = itertools.accumulate(sizes, initial=0)
+    return [np.ndarray(shape, dtype, memory, start) for (shape, dtype), start in zip(kinds, starts, strict=False)]
 
 
 class _Ragged:

@@ -254,7 +254,7 @@ class Log:
         LogError
             A topic is not in the log.
         """
-        collected = self._collectors(topics)
+        collected = self._collectors(topics, in_pieces=batch_bytes is not None)
         most = math.inf if batch_bytes is None else batch_bytes
         given = dict.fromkeys(collected, 0)
         held = 0
@@ -275,7 +275,7 @@ class Log:
             self._note_losses(name, of, given[name] + tables[name].num_rows)
         yield tables
 
-    def _collectors(self, topics: Iterable[str]) -> dict[str, TopicTable]:
+    def _collectors(self, topics: Iterable[str], *, in_pieces: bool) -> dict[str, TopicTable]:
         """Return an empty table for each topic that can be decoded."""
         wanted = list(dict.fromkeys(topics))
         unknown = [name for name in wanted if name not in self.topics]
@@ -285,7 +285,12 @@ class Log:
             )
         types = {name: self._message_type(name) for name in wanted}
         return {
-            name: TopicTable(of, self.topics[name].encoding, expected_rows=self.topics[name].message_count or 0)
+            name: TopicTable(
+                of,
+                self.topics[name].encoding,
+                expected_rows=self.topics[name].message_count or 0,
+                in_pieces=in_pieces,
+            )
             for name, of in types.items()
             if of is not None
         }
