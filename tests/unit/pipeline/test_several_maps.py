@@ -16,6 +16,7 @@ from tcpipe.errors import DatasetError, MapError
 from tcpipe.formats.dataset_files import read_card, read_samples
 from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import open_map
+from tcpipe.pipeline import dataset_sampling
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.report.overview import joint_bounds_m, maps_overview
@@ -54,7 +55,10 @@ def store(tmp_path_factory):
 
 
 def build(store, out, names, **keywords):
-    return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
+    """Build without the page, which takes nine tenths of the time; the last test draws it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")
+        return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
 
 
 @pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])
@@ -130,6 +134,24 @@ def test_what_cannot_be_built_from_is_said_in_one_line(store, tmp_path):
     with pytest.raises(DatasetError, match=r"3 maps in the store .*name one with --map, or several"):
         build(store, tmp_path / "out", None)
     assert not (tmp_path / "out").exists()
+
+
+def test_maps_are_held_open_only_while_samples_are_taken(store, tmp_path, monkeypatch):
+    """One more map than a process holds; and what goes wrong leaves none behind."""
+    seen = []
+
+    def failing(*arguments, **keywords):
+        seen.append(len(dataset_sampling._held))
+        raise MapError("a tile is damaged")
+
+    monkeypatch.setattr(dataset_sampling, "_HELD_MAPS", 1)
+    assert build(store, tmp_path / "out", ("west", "east")).samples > 600
+    assert not dataset_sampling._held
+    monkeypatch.setattr(dataset_sampling, "sample_on_maps", failing)
+    with pytest.raises(MapError, match="a tile is damaged"):
+        build(store, tmp_path / "other", ("west", "east"))
+    assert seen == [1]
+    assert not dataset_sampling._held
 
 
 def test_the_option_may_be_repeated(store, tmp_path):
