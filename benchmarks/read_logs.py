@@ -356,7 +356,8 @@ def start_up() -> None:
     found = []
     for _ in range(REPEATS):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
+        with MACHINE.ours():
+            subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         found.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     row("tcpipe --help: CPU ms", 80, 1000 * min(found))
@@ -374,10 +375,10 @@ def memory_rows(directory: Path, gigabytes: float) -> None:
         rows, peak, largest = map(float, done.stdout.split())
         name = f"{size:.1f} GB MCAP, {threads} thread(s): peak MB over imports and a row group"
         row(name, 120, peak - largest, note=f"peak {peak:.0f}, largest row group {largest:.0f}, {rows:.0f} messages")
-    start = time.perf_counter()
     program = f"import sys; from tcpipe.cli import cli; sys.argv = ['tcpipe', 'inspect', {str(path)!r}]; cli()"
-    subprocess.run([sys.executable, "-c", program], check=True, capture_output=True)
-    row(f"tcpipe inspect of {size:.1f} GB: wall s", 1.0, time.perf_counter() - start)
+    inspect = [sys.executable, "-c", program]
+    wall = best({"": lambda: subprocess.run(inspect, check=True, capture_output=True)}, time.perf_counter)
+    row(f"tcpipe inspect of {size:.1f} GB: wall s", 1.0, wall[""])
     path.unlink()
 
 
