@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from obstore.store import ObjectStore
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
+_ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
@@ -132,12 +133,21 @@ def _told(url: str) -> Iterator[None]:
         raise LogError(f"{url}: it cannot be read ({reason})") from None
 
 
+def _refuse_endpoints_that_are_none(scheme: str) -> None:
+    """Refuse an endpoint that is no address: obstore would end the process."""
+    for name in ("AWS_ENDPOINT_URL", "AWS_ENDPOINT_URL_S3", "AWS_ENDPOINT"):
+        value = os.environ.get(name) or os.environ.get(name.lower())
+        if scheme == "s3" and value and not _ENDPOINT.fullmatch(value):
+            raise ValueError(f"{name} is {value!r}, wanted http://host or https://host, with :port where it has one")
+
+
 def _opened(url: str) -> tuple[ObjectStore, str]:
     """Return the store, and the name of the object or prefix in it."""
     import obstore  # noqa: PLC0415
 
     scheme, _, rest = url.partition("://")
     scheme, rest = scheme.lower(), rest.rstrip("/")
+    _refuse_endpoints_that_are_none(scheme)
     if scheme == "file":
         container, _, name = rest.rpartition("/")
         container = container or "/"

@@ -114,3 +114,9 @@ def test_a_file_whose_url_is_percent_encoded(tmp_path):
 def test_a_url_that_leads_nowhere_is_refused(url):
     with pytest.raises(LogError, match=f"{url}: it cannot be read"):
         open_log(url)
+
+
+def test_an_endpoint_that_is_no_address_is_refused(monkeypatch):
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "localhost:9000")
+    with pytest.raises(LogError, match="AWS_ENDPOINT_URL is 'localhost:9000', wanted http://host"):
+        open_log("s3://bucket/run.mcap")
