@@ -7,7 +7,9 @@ Gates recover. A sensor that has been refused many times in a row and for a long
 odometry 5 s, 0.3 s where nothing else tells velocity) is taken to be right and the filter wrong: the covariance is lifted by the
 innovation before that update, which the smoother sees as process noise. Until then a multipath jump or a slipping wheel costs nothing but
 listed refusals. Where more than a tenth of all fixes is refused, the receiver's variance is not what they scatter by (a wrong claim, or
-a clock that is off): it is raised by 16 or 256 if that lets them in again, and the facts say so.
+a clock that is off): it is raised by 16 or 256 if that lets them in again, and the facts say so. Where fixes scatter far less than they
+claim, the rest of their error lasts (satellite-based corrections wander by a metre in minutes): it is no noise that averages out. It is
+added to every position's variance and, where it is larger than what odometry drifts by, such fixes count once in half a minute.
 """
 
 from __future__ import annotations
@@ -34,14 +36,18 @@ from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix
 
 _WIDTH = 30  # of a row of outputs, see `error_state_kernel._saved`; 81 more with covariances
 _BLOCK = 2048
-_KEPT_BLOCKS = 24
-"""Blocks whose forward pass is kept at once: about 2.2 kB an event, 0.11 GB."""
+_KEPT_BLOCKS = 12
+"""Blocks whose forward pass is kept at once: about 2.2 kB an event, 55 MB."""
 
 _Store = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
 _ROLES = {kernel.GNSS_POSITION: GNSS, kernel.WHEEL_VELOCITY: WHEELS, kernel.VISUAL_VELOCITY: VISUAL}
 _DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
 _DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2}
+_MANY_FIXES, _SCATTERS_LITTLE = 50, 0.5
+_ODOMETRY_HOLDS_M = 0.1
+"""What odometry drifts in half a minute: a lasting error of the fixes that is smaller is followed, a larger one is averaged."""
+_LASTS_S = 30.0
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _LEVELLING_NS = 60_000_000_000
 _NEVER = 1e18
@@ -94,6 +100,11 @@ def run_error_state(
         softer = _softened(run, initial, measurements, gate_probability)
         if softer is not None:
             run, outputs = softer, (softer.smoothed(initial) if smooth else softer.filtered(initial))
+    lasting_m2 = _lasting_variance(run, measurements)
+    if lasting_m2[0] > _ODOMETRY_HOLDS_M**2:
+        run = _less_often(run, measurements, gate_probability, lasting_m2[0])
+        outputs = run.smoothed(initial) if smooth else run.filtered(initial)
+    run.lasting_m2 = lasting_m2
     if not np.isfinite(outputs).all():
         raise FusionError("fusion: the estimate is not finite; look at the streams' values with tcpipe inspect --full")
     return _trajectory(timeline, outputs, run, output_ns)
@@ -131,6 +142,32 @@ def _softened(run: _Run, initial: InitialState, measurements: Measurements, gate
     return None
 
 
+def _lasting_variance(run: _Run, measurements: Measurements) -> NDArray[np.float64]:
+    """Return what the fixes err by together [m²], shape (3,): where they scatter far less than they claim, the rest of it lasts."""
+    of_gnss = (run.timeline.kind == kernel.GNSS_POSITION) & (run.verdict == kernel.ACCEPTED)
+    if measurements.gnss is None or of_gnss.sum() < _MANY_FIXES:
+        return np.zeros(3)
+    scatter = float(np.mean(run.nis[of_gnss])) / _DOF[kernel.GNSS_POSITION]
+    share = 1.0 - scatter if scatter < _SCATTERS_LITTLE else 0.0
+    return np.asarray(share * np.median(run.timeline.variance[of_gnss], axis=0))
+
+
+def _less_often(run: _Run, measurements: Measurements, gate_probability: float, lasting_m2: float) -> _Run:
+    """Return a run that counts an error of the fixes that lasts once in half a minute, or less often where odometry knows no better."""
+    gnss = measurements.gnss
+    fixes = 1.0 if gnss is None else max(1.0, _LASTS_S * 1e9 / median_period_ns(gnss.stamp_ns))
+    variance = run.timeline.variance.copy()
+    variance[run.timeline.kind == kernel.GNSS_POSITION] *= min(fixes, lasting_m2 / _ODOMETRY_HOLDS_M**2)
+    return _Run(
+        replace(run.timeline, variance=variance),
+        measurements,
+        gate_probability,
+        lags=run.lags,
+        covariances=run.covariances,
+        gnss_factor=run.gnss_factor,
+    )
+
+
 @dataclass(slots=True)
 class _Memory:
     """What the filter carries from event to event."""
@@ -161,6 +198,7 @@ class _Run:
         self.covariances = covariances
         self._width = _WIDTH + 81 if covariances else _WIDTH
         self.timeline = timeline
+        self.lasting_m2 = np.zeros(3)
         self.gnss_factor = gnss_factor
         count = timeline.stamp_ns.size
         self.nis = np.full(count, np.nan)
@@ -347,6 +385,10 @@ def _trajectory(
 ) -> Trajectory:
     rotation = outputs[:, 0:9].reshape(-1, 3, 3)
     scale_std, speed_mps = run.unseen_scale_std, np.linalg.norm(outputs[:, 15:18], axis=1)
+    outputs[:, 23:26] += run.lasting_m2
+    if run.covariances:
+        for axis in range(3):
+            outputs[:, _WIDTH + 10 * (6 + axis)] += run.lasting_m2[axis]
     if run.unseen_yaw_std:
         _doubt_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
     bias = outputs[:, 9:12] * (timeline.output_rate_radps if run.turn_scale_std else timeline.output_has_gyro[:, None])
@@ -427,6 +469,7 @@ def _facts(timeline: Timeline, run: _Run) -> dict[str, Any]:
     facts["events"] = int(timeline.stamp_ns.size)
     facts["standing_updates"] = int((timeline.kind == kernel.STANDING).sum())
     facts["gnss_variance_factor"] = run.gnss_factor
+    facts["gnss_lasting_error_m"] = float(np.sqrt(run.lasting_m2[0]))
     facts["covariance_repairs"] = int(run.repairs)
     facts["gyro_bias_radps"] = None if run.turn_scale_std else x[9:12].tolist()
     facts["turn_scale"] = float(1 + x[11]) if run.turn_scale_std else None

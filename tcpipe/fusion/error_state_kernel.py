@@ -236,10 +236,8 @@ def _stray(P: Matrix, x: Vector, centre: Vector, q: Vector, shake: float, dt: fl
         ub = x[b] * x[15] + x[3 + b] * x[16] + x[6 + b] * x[17]
         uc = x[c] * x[15] + x[3 + c] * x[16] + x[6 + c] * x[17]
         more = 0.0  # of the noise along body axis k beyond ``shake``
-        if k == 1:
-            more = dt * (q[10] + (q[SLIDING] - 1.0) * shake)
-        elif k == 2:
-            more = dt * (q[11] - shake)
+        if k > 0:
+            more = dt * (q[9 + k] + (q[SLIDING] - 1.0) * shake)
         for i in range(3):
             vi = centre[3 * i + c] * ub - centre[3 * i + b] * uc  # R⁺ (e_k x u)
             P[k, 9 + i] += turned * vi
@@ -256,7 +254,7 @@ def predict(
     """Advance x and P by dt.
 
     q holds 17 noise densities [unit²/s], of which that of v is left out: it is ``shake`` in all directions, or where the body velocity is
-    kept ``shake`` forward, and sideways and upward what stands there, with SLIDING times ``shake`` sideways. Then come the rate at which
+    kept ``shake`` forward, and sideways and upward what stands there and SLIDING times ``shake``. Then come the rate at which
     s_w decays (DECAY), how much the noise of the turn grows with its square (TURNING), whether b_g are scale errors (SCALED, 0 or 1),
     and by how much roll and pitch stray on a metre of ground [rad²/m] (GROUND).
     F, shape (12, 9), becomes what the first 12 errors turn into of those in `_MOVED`; a F of no rows is left alone.

@@ -32,7 +32,7 @@ _MAX_RATE_RADPS = 100.0
 _MAX_FORCE_MPS2 = 1000.0
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _DATUM_FIXES = 10
-_NOISE_WINDOW_S = 1.0
+_NOISE_WINDOW_S = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +161,8 @@ def inertial(
     # NaN compares false.
     good: NDArray[np.bool_] = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
     usable, repeated = _usable(stamp_ns, good)
-    orientation = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"])[usable])
-    norm = float(np.median(np.linalg.norm(force[usable], axis=1))) if usable.size else 0.0
+    rate, force = rate[usable], force[usable]
+    norm = float(np.median(np.linalg.norm(force, axis=1))) if usable.size else 0.0
     low, high = _GRAVITY_BAND_MPS2
     remarks: tuple[str, ...] = ()
     if usable.size and not low <= norm <= high:
@@ -170,16 +170,21 @@ def inertial(
         remarks = (
             f"median specific force is {norm:.2f} m/s², {wanted}: only the gyroscope is used, roll and pitch are weak",
         )
-    turn = rotate(quat_xyzw, rate[usable])
+    gyro_std = max(gyro_std_radps, white_noise(rate))
+    noise = np.maximum(accelerometer_std_mps2, _local_noise(stamp_ns[usable], force))
+    accelerometer_std = max(accelerometer_std_mps2, white_noise(force))
+    rate, force = rotate(quat_xyzw, rate), rotate(quat_xyzw, force)
+    force -= _lever_acceleration(stamp_ns[usable], rate, np.asarray(xyz_m))
+    orientation = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"])[usable])
     made = InertialMeasurements(
         stamp_ns[usable],
-        turn,
-        rotate(quat_xyzw, force[usable]) - _lever_acceleration(stamp_ns[usable], turn, np.asarray(xyz_m)),
+        rate,
+        force,
         product(orientation, inverse(quat_xyzw)),
-        max(gyro_std_radps, white_noise(rate[usable])),
-        max(accelerometer_std_mps2, white_noise(force[usable])),
+        gyro_std,
+        accelerometer_std,
         not remarks,
-        accelerometer_noise_mps2=np.maximum(accelerometer_std_mps2, _local_noise(stamp_ns[usable], force[usable])),
+        accelerometer_noise_mps2=noise,
     )
     return made, Prepared(stamp_ns[~good], repeated, 0, remarks)
 
@@ -201,16 +206,18 @@ def _lever_acceleration(
 
 
 def _local_noise(stamp_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Estimate the white noise over the second around each sample, the largest of the axes, shape (N,)."""
+    """Estimate the white noise over two seconds around each sample, the largest of the axes, shape (N,)."""
     if values.shape[0] < 3:
         return np.zeros(values.shape[0])
     half = max(1, round(_NOISE_WINDOW_S * 0.5e9 / median_period_ns(stamp_ns)))
-    total = np.zeros((values.shape[0] - 1, values.shape[1]))
-    np.cumsum(np.diff(values, n=2, axis=0) ** 2 / 6, axis=0, out=total[1:])
     row = np.arange(values.shape[0]) - 1
-    first, last = np.clip(row - half, 0, len(total) - 1), np.clip(row + half + 1, 0, len(total) - 1)
-    mean = (total[last] - total[first]) / np.maximum(last - first, 1)[:, None]
-    return np.asarray(np.sqrt(np.maximum(mean.max(axis=1), 0.0)))
+    last_row = values.shape[0] - 2
+    first, last = np.clip(row - half, 0, last_row), np.clip(row + half + 1, 0, last_row)
+    largest = np.zeros(values.shape[0])
+    for axis in values.T:
+        total = np.concatenate(([0.0], np.cumsum(np.diff(axis, n=2) ** 2 / 6)))
+        np.maximum(largest, total[last] - total[first], out=largest)
+    return np.asarray(np.sqrt(largest / np.maximum(last - first, 1)))
 
 
 def _matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> NDArray[np.float64]:

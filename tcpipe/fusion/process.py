@@ -18,7 +18,7 @@ from tcpipe.fusion.signals import in_gap, median_period_ns, seconds, slopes, whi
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
 VISUAL_SCALE_STD = 0.05
-_WHEEL_SCALE_TIME_S = 30.0
+_WHEEL_SCALE_TIME_S = 60.0
 _WHEEL_TURN_SCALE_STD, _VISUAL_TURN_SCALE_STD = 0.2, 0.03
 _TURN_SCALE_TIME_S = 60.0
 _GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre

@@ -37,6 +37,7 @@ _STANDING_STD_MPS = 0.01
 _LEVEL_NS = 1_000_000_000
 _LEVEL_STD_RAD = 0.7
 _MIN_INPUT_GAP_NS = 100_000_000
+_PIECE = 1 << 15
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,9 +97,9 @@ def build_timeline(
     stamp, kind, output = stamp[order], kind[order], output[order]
     before = np.concatenate((stamp[:1], stamp[:-1]))
     rate, force, mode = _inputs(measurements, before, stamp, start)
-    rate_now, _, _ = _inputs(measurements, stamp, stamp, start)
+    rate_now, _ = _turn_rates(measurements, stamp, stamp, start)
     half = (median_period_ns(output_ns) if output_ns.size > 1 else _MAX_STEP_NS) // 2
-    around, _, around_mode = _inputs(measurements, output_ns - half, output_ns + half, start)
+    around, around_mode = _turn_rates(measurements, output_ns - half, output_ns + half, start)
     return Timeline(
         stamp,
         np.asarray(stamp - before, np.float64) * 1e-9,
@@ -213,19 +214,49 @@ def _inputs(
     measurements: Measurements, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64], zero_ns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int8]]:
     """Mean angular velocity and specific force over each interval, and the process mode they allow: the best source that covers it."""
-    rate, mode = _odometric_turn_rate(measurements, before_ns, after_ns, zero_ns)
+    rate, mode = _turn_rates(measurements, before_ns, after_ns, zero_ns)
     force = np.zeros((before_ns.size, 3))
     imu = measurements.imu
-    if imu is None or imu.stamp_ns.size == 0:
-        return rate, force, mode
-    covered = _covered(imu.stamp_ns, before_ns, after_ns)
-    stamp_s = seconds(imu.stamp_ns, zero_ns)
-    start_s, end_s = seconds(before_ns[covered], zero_ns), seconds(after_ns[covered], zero_ns)
-    rate[covered] = interval_means(stamp_s, imu.angular_velocity_radps, start_s, end_s)
-    if imu.accelerometer_usable:
-        force[covered] = interval_means(stamp_s, imu.specific_force_mps2, start_s, end_s)
-    mode[covered] = kernel.INERTIAL if imu.accelerometer_usable else kernel.GYRO_TURN
+    if imu is not None and imu.accelerometer_usable:
+        felt = mode == kernel.GYRO_TURN
+        force[felt] = _means(imu, imu.specific_force_mps2, before_ns[felt], after_ns[felt], zero_ns)
+        mode[felt] = kernel.INERTIAL
     return rate, force, mode
+
+
+def _turn_rates(
+    measurements: Measurements, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64], zero_ns: int
+) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    """Mean angular velocity over each interval by the best source that covers it, and the process mode that goes with it."""
+    imu = measurements.imu
+    if imu is None or imu.stamp_ns.size == 0:
+        return _odometric_turn_rate(measurements, before_ns, after_ns, zero_ns)
+    rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, kernel.GYRO_TURN, np.int8)
+    covered = _covered(imu.stamp_ns, before_ns, after_ns)
+    rate[covered] = _means(imu, imu.angular_velocity_radps, before_ns[covered], after_ns[covered], zero_ns)
+    rate[~covered], mode[~covered] = _odometric_turn_rate(
+        measurements, before_ns[~covered], after_ns[~covered], zero_ns
+    )
+    return rate, mode
+
+
+def _means(
+    imu: InertialMeasurements,
+    values: NDArray[np.float64],
+    before_ns: NDArray[np.int64],
+    after_ns: NDArray[np.int64],
+    zero_ns: int,
+) -> NDArray[np.float64]:
+    """Mean of an IMU's signal over each interval; these are in order and go piece by piece: a long log takes little room."""
+    found = np.empty((before_ns.size, 3))
+    for first in range(0, before_ns.size, _PIECE):
+        piece = slice(first, first + _PIECE)
+        begin, end = before_ns[piece], after_ns[piece]
+        low, high = np.searchsorted(imu.stamp_ns, (begin[0], end[-1]))
+        rows = slice(max(low - 1, 0), high + 1)
+        stamp_s = seconds(imu.stamp_ns[rows], zero_ns)
+        found[piece] = interval_means(stamp_s, values[rows], seconds(begin, zero_ns), seconds(end, zero_ns))
+    return found
 
 
 def _covered(
@@ -277,4 +308,7 @@ def _course_rate(gnss: Positions, zero_ns: int) -> tuple[NDArray[np.float64], ND
         return stamp_s[:1], np.zeros(1)
     course = np.unwrap(np.angle(way[moving]))
     at_s = grid_s[1:-1][moving]
-    return 0.5 * (at_s[1:] + at_s[:-1]), np.diff(course) / np.diff(at_s)
+    middle_s = 0.5 * (at_s[1:] + at_s[:-1])
+    # Before it first moves and after it last did, the robot does not turn, as far as anything tells.
+    stamp_s = np.concatenate((middle_s[:1] - 0.25, middle_s, middle_s[-1:] + 0.25))
+    return stamp_s, np.concatenate(([0.0], np.diff(course) / np.diff(at_s), [0.0]))

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
-from tcpipe.fusion.preparation import Columns, Prepared
+from tcpipe.fusion.preparation import Prepared
 from tcpipe.fusion.rails import RailSamples
 from tcpipe.fusion.stamp_jitter import steadied
 from tcpipe.recipe import FuseConfig
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import FloatColumns, floats, integers
 from tcpipe.tables.levels import Sensor, Streams
 
 
@@ -47,7 +47,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> Inputs:
     tables = {role: streams.tables[role] for role in (GNSS, IMU, WHEELS, VISUAL) if role in streams.tables}
     datum = None
     if GNSS in tables:
-        fixes = _columns(tables[GNSS])
+        fixes = FloatColumns(tables[GNSS])
         datum = preparation.find_datum(fixes["lon_deg"], fixes["lat_deg"], fixes["alt_m"])
     inputs = Inputs(datum)
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
@@ -66,7 +66,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> Inputs:
 
 
 def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: Inputs) -> Any:
-    stamp_ns, columns = integers(table, "stamp_ns"), _columns(table)
+    stamp_ns, columns = integers(table, "stamp_ns"), FloatColumns(table)
     place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
     made: Any
     if role == GNSS:
@@ -96,10 +96,6 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
         )
     inputs.note(role, prepared)
     return made if made.stamp_ns.size else None
-
-
-def _columns(table: pa.Table) -> Columns:
-    return {name: floats(table, name) for name in table.column_names if pa.types.is_floating(table[name].type)}
 
 
 def rails_of(table: pa.Table) -> list[RailSamples]:

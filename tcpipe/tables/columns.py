@@ -6,7 +6,7 @@ Units, frames, flag bits and one-line meanings stand in the Arrow field metadata
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from enum import IntFlag
 
@@ -111,6 +111,25 @@ def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
     """Return a column as float64, null as NaN, shape (N,)."""
     values: NDArray[np.float64] = table.column(name).to_numpy().astype(np.float64, copy=False)
     return values
+
+
+class FloatColumns(Mapping[str, NDArray[np.float64]]):
+    """A table's columns of numbers by name, as `floats` gives them, made when they are asked for: a long log has many nobody asks for."""
+
+    def __init__(self, table: pa.Table) -> None:
+        self._table = table
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        """Return one column, null as NaN."""
+        return floats(self._table, name)
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names."""
+        return (name for name in self._table.column_names if pa.types.is_floating(self._table[name].type))
+
+    def __len__(self) -> int:
+        """Return how many there are."""
+        return sum(1 for _ in self)
 
 
 def integers(table: pa.Table, name: str) -> NDArray[np.int64]:

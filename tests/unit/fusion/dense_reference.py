@@ -79,7 +79,7 @@ def stray(x, centre, q, shake, w, mode):  # noqa: PLR0917
     if not inertial:  # what is kept in the body turns with it
         spread[9:12, :3] = later @ np.cross(np.eye(3), body).T
     noise[:3, :3] = 0.0
-    slides = [shake] * 3 if inertial else [shake, q[10] + q[9] * shake, q[11]]
+    slides = [shake] * 3 if inertial else [shake, q[10] + q[9] * shake, q[11] + q[9] * shake]
     return noise + spread @ np.diag(np.concatenate((turned, slides))) @ spread.T
 
 

@@ -1,0 +1,108 @@
+"""How much noise the process is given, and what follows from it."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from unit.fusion import drive
+from unit.fusion.test_error_state import fuse, truth
+
+from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion.preparation import inertial
+from tcpipe.fusion.process import process_noise, shake_density, turn_scale_std
+from tcpipe.fusion.signals import slopes, white_noise
+
+
+@cache
+def measured(**options):
+    return drive.measure(truth(), 1, **options)
+
+
+def test_slopes_of_a_line_are_its_own_whatever_its_stamps():
+    stamp_ns = np.sort(np.random.default_rng(0).integers(0, 10**10, 200)) + 10**18
+    values = 3.0 - 0.7 * (stamp_ns - 10**18) * 1e-9
+    assert slopes(stamp_ns, values, 0.6) == pytest.approx(np.full(200, -0.7), abs=1e-5)
+    assert slopes(stamp_ns[:1], values[:1], 0.6).tolist() == [0.0]
+
+
+def test_white_noise_is_told_from_motion():
+    t = np.arange(4000) / 200
+    noise = 0.05 * np.random.default_rng(1).normal(size=(4000, 3))
+    assert white_noise(noise + np.sin(t)[:, None]) == pytest.approx(0.05, rel=0.05)
+    assert white_noise(noise[:2]) == 0.0
+
+
+def test_vibration_counts_where_it_is():
+    rng = np.random.default_rng(2)
+    stamp_ns = np.arange(4000, dtype=np.int64) * 5_000_000
+    shaken = np.where(np.arange(4000) < 2000, 0.05, 0.4)[:, None] * rng.normal(size=(4000, 3)) + [0.0, 0.0, 9.81]
+    names = [f"linear_acceleration_{axis}_mps2" for axis in "xyz"]
+    columns = dict(zip(names, shaken.T, strict=True))
+    columns |= {f"angular_velocity_{axis}_radps": np.zeros(4000) for axis in "xyz"}
+    columns |= {f"quat_{c}": np.full(4000, np.nan) for c in "xyzw"}
+    place = {"xyz_m": (0.0, 0.0, 0.0), "quat_xyzw": (0.0, 0.0, 0.0, 1.0)}
+    imu, _ = inertial(stamp_ns, columns, **place, gyro_std_radps=0.002, accelerometer_std_mps2=0.02)
+    assert imu.accelerometer_noise_mps2[:1700] == pytest.approx(np.full(1700, 0.05), rel=0.3)
+    assert imu.accelerometer_noise_mps2[2300:] == pytest.approx(np.full(1700, 0.4), rel=0.3)
+    at_ns, inertial_mode = stamp_ns[[1000, 3000]], np.full(2, kernel.INERTIAL, np.int8)
+    density = shake_density(replace(measured(), imu=imu), at_ns, inertial_mode)
+    assert density == pytest.approx(np.array([0.05, 0.4]) ** 2 / 200, rel=0.6)
+
+
+def test_without_an_imu_the_velocity_may_change_where_every_odometry_says_so():
+    moving, held = measured(imu=False), np.zeros(2, np.int8)
+    at_ns = drive.ns([4.3, 30.0])  # starting, and driving steadily
+    starting, steady = shake_density(moving, at_ns, held)
+    assert starting > 5 * steady
+    digging = moving.wheels.velocity_mps.copy()
+    digging[:, 0] += np.clip((moving.wheels.stamp_ns - at_ns[1]) * 1e-9, 0, 1)  # the camera sees no such start
+    again = shake_density(replace(moving, wheels=replace(moving.wheels, velocity_mps=digging)), at_ns, held)
+    assert again[1] < 5 * steady
+    blind = replace(moving, visual=None, wheels=replace(moving.wheels, velocity_mps=digging))
+    assert shake_density(blind, at_ns + 300_000_000, held)[1] > 5 * steady
+
+
+def test_a_turn_rate_of_an_odometry_has_a_scale_to_be_found():
+    with_imu, without = measured(), measured(imu=False)
+    assert turn_scale_std(with_imu) == 0.0
+    assert turn_scale_std(without) > 0.1
+    assert process_noise(with_imu)[:, kernel.SCALED].max() == 0.0
+    assert process_noise(without)[kernel.FLAT_TURN, kernel.SCALED] == 1.0
+    found = fuse(without)
+    assert found.facts["turn_scale"] == pytest.approx(0.75, abs=0.03)  # these wheels say 0.8 of a turn: w (1 + 0.25)
+    assert found.facts["gyro_bias_radps"] is None
+    assert drive.errors(truth(), found)["yaw_deg"] < 1.5
+
+
+def test_positions_alone_do_not_tell_which_way_the_robot_looks():
+    alone = fuse(measured(imu=False, visual=False, wheels=False), covariances=True)
+    assert alone.yaw_std_rad.min() > 1.5
+    speed = np.linalg.norm(alone.velocity_enu_mps, axis=1)
+    assert (alone.forward_velocity_std_mps > speed).all()
+    found = drive.errors(truth(), alone)
+    assert found["xy"] < 0.35
+    assert 0.05 < found["nees_position"] < 3.0
+    assert np.linalg.eigvalsh(alone.covariance).min() > 0
+
+
+@pytest.mark.parametrize(("std_m", "holds"), [(1.0, (0.4, 1.6)), (0.014, (0.01, 0.03))])
+def test_an_error_of_the_fixes_that_lasts_does_not_average_out(std_m, holds):
+    """A first-order Gauss-Markov error with a correlation time of a minute, ten times a second."""
+    m = measured(gnss_std=1e-3, gnss_outliers=0.01)
+    rng = np.random.default_rng(3)
+    kept = np.exp(-0.1 / 60)
+    error = std_m * rng.normal(size=(m.gnss.stamp_ns.size, 3))
+    error[1:] *= np.sqrt(1 - kept**2)
+    for k in range(1, len(error)):
+        error[k] += kept * error[k - 1]
+    variance = np.full(error.shape, std_m**2)
+    fixes = replace(m.gnss, position_enu_m=m.gnss.position_enu_m + error, variance_m2=variance)
+    found = fuse(replace(m, gnss=fixes))
+    assert holds[0] < found.facts["gnss_lasting_error_m"] < holds[1]
+    figures = drive.errors(truth(), found)
+    assert 0.05 < figures["nees_position"] < 3.0
+    assert figures["forward"] < 0.015
+    assert figures["nees_forward"] < 3.0
+    white = fuse(measured())
+    assert white.facts["gnss_lasting_error_m"] == 0.0
