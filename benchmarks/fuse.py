@@ -1,4 +1,4 @@
-"""CPU time and memory of the estimators, paired with compiled C++ and with filterpy: ``python benchmarks/fuse.py [--hours 6]``.
+"""CPU time and memory of the estimators, paired with compiled C++ and with filterpy: ``python benchmarks/fuse.py [--hours 1 6]``.
 
 The log: a robot that winds over flat ground at 1 m/s with IMU 200 Hz, wheels 50 Hz, visual odometry 30 Hz and GNSS 10 Hz: 290 events a
 second, each one prediction and one update for the 15-state filters; ``us/event`` is by these everywhere. (The error-state filter takes the
@@ -6,7 +6,8 @@ IMU as its process input, so that it steps less often than messages come; the sa
 
 The compiled C++ is `eigen_ukf15.cpp`, the step of robot_localization's UKF core on the same events; it needs g++ and Eigen
 (Debian: libeigen3-dev), else it is left out. Runs are interleaved, so that a busy machine slows all; the median of the paired ratios
-counts. Compilation is not counted. The last part fuses an hour through the whole stage, from streams to track, in a process of its own.
+counts. Compilation is not counted. The last part fuses an hour, and six, through the whole stage, from streams to track, in processes of
+their own: how memory grows with the log.
 """
 
 from __future__ import annotations
@@ -245,14 +246,15 @@ def fuse_hours(hours: float) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--hours", type=float, default=1.0, help="length of the long log")
+    parser.add_argument("--hours", type=float, nargs="+", default=[1.0, 6.0], help="lengths of the long logs")
     parser.add_argument("--only-long", action="store_true")
     given = parser.parse_args()
     if given.only_long:
-        fuse_hours(given.hours)
+        fuse_hours(given.hours[0])
         return
     print_paired()
-    subprocess.run([sys.executable, __file__, "--only-long", "--hours", str(given.hours)], check=True)
+    for hours in given.hours:
+        subprocess.run([sys.executable, __file__, "--only-long", "--hours", str(hours)], check=True)
 
 
 if __name__ == "__main__":

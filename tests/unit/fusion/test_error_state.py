@@ -76,7 +76,7 @@ def test_facts_name_what_the_sensors_were():
     assert facts["visual_scale"] == pytest.approx(1.02, abs=0.01)
     assert set(facts["nis_mean"]) == {GNSS, WHEELS, VISUAL}
     assert all(0.7 < facts["nis_mean"][role] < 1.3 for role in (GNSS, VISUAL))
-    assert 0.05 < facts["nis_mean"][WHEELS] < 1.0  # slip lasts: their variance is taken five times
+    assert 0.05 < facts["nis_mean"][WHEELS] < 1.0  # beyond noise they claim nothing here; slip is a state
     assert facts["covariance_repairs"] == 0
 
 
