@@ -6,7 +6,7 @@ import logging
 import tempfile
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,6 +16,7 @@ from tcpipe.errors import LogError, TcpipeError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.joined_log import open_logs
 from tcpipe.formats.json_files import plain
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, read_key, recipe_id
 from tcpipe.logs.profiles import ROBOTS, Robot
 from tcpipe.pipeline.log_sources import LogSource, definitions_key, find_sources, in_turns, on_this_machine, with_hashes
@@ -125,7 +126,7 @@ def ingest(
     robot = robot or ruling.robot
     if robot is not None and robot not in ROBOTS:
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(ROBOTS))}")
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as staging, _gone_if_empty(Path(store)):
+    with _place_for_stand_ins(logs := list(logs)) as staging, _gone_if_empty(Path(store)):
         found = find_sources(logs, as_one=as_one, staging=Path(staging))
         house = open_store(store, create=True)
         if on_found:
@@ -147,6 +148,12 @@ def ingest(
                     if on_result:
                         on_result(result)
         return IngestSummary(house.root, tuple(results[index] for index in range(len(sources))))
+
+
+def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[str]:
+    """Return a temporary directory, where a log is named by its URL."""
+    remote = any(is_url(log) for log in logs)
+    return tempfile.TemporaryDirectory(prefix="tcpipe-") if remote else nullcontext("")
 
 
 @contextmanager
