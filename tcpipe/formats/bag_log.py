@@ -50,6 +50,8 @@ _MAX_CHUNK_HEADER = 128
 _NS = 1_000_000_000
 _TIME = struct.Struct("<II")
 _INDEX_ENTRY_BYTES = 12
+_INDEX_HEAD_BYTES = 64
+"""As much as an index record's header takes as a rule, and the length behind it."""
 _LEAST_RECORD_BYTES = 8
 
 _Messages = tuple[Int64Array, Int64Array, Int64Array]
@@ -259,10 +261,11 @@ class BagPart:
 
         Their headers differ in connection and count only, so that most need no parsing.
         """
-        length = int.from_bytes(self._bytes.peek(position, 4), "little")
-        if length in self._index_heads:
+        head = self._bytes.peek(position, _INDEX_HEAD_BYTES)
+        length = int.from_bytes(head[:4], "little")
+        if length in self._index_heads and length + 8 <= len(head):
             connection_at, low, high, rest = self._index_heads[length]
-            header = self._bytes.peek(position + 4, length + 4)
+            header = head[4 : length + 8]
             size = int.from_bytes(header[length:], "little")
             if header[:low] + header[low + 4 : high] + header[high + 4 : length] == rest and size % 12 == 0:
                 connection = int.from_bytes(header[connection_at : connection_at + 4], "little")

@@ -31,7 +31,7 @@ SEARCH_BYTES = 1 << 20
 _LZ4_HEAD = struct.Struct("<4sBBQ")
 """An LZ4 frame's first fields: magic, flags, block size, size of the content."""
 _LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
-_PEEK_BYTES = 1 << 14
+_PEEK_BYTES = 1 << 13
 _GAP_BYTES = 1 << 15
 """Pieces of a file that lie no further apart are read as one."""
 
@@ -177,16 +177,6 @@ class ByteSource:
         if offset < at or offset + size > at + len(held):
             at, held = self._peeked = offset, os.pread(self._file.fileno(), max(size, _PEEK_BYTES), offset)
         return held[offset - at : offset - at + size]
-
-    def mapped(self, offset: int, size: int, pieces: tuple[Int64Array, Int64Array] | None = None) -> memoryview:
-        """Return a view of the file that is read where it is touched; with ``pieces`` (starts, ends), there and hardly elsewhere."""
-        if not size:
-            return memoryview(b"")
-        before = offset % mmap.ALLOCATIONGRANULARITY
-        window = mmap.mmap(self._file.fileno(), size + before, access=mmap.ACCESS_READ, offset=offset - before)
-        if pieces is not None:
-            read_only(window, pieces[0] + before, pieces[1] + before)
-        return memoryview(window)[before:]
 
     def skips(self) -> None:
         """Tell the system that this file is read in pieces: what follows a piece need not be read ahead."""
