@@ -23,6 +23,7 @@ from tcpipe.tables.levels import with_metadata
 
 INDEX = "export.json"
 """What a directory of exported topics holds, and of which log: a second call finds it done."""
+_ENTRY = {"file", "bytes", "type", "rows", "made_from", "damage", "remarks"}
 _LONGEST_STEM = 200
 
 
@@ -120,8 +121,11 @@ def _identity(log: Log, log_path: Path | str, message_definitions: Path | None) 
 
 
 def _index(out: Path) -> dict[str, Any]:
+    """Return what ``out`` holds; an entry that is not as this version writes it counts for nothing."""
     found = read_json(out / INDEX) if (out / INDEX).is_file() else {}
-    return {**found, "topics": dict(found.get("topics", {}))}
+    entries = found.get("topics")
+    known = entries if isinstance(entries, dict) else {}
+    return {"topics": {name: of for name, of in known.items() if isinstance(of, dict) and of.keys() == _ENTRY}}
 
 
 def _refuse_others_files(index: Mapping[str, Any], made_from: Mapping[str, Any], paths: Mapping[str, Path]) -> None:

@@ -81,6 +81,16 @@ def test_topics_are_added_to_what_is_there(tmp_path, log):
     assert export(log, out).status == "unchanged"
 
 
+@pytest.mark.parametrize(
+    "content", ["{}", '{"topics": []}', '{"topics": {"/Imu": {"file": "Imu.parquet"}, "/Path": 1}}']
+)
+def test_an_index_that_is_not_ours_counts_for_nothing(tmp_path, log, content):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "export.json").write_text(content)
+    assert export(log, tmp_path / "out").status == "done"
+    assert export(log, tmp_path / "out").status == "unchanged"
+
+
 def test_a_log_that_has_changed_is_exported_again(tmp_path, log):
     export(log, tmp_path / "out")
     write_mcap(log, random_messages(2, count=30, types=TYPES))
