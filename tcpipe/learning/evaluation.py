@@ -141,6 +141,7 @@ def _split_values(found: Measured, said: Mapping[str, Any], plant: PlantCosts | 
     values = {
         "samples": len(found.split),
         "classes": counts,
+        "class_order": list(counts),
         "errors": errors_by_class(said, found.costs, found.class_ids, found.names),
         "label_floor": label_floor(found.deviations, found.costs, found.class_ids, found.names),
     }

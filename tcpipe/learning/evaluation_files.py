@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ from tcpipe import __version__
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import write_text
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.formats.json_files import digest, read_json, write_json
+from tcpipe.formats.json_files import digest, read_json, to_json, write_json
 from tcpipe.learning.evaluation import NETWORKS, EvaluateConfig, PlantCosts, evaluate
 from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows
 from tcpipe.learning.metrics import ALL, QUANTITIES
@@ -74,7 +75,8 @@ def run_evaluation(
     if (place / JSON).is_file() and (known := read_json(place / JSON)).get("key") == key:
         values = known
     else:
-        values = {**evaluate(model, dataset, place, rules, plant=plant), "key": key}
+        found = {**evaluate(model, dataset, place, rules, plant=plant), "key": key}
+        values = json.loads(to_json(found))  # in the order of the file, as the next call will read it
     name = values["dataset"]["name"]
     lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E, beside the paper's."
     warnings = [SIMULATED] if plant is not None else []

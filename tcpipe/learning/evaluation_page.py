@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.evaluation import SPLITS
+from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS, SPLITS
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.prediction_figures import predictions_by_patch
 
-FLOORS = {"label_floor": "label noise alone", "simulation_floor": "a predictor that knows the simulator"}
+FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """What an error can hardly be less than, and what the page calls it."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
@@ -33,7 +33,7 @@ def evaluation_page(
             Number(
                 _figure(part["errors"][quantity][ALL], "mape_percent", quantity) + " %", f"MAPE of {quantity}, {name}"
             )
-            for name, part in values["splits"].items()
+            for name, part in sorted(values["splits"].items())
             for quantity in ("E", "T")
         ],
         warnings=[*warnings, *values["warnings"]],
@@ -96,7 +96,7 @@ def _by_class(values: Mapping[str, Any]) -> list[Section]:
         if name not in values["splits"]:
             continue
         part = values["splits"][name]
-        classes = [*part["classes"], ALL]
+        classes = [*part["class_order"], ALL]
         rows = []
         for quantity in QUANTITIES:
             for measure, called in MEASURES.items():
@@ -104,10 +104,7 @@ def _by_class(values: Mapping[str, Any]) -> list[Section]:
                 rows.append((f"{quantity}, {called} [{_unit(measure, quantity)}]", "here", *ours))
                 told = dict(zip(paper.CLASSES, paper.BY_CLASS[name, quantity, measure], strict=True))
                 rows.append(("", "the paper", *(_paper_figure(told.get(entry)) for entry in classes)))
-                for floor, said in (
-                    ("label_floor", "label noise alone"),
-                    ("simulation_floor", "simulation's own floor"),
-                ):
+                for floor, said in FLOORS.items():
                     if floor in part:
                         noise = [_figure(part[floor][quantity].get(entry), measure, quantity) for entry in classes]
                         rows.append(("", said, *noise))
@@ -118,7 +115,7 @@ def _by_class(values: Mapping[str, Any]) -> list[Section]:
         header = (
             "",
             "",
-            *(f"{entry} ({part['classes'][entry]})" for entry in part["classes"]),
+            *(f"{entry} ({part['classes'][entry]})" for entry in part["class_order"]),
             f"all ({part['samples']})",
         )
         sections.append(
@@ -135,7 +132,7 @@ _TEXT = {
 
 def _ablation(values: Mapping[str, Any]) -> Section:
     """Return table III."""
-    splits = list(values["splits"])
+    splits = [split for split in SPLITS if split in values["splits"]]
     rows = []
     for row in values["ablation"]:
         key = tuple(row["layers"])
@@ -153,9 +150,9 @@ def _ablation(values: Mapping[str, Any]) -> Section:
 
 
 def _compared(title: str, text: str, found: Mapping[str, Any], told: Mapping[str, Any], quantity: str) -> Section:
-    splits = list(next(iter(found.values()), {}))
+    splits = [split for split in SPLITS if split in found[OURS]]
     rows = []
-    for what, by_split in found.items():
+    for what, by_split in ((what, found[what]) for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED) if what in found):
         cells = [_figure(by_split[split], measure, quantity) for split in splits for measure in MEASURES]
         rows.append((what, "here", *cells))
         if what in told:

@@ -31,7 +31,7 @@ def predictions_by_patch(measured: Array, predicted: Array, classes: Sequence[st
         values.plot(number, measured, color=MEASURED, lw=1.1, label="measured")
         values.plot(number, predicted, color=PREDICTED, lw=1.1, label="predicted")
         values.set_ylabel(label)
-        values.legend(loc="lower right", bbox_to_anchor=(1.0, 1.05), ncols=2, frameon=False, borderaxespad=0.0)
+        values.legend(loc="lower right", bbox_to_anchor=(1.0, 1.14), ncols=2, frameon=False, borderaxespad=0.0)
         error.plot(number, 100.0 * np.abs(predicted - measured) / np.abs(measured), color=INK, lw=1.1)
         error.set_ylabel("absolute error [%]")
         error.set_ylim(0.0, 50.0)

@@ -96,8 +96,10 @@ def test_a_class_that_the_model_never_saw_is_said(evaluated):
 
 def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):
     place, values = evaluated
+    before = {path: path.read_bytes() for path in place.iterdir()}
     monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", None)
     assert run_evaluation(model, dataset, place, config=CONFIG).values == values
+    assert {path: path.read_bytes() for path in place.iterdir()} == before
 
 
 def test_a_model_that_does_not_fit_is_told_every_reason(dataset, tmp_path):
