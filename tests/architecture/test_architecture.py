@@ -9,7 +9,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from importlinter.cli import lint_imports
 
 from tcpipe.tables import levels
 from tcpipe.tables.columns import TableSchema
@@ -107,9 +106,11 @@ def _used(tree):
             yield ".".join([known[inner.id], *reversed(parts)]), id(node) in bare, node.lineno
 
 
-def test_imports_go_only_downward(capsys):
-    status = lint_imports(config_filename=str(ROOT / "pyproject.toml"), no_cache=True)
-    assert status == 0, capsys.readouterr().out
+def test_imports_go_only_downward():
+    # In a process of its own: the linter keeps the output stream that it meets first, which here is one that pytest has closed.
+    linter = [sys.executable, "-c", "import importlinter.cli; importlinter.cli.lint_imports_command()", "--no-cache"]
+    done = subprocess.run(linter, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_page_and_linter_show_the_same_floors():

@@ -474,6 +474,7 @@ def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_p
         _, told = process.communicate(timeout=120)
         assert process.returncode == 0, told
     assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest.json"))) == 2
-    assert len(json.loads((tmp_path / "tcpipe-store" / "sources.json").read_text())) == 3
+    sources = json.loads((tmp_path / "tcpipe-store" / "sources.json").read_text())
+    assert len(sources.keys() - {"document_sha256"}) == 3
     assert not list(tmp_path.rglob(".tmp-*"))
     assert "nothing to do: 3 of 3" in _run("ingest", *batches[0], *batches[1], cwd=tmp_path)
