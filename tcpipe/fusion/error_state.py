@@ -105,6 +105,7 @@ def run_error_state(
         run = _less_often(run, measurements, gate_probability, lasting_m2[0])
         outputs = run.smoothed(initial) if smooth else run.filtered(initial)
     run.lasting_m2 = lasting_m2
+    run.unseen_scale_std = _unseen_scale_std(run, measurements)
     if not np.isfinite(outputs).all():
         raise FusionError("fusion: the estimate is not finite; look at the streams' values with tcpipe inspect --full")
     return _trajectory(timeline, outputs, run, output_ns)
@@ -150,6 +151,22 @@ def _lasting_variance(run: _Run, measurements: Measurements) -> NDArray[np.float
     scatter = float(np.mean(run.nis[of_gnss])) / _DOF[kernel.GNSS_POSITION]
     share = 1.0 - scatter if scatter < _SCATTERS_LITTLE else 0.0
     return np.asarray(share * np.median(run.timeline.variance[of_gnss], axis=0))
+
+
+def _unseen_scale_std(run: _Run, measurements: Measurements) -> float:
+    """Return what the fixes cannot tell of the odometry's scale: their error at both ends of the ground that they span.
+
+    It is at most the scale's own deviation. The white part of the error of many fixes is the filter's business.
+    """
+    own = WHEEL_SCALE_STD if measurements.visual is None else VISUAL_SCALE_STD
+    of_gnss = (run.timeline.kind == kernel.GNSS_POSITION) & (run.verdict == kernel.ACCEPTED)
+    if measurements.wheels is None and measurements.visual is None:
+        return 0.0
+    if of_gnss.sum() < 2:
+        return own
+    few_m2 = np.median(run.timeline.variance[of_gnss, 0]) if of_gnss.sum() < _MANY_FIXES else 0.0
+    span_m = np.linalg.norm(np.ptp(run.timeline.value[of_gnss, :2], axis=0))
+    return float(min(own, np.sqrt(2.0 * max(run.lasting_m2[0], few_m2)) / max(span_m, 1e-3)))
 
 
 def _less_often(run: _Run, measurements: Measurements, gate_probability: float, lasting_m2: float) -> _Run:
@@ -227,8 +244,6 @@ class _Run:
             self._lock_out[kernel.GNSS_POSITION, 1:] = 1.0
         # Without GNSS nothing tells how long a metre of odometry is; an accelerometer has a scale and an alignment of its own.
         self.unseen_scale_std = 0.0
-        if measurements.gnss is None:
-            self.unseen_scale_std = WHEEL_SCALE_STD if measurements.visual is None else VISUAL_SCALE_STD
         # From positions alone forward and reverse look the same: yaw is the course, and may be anything.
         self.unseen_yaw_std = 0.0
         self.antenna_m = self._levers[kernel.GNSS_POSITION]

@@ -188,3 +188,30 @@ def test_a_receiver_whose_clock_is_off_is_trusted_less_rather_than_refused():
     assert 0.1 < error["xy"] < 0.3  # a quarter of a second of way, but no more
     assert error["forward"] < 0.03
     assert smoothed().facts["gnss_variance_factor"] == 1
+
+
+def test_two_fixes_close_together_say_nothing_of_how_long_a_metre_is():
+    all_of_it = drive.measure(truth(), 1)
+    first = {name: getattr(all_of_it.gnss, name)[:2] for name in ("stamp_ns", "position_enu_m", "variance_m2")}
+    found = fuse(replace(all_of_it, gnss=replace(all_of_it.gnss, **first)))
+    moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
+    unplaced = smoothed(gnss=False)
+    assert found.forward_velocity_std_mps[moving].min() > 0.025
+    assert np.median(found.forward_velocity_std_mps[moving]) > 0.9 * np.median(
+        unplaced.forward_velocity_std_mps[moving]
+    )
+    assert np.median(smoothed().forward_velocity_std_mps[moving]) < 0.01
+
+
+def test_an_error_of_a_metre_that_lasts_leaves_the_scale_open():
+    all_of_it = drive.measure(truth(), 1)
+    slow = np.cumsum(
+        np.random.default_rng(2).normal(0, 0.16 * np.sqrt(0.1), all_of_it.gnss.position_enu_m.shape), axis=0
+    )
+    claims = np.full_like(all_of_it.gnss.variance_m2, 1.5**2)
+    fixes = replace(all_of_it.gnss, position_enu_m=all_of_it.gnss.position_enu_m + slow, variance_m2=claims)
+    found = fuse(replace(all_of_it, gnss=fixes))
+    true = drive.errors(truth(), found)["forward"]
+    moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
+    assert found.facts["gnss_lasting_error_m"] > 1.0
+    assert np.median(found.forward_velocity_std_mps[moving]) > true
