@@ -37,12 +37,10 @@ def pages() -> dict[str, str]:
 
 def _cli() -> str:
     parts = [_NOTE, "# Commands\n"]
-    with click.Context(cli, info_name="tcpipe", terminal_width=110, max_content_width=110) as parent:
+    with click.Context(cli, info_name="tcpipe", terminal_width=110, **cli.context_settings) as parent:
         parts.append(f"```\n{cli.get_help(parent)}\n```\n")
         for name, command in cli.commands.items():
-            with click.Context(
-                command, info_name=name, parent=parent, terminal_width=110, max_content_width=110
-            ) as context:
+            with click.Context(command, info_name=name, parent=parent, terminal_width=110) as context:
                 parts.append(f"## tcpipe {name}\n\n```\n{command.get_help(context)}\n```\n")
     return "\n".join(parts)
 

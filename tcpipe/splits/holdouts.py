@@ -46,8 +46,8 @@ class Groups:
         if kinds == 0:
             return np.full(len(self.names), UNDECIDED)
         known = values != UNDECIDED
-        votes = np.bincount(self.member[known] * kinds + values[known], minlength=len(self.names) * kinds)
-        votes = votes.reshape(-1, kinds)
+        ballots = self.member[known] * kinds + values[known]
+        votes = np.bincount(ballots, minlength=len(self.names) * kinds).reshape(-1, kinds)
         return np.where(votes.any(axis=1), votes.argmax(axis=1), UNDECIDED)
 
 
