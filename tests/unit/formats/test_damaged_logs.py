@@ -2,6 +2,7 @@
 
 import sqlite3
 import struct
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -276,7 +277,7 @@ def test_a_broken_metadata_file_costs_nothing(tmp_path, content):
 def test_rows_that_are_no_messages_cost_only_themselves(tmp_path):
     messages = random_messages(5, count=20, types=("std_msgs/msg/ColorRGBA",))
     path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
-    with sqlite3.connect(path) as database:
+    with closing(sqlite3.connect(path)) as database, database:
         database.execute("UPDATE messages SET timestamp = 'abc' WHERE id = 3")
         database.execute("UPDATE messages SET data = 'text' WHERE id = 5")
         database.execute("UPDATE messages SET topic_id = 99 WHERE id IN (7, 8)")

@@ -4,6 +4,7 @@ import sqlite3
 import struct
 import time
 import tracemalloc
+from contextlib import closing
 
 import lz4.frame
 import pytest
@@ -142,7 +143,7 @@ def test_bombs_of_messages_and_of_files(tmp_path, bounded):
     database = next(bag.glob("*.db3"))
     compressor = zstandard.ZstdCompressor().compressobj()
     bomb = b"".join([*(compressor.compress(bytes(1 << 20)) for _ in range(BOMB_BYTES >> 20)), compressor.flush()])
-    with sqlite3.connect(database) as connection:
+    with closing(sqlite3.connect(database)) as connection, connection:
         connection.execute("UPDATE messages SET data = ? WHERE id = 7", (bomb,))
     connection.close()
     tables, damage = read(bag)
@@ -165,7 +166,7 @@ def test_metadata_that_unfolds_without_bound(tmp_path, bounded):
 
 def test_a_view_in_place_of_a_table_is_refused(tmp_path, bounded):
     path = tmp_path / "a.db3"
-    with sqlite3.connect(path) as connection:
+    with closing(sqlite3.connect(path)) as connection, connection:
         connection.execute(
             "CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT)"
         )
