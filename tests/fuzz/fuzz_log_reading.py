@@ -111,13 +111,9 @@ def containers(directory: Path) -> Iterator[bytes]:
         yield write_bag(directory / f"{number}.bag", ros1, compression).read_bytes()
     path = next(write_rosbag2(directory / "db3", messages).glob("*.db3"))
     yield path.read_bytes()
-    with (
-        closing(sqlite3.connect(path)) as database,
-        database,
-    ):  # small pages: several to a table, and messages that overflow one
+    with closing(sqlite3.connect(path)) as database:  # small pages: several to a table, and messages that overflow one
         database.execute("PRAGMA page_size = 512")
         database.execute("VACUUM")
-    database.close()
     yield path.read_bytes()
 
 
