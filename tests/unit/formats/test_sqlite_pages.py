@@ -1,6 +1,7 @@
 """Pages read without SQLite, against SQLite: every page size, rows of every size, deletions, and what is left to SQLite."""
 
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -62,7 +63,7 @@ def rows_by_sqlite(connection):
 @pytest.mark.parametrize("threads", [1, 3])
 def test_every_row_of_every_size_is_what_sqlite_reads(tmp_path, page_bytes, threads):
     path = tmp_path / "a.db3"
-    with database(path, page_bytes=page_bytes) as connection:
+    with closing(database(path, page_bytes=page_bytes)) as connection, connection:
         expected = rows_by_sqlite(connection)
     found, channels, used = rows_by_part(path, threads=threads)
     assert used
@@ -74,7 +75,7 @@ def test_every_row_of_every_size_is_what_sqlite_reads(tmp_path, page_bytes, thre
 
 def test_rows_that_were_deleted_are_gone(tmp_path):
     path = tmp_path / "a.db3"
-    with database(path, count=600) as connection:
+    with closing(database(path, count=600)) as connection, connection:
         connection.execute("DELETE FROM messages WHERE id % 3 = 0")
         connection.execute("INSERT INTO messages VALUES (1000000000000, 1, 5, x'00')")
         connection.commit()
@@ -121,7 +122,7 @@ def test_what_is_not_as_ros_2_makes_it_is_left_to_sqlite(tmp_path, table):
 
 def test_rows_of_unusual_types_are_left_to_sqlite_from_there_on(tmp_path):
     path = tmp_path / "a.db3"
-    with database(path, count=50) as connection:
+    with closing(database(path, count=50)) as connection, connection:
         last = connection.execute("SELECT MAX(id) FROM messages").fetchone()[0]
         connection.execute("INSERT INTO messages VALUES (?, 1, 2.5, x'0102')", (last + 1,))
         connection.execute("INSERT INTO messages VALUES (?, 1, 7, x'0102')", (last + 2,))
