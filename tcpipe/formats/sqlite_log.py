@@ -58,6 +58,9 @@ class SqlitePart:
             self._refuse_views(path)
             self._table = None if self._scratch else _message_table(path, self._database)
             self.channels = self._channels()
+        except LogError:
+            self.close()
+            raise
         except _BROKEN as error:
             self.close()
             raise LogError(
