@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option, store_option
+from tcpipe.cli.options import json_option, map_option, quiet_option, store_option
 
 
 @click.command("cost-map", short_help="Directional cost maps of a whole map")
 @click.argument("model", metavar="MODEL")
 @click.argument("out", default="cost-map", metavar="[OUT]")
-@click.option("--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store).")
+@map_option
 @click.option(
     "--step",
     "step_m",
@@ -35,7 +35,7 @@ def cost_map(
     """
     from dataclasses import asdict
 
-    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.models import load_model
     from tcpipe.planning.cost_map import make_cost_map
     from tcpipe.planning.inputs import chosen_map
@@ -46,5 +46,4 @@ def cost_map(
     if as_json:
         print_json(asdict(result))
     else:
-        for line in str(result).splitlines():
-            say(line)
+        say_lines(result)

@@ -52,6 +52,13 @@ def quiet_option(function: Command) -> Command:
     return click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")(function)
 
 
+def map_option(function: Command) -> Command:
+    """``--map``: the map to look at."""
+    return click.option(
+        "--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store)."
+    )(function)
+
+
 def tag_values(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:
     """Turn ``K=V`` pairs into a dict; a pair without key or '=' is a usage error."""
     for value in values:

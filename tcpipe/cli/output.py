@@ -116,6 +116,12 @@ def say(text: str) -> None:
     click.echo(plain_line(text))
 
 
+def say_lines(result: object) -> None:
+    """Print a result that tells itself in lines of text on stdout."""
+    for line in str(result).splitlines():
+        say(line)
+
+
 def print_json(value: Any) -> None:
     """Print one JSON object on stdout."""
     from tcpipe.formats.json_files import to_json

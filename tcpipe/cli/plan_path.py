@@ -72,7 +72,7 @@ def plan_path(
     """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel."""
     from dataclasses import asdict
 
-    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.models import load_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.plan_files import PlanRequest, plan
@@ -85,5 +85,4 @@ def plan_path(
     if as_json:
         print_json(asdict(result))
     else:
-        for line in str(result).splitlines():
-            say(line)
+        say_lines(result)

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option, store_option
+from tcpipe.cli.options import json_option, map_option, quiet_option, store_option
 
 
 @click.command("predict-path", short_help="Time and energy of a path")
 @click.argument("model", metavar="MODEL")
 @click.option("--path", "path_file", required=True, metavar="FILE", help="GeoJSON LineString (WGS84, lon before lat).")
-@click.option("--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store).")
+@map_option
 @click.option("--out", metavar="FILE", help="Write the table of pieces: .csv, .parquet or .json.")
 @store_option
 @json_option
@@ -25,7 +25,7 @@ def predict_path(
     Pieces on ground where MODEL has no business (a class, slope or relief not seen in training, off the map, no data, not
     traversable) are marked and counted. Exit code 3: some pieces have no cost.
     """
-    from tcpipe.cli.output import print_json, progress, say
+    from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.models import load_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.path_files import predict_path as run
@@ -36,6 +36,5 @@ def predict_path(
     if as_json:
         print_json({**result.summary, "path": path_file, "out": out, "status": result.status})
     else:
-        for line in str(result).splitlines():
-            say(line)
+        say_lines(result)
     return result.exit_code

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import kernel
+from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA
 
 
 @kernel
@@ -15,7 +16,7 @@ def relief_steps(height: NDArray[np.uint16], out: NDArray[np.uint16]) -> None:
     for n in range(flat.shape[0]):
         most = np.uint16(0)
         for k in range(flat.shape[1]):
-            value = flat[n, k] if flat[n, k] != 65535 else np.uint16(0)
+            value = flat[n, k] if flat[n, k] != HEIGHT_NODATA else np.uint16(0)
             most = max(most, value)
         out[n] = most
 
