@@ -16,7 +16,7 @@ from tcpipe.dataset.pixels import StoredPixels
 from tcpipe.dataset.tensor import TensorForm, tensor_form
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_files import read_samples, sample_columns
-from tcpipe.tables.bits import Quality
+from tcpipe.tables.bits import Quality, name_of
 
 if TYPE_CHECKING:
     from tcpipe.dataset.torch_data import TorchBatches
@@ -186,7 +186,7 @@ class Split:
             Samples with a larger standard deviation are left out [W], [m/s].
 
         """
-        named = {str(bit.name).lower(): int(bit) for bit in Quality}
+        named = {name_of(bit): int(bit) for bit in Quality}
         unknown = [name for name in without if name not in named]
         if unknown:
             raise DatasetError(f"quality {', '.join(unknown)}: wanted some of {', '.join(named)}")

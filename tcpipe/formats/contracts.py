@@ -8,6 +8,7 @@ import pyarrow as pa
 
 from tcpipe.formats.json_files import to_json
 from tcpipe.formats.recipe_toml import recipe_schema
+from tcpipe.tables.bits import name_of
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
 
@@ -49,5 +50,5 @@ def _column_schema(column: Column) -> dict[str, Any]:
     if column.frame:
         schema["x-frame"] = column.frame
     if column.flags is not None:
-        schema["x-flags"] = {str(int(bit)): str(bit.name).lower() for bit in column.flags}
+        schema["x-flags"] = {str(int(bit)): name_of(bit) for bit in column.flags}
     return schema

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tcpipe.geometry.polyline import polyline
 from tcpipe.motion.pieces import piece_spans, runs
-from tcpipe.tables.bits import DropReason
+from tcpipe.tables.bits import DropReason, name_of
 
 
 def stretches(dropped_by: NDArray[np.uint32], piece: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -84,4 +84,4 @@ def interval_duration_s(stamp_ns: NDArray[np.int64], epoch: NDArray[np.integer[A
 
 def by_reason(reason: NDArray[np.uint32], amount: NDArray[np.float64]) -> dict[str, float]:
     """Return the sum of an amount an interval (metres, seconds, joules) by reason's name, every `DropReason` present."""
-    return {str(bit.name).lower(): float(amount[reason == int(bit)].sum()) for bit in DropReason}
+    return {name_of(bit): float(amount[reason == int(bit)].sum()) for bit in DropReason}

@@ -25,7 +25,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment
 from tcpipe.splits.ranking import order_ranks
 from tcpipe.splits.regions import Regions
-from tcpipe.tables.bits import Loss
+from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.projection import area_of, parse_crs
@@ -182,9 +182,7 @@ def _ranks(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
 
 def _nothing_sampled(segments: pa.Table, patches: PatchTable, sources: Sequence[MapFile]) -> str:
     """Say where the segments went instead, and where maps and runs lie."""
-    lost = sorted(
-        ((metres, str(loss.name).lower()) for loss, metres in patches.lost_m.items() if metres > 0.0), reverse=True
-    )
+    lost = sorted(((metres, name_of(loss)) for loss, metres in patches.lost_m.items() if metres > 0.0), reverse=True)
     where = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for metres, name in lost)
     lon, lat = (float(np.mean(floats(segments, f"start_{axis}_deg"))) for axis in ("lon", "lat"))
     names = f"map{'s' if len(sources) > 1 else ''} {', '.join(source.name for source in sources)}"

@@ -17,7 +17,7 @@ from tcpipe.motion.pieces import piece_of_rows
 from tcpipe.motion.removal import Group, main_reason, named_groups, tally_m, uneven
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory
-from tcpipe.tables.bits import DropReason
+from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
 from tcpipe.terrain.point_classes import OFF_THE_MAP, classes_at
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
@@ -30,7 +30,7 @@ _SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
 _SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
 _REASONS = (
     "in_samples",
-    *(str(bit.name).lower() for bit in DropReason),
+    *(name_of(bit) for bit in DropReason),
     "curved_or_leftover",
     "not_sampled",
 )

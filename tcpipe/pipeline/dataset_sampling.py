@@ -21,7 +21,7 @@ from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled
 from tcpipe.stages.sample_maps import check_alike, sample_on_maps
-from tcpipe.tables.bits import Loss
+from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.layers import LAYERS
@@ -236,7 +236,7 @@ def sample_all_segments(
         footprint_lonlat_deg=columns.pop(_LONLAT, np.empty((0, 4, 2))),
         columns=columns,
         spool=spool,
-        lost_m={loss: math.fsum(part.ledger_m.get(str(loss.name).lower(), 0.0) for part in ended) for loss in _LOSSES},
+        lost_m={loss: math.fsum(part.ledger_m.get(name_of(loss), 0.0) for part in ended) for loss in _LOSSES},
         warnings=tuple(dict.fromkeys(warning for part in ended for warning in part.warnings)),
     )
 

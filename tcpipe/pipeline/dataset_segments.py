@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError
 from tcpipe.formats.arrow_file import map_table, write_pieces
 from tcpipe.store import RunDirectory
-from tcpipe.tables.bits import Loss
+from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 
@@ -113,7 +113,7 @@ def move_out(ledger_m: Mapping[str, float], lost_m: Mapping[Loss, float]) -> dic
     """Return the ledger with metres moved from what is kept to losses [m]; its sum stays the odometer."""
     moved = dict(ledger_m)
     for loss, metres in lost_m.items():
-        name = str(loss.name).lower()
+        name = name_of(loss)
         moved[name] = moved.get(name, 0.0) + float(metres)
     total = math.fsum(float(metres) for metres in lost_m.values())
     left = moved.get(KEPT, 0.0) - total

@@ -32,7 +32,7 @@ from tcpipe.pipeline.ingest import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import sample_segments
 from tcpipe.store import RunDirectory, Store, open_store
-from tcpipe.tables.bits import DropReason, Quality
+from tcpipe.tables.bits import DropReason, Quality, name_of
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import LABELLED_SEGMENTS, Streams
 
@@ -101,7 +101,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     facts = {
         "sample": sample,
         "labels": {name: sample[name] for name in _LABELS},
-        "quality": [str(bit.name).lower() for bit in Quality if sample["quality"] & bit],
+        "quality": [name_of(bit) for bit in Quality if sample["quality"] & bit],
         "log": _log(house, run),
         "messages": {} if streams is None else dict(_messages(streams, *window)),
         "gates": list(_gates(run, *window)),
@@ -203,7 +203,7 @@ def _gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[dict[str, 
     stamps, bits = stamps[near], bits[near]
     for part in np.split(np.arange(len(bits)), np.flatnonzero(np.diff(bits)) + 1):
         if len(part) and bits[part[0]]:
-            names = [str(reason.name).lower() for reason in DropReason if int(bits[part[0]]) & reason]
+            names = [name_of(reason) for reason in DropReason if int(bits[part[0]]) & reason]
             before = stamps[part[0]] < start_ns
             offset_ns = start_ns - stamps[part[-1]] if before else stamps[part[0]] - end_ns
             yield {

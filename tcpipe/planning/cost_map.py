@@ -37,6 +37,7 @@ from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
 from tcpipe.planning.reasons import Reason
 from tcpipe.planning.verdicts import verdicts_of
+from tcpipe.tables.bits import name_of
 from tcpipe.terrain.grid import MapGrid
 
 logger = logging.getLogger("tcpipe")
@@ -266,7 +267,7 @@ def _write(directory: Path, costs: CostGrid) -> dict[str, Any]:
         "courses_deg": ANGLES_DEG,
         "bands": {name: [*_BAND_NAMES, "min", "mean", "best course"] for name in _QUANTITIES},
         "units": _QUANTITIES,
-        "reasons": {str(int(reason)): str(reason.name).lower() for reason in Reason},
+        "reasons": {str(int(reason)): name_of(reason) for reason in Reason},
         "nav2_scale": scales,
         **_shares(costs),
     }
@@ -345,6 +346,6 @@ def _shares(costs: CostGrid) -> dict[str, Any]:
         trusted += int(np.count_nonzero((bits == 0).any(axis=0)))
         for reason in counts:
             counts[reason] += int(np.count_nonzero(bits & reason))
-    shares = {str(reason.name).lower(): count / costs.reasons.size for reason, count in counts.items() if count}
+    shares = {name_of(reason): count / costs.reasons.size for reason, count in counts.items() if count}
     cells = {"all": costs.grid.rows * costs.grid.cols, "with_cost": with_cost, "trusted": trusted}
-    return {"cells": cells, "reason_share": shares, "barred_by": [str(r.name).lower() for r in Reason if r & BARRED]}
+    return {"cells": cells, "reason_share": shares, "barred_by": [name_of(r) for r in Reason if r & BARRED]}

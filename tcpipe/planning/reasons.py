@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.ground_kernel import class_facts, relief_steps
+from tcpipe.tables.bits import name_of
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_STEP_M
 from tcpipe.terrain.sampling import Patches
@@ -58,12 +59,12 @@ Bits = NDArray[np.uint16]
 
 def names_of(bits: int) -> tuple[str, ...]:
     """Return the names of the reasons in a number, lower case."""
-    return tuple(str(reason.name).lower() for reason in Reason if bits & reason)
+    return tuple(name_of(reason) for reason in Reason if bits & reason)
 
 
 def counts_of(bits: Bits) -> dict[str, int]:
     """Return how often each reason occurs; those that never do are left out."""
-    counts = {str(reason.name).lower(): int(np.count_nonzero(bits & reason)) for reason in Reason}
+    counts = {name_of(reason): int(np.count_nonzero(bits & reason)) for reason in Reason}
     return {name: count for name, count in counts.items() if count}
 
 

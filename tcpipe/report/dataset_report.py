@@ -25,7 +25,7 @@ from tcpipe.report.figures import (
 from tcpipe.report.overview import Bounds, joint_bounds_m, read_overview
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.quality import quality_sections
-from tcpipe.tables.bits import Quality
+from tcpipe.tables.bits import Quality, name_of
 
 _GALLERY = 10
 
@@ -179,7 +179,7 @@ def _label_sections(card: Mapping[str, Any], samples: pa.Table) -> list[Section]
 
 def _quality_counts(samples: pa.Table) -> dict[str, int]:
     quality = samples.column("quality").to_numpy()
-    return {str(bit.name).lower(): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
+    return {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
 
 
 def _audit_section(card: Mapping[str, Any]) -> Section:

@@ -5,16 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from tcpipe.report.page import Section
-from tcpipe.tables.bits import Quality
+from tcpipe.tables.bits import Quality, name_of
 
 
 def quality_sections(counts: Mapping[str, int], of_what: str) -> list[Section]:
     """Return the table of the bits that any label carries; ``counts`` are by the bit's name."""
-    rows = [
-        (str(bit.name).lower().replace("_", " "), count)
-        for bit in Quality
-        if (count := counts.get(str(bit.name).lower(), 0))
-    ]
+    rows = [(name_of(bit).replace("_", " "), count) for bit in Quality if (count := counts.get(name_of(bit), 0))]
     if not rows:
         return [Section("Quality flags", f"None: all {of_what} are clean.")] if counts else []
     return [

@@ -19,7 +19,7 @@ from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.quality import quality_sections
 from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.store import RunDirectory, Store
-from tcpipe.tables.bits import DropReason, Quality
+from tcpipe.tables.bits import DropReason, Quality, name_of
 
 _MOSTLY = 0.5
 
@@ -84,7 +84,7 @@ def _first_reason(dropped_by: NDArray[Any]) -> NDArray[Any]:
     """Return each row's reason by precedence, ``kept`` where there is none."""
     reasons = np.full(len(dropped_by), "kept", dtype=object)
     for bit in reversed(list(DropReason)):
-        reasons[(dropped_by & int(bit)) != 0] = str(bit.name).lower().replace("_", " ")
+        reasons[(dropped_by & int(bit)) != 0] = name_of(bit).replace("_", " ")
     return reasons
 
 
@@ -171,6 +171,6 @@ def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: 
         sections += _physics_sections(segments, physics)
         quality = _column(segments, "quality")
         sections += quality_sections(
-            {str(bit.name).lower(): int(((quality & int(bit)) != 0).sum()) for bit in Quality}, "segments"
+            {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}, "segments"
         )
     return sections

@@ -8,7 +8,7 @@ from tcpipe.motion import masks
 from tcpipe.motion.pieces import Mask, MotionRows, piece_of_rows
 from tcpipe.recipe import GateConfig
 from tcpipe.stages.gate_gaps import find_gaps
-from tcpipe.tables.bits import DropReason
+from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, with_findings
 
@@ -41,7 +41,7 @@ def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | No
         "rows": table.num_rows,
         "rows_kept": int((dropped_by == 0).sum()),
         "gap_rows": gaps.counts(),
-        "rows_dropped": {str(reason.name).lower(): int((dropped_by & reason != 0).sum()) for reason in DropReason},
+        "rows_dropped": {name_of(reason): int((dropped_by & reason != 0).sum()) for reason in DropReason},
         "max_velocity_mps": limit_mps,
         "full_speed_mps": slowest,
     }

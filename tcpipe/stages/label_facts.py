@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tcpipe.cost.budget import energy_budget
 from tcpipe.cost.power import Rail, Rule
 from tcpipe.stages.label_power import rail_facts
-from tcpipe.tables.bits import Quality
+from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats
 
 _MUCH_STANDING = 0.5
@@ -57,7 +57,7 @@ def label_facts(
             for name, unit in (("duration", "s"), ("velocity", "mps"), ("power", "watt"), ("energy", "joule"))
         },
         "energy_budget": _budget(energy, energy_variance_j2),
-        "quality": {str(bit.name).lower(): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
+        "quality": {name_of(bit): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
     }
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.recipe import SampleConfig
-from tcpipe.tables.bits import Loss
+from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import PLACED_SEGMENTS, Findings
 from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
@@ -104,12 +104,12 @@ def _lost(
 
 def ledger_by_loss(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -> dict[str, float]:
     """Return metres driven, kept and by loss."""
-    named = {"kept": 0} | {str(loss.name).lower(): loss for loss in _LOSSES}
+    named = {"kept": 0} | {name_of(loss): loss for loss in _LOSSES}
     return {name: float(arc_length_m[lost_by == loss].sum()) for name, loss in named.items()}
 
 
 def _facts(lost_by: NDArray[np.uint32]) -> dict[str, object]:
-    counts = {str(loss.name).lower(): int((lost_by == loss).sum()) for loss in _LOSSES}
+    counts = {name_of(loss): int((lost_by == loss).sum()) for loss in _LOSSES}
     return {"segments": lost_by.size, "samples": int((lost_by == 0).sum()), "lost": counts}
 
 

@@ -15,11 +15,11 @@ from tcpipe.motion.ledger import by_reason, interval_duration_s, interval_length
 from tcpipe.motion.pieces import piece_of_rows
 from tcpipe.path.cutting import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
-from tcpipe.tables.bits import DropReason, Loss
+from tcpipe.tables.bits import DropReason, Loss, name_of
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, with_findings
 
-ENTRIES = ("kept", *(str(bit.name).lower() for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
+ENTRIES = ("kept", *(name_of(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
 """Names of the ledger's entries, in order."""
 
 

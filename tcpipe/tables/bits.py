@@ -8,6 +8,11 @@ from __future__ import annotations
 from enum import IntFlag
 
 
+def name_of(bit: IntFlag) -> str:
+    """Return a flag's name as files and pages have it."""
+    return str(bit.name).lower()
+
+
 class DropReason(IntFlag):
     """Why a row of the track is not used; 0 means kept. Order is precedence in the loss ledger."""
 

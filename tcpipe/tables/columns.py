@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
+from tcpipe.tables.bits import name_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,7 +37,7 @@ class Column:
         if self.frame:
             metadata["frame"] = self.frame
         if self.flags is not None:
-            metadata["flags"] = json.dumps({str(int(bit)): str(bit.name).lower() for bit in self.flags})
+            metadata["flags"] = json.dumps({str(int(bit)): name_of(bit) for bit in self.flags})
         return pa.field(self.name, self.dtype, nullable=self.nullable, metadata=metadata)
 
 
