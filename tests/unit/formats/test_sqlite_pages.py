@@ -128,8 +128,8 @@ def test_rows_of_unusual_types_are_left_to_sqlite_from_there_on(tmp_path):
         connection.execute("INSERT INTO messages VALUES (?, 1, 7, x'0102')", (last + 2,))
         connection.commit()
         expected = [row for row in rows_by_sqlite(connection) if isinstance(row[2], int)]
-    part = SqlitePart(path, path.name)
-    found = sorted(number for block in part.blocks(frozenset({1, 300})) for number in block.ordinal.tolist())
+    with closing(SqlitePart(path, path.name)) as part:
+        found = sorted(number for block in part.blocks(frozenset({1, 300})) for number in block.ordinal.tolist())
     assert found == [row[0] for row in expected]
     assert [damage.messages_lost for damage in part.damage] == [1]
 
