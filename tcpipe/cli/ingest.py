@@ -80,9 +80,8 @@ def ingest(
             on_result=on_result,
         )
     if as_json:
-        print_json(
-            {"recipe": source, "store": str(summary.store), "exit_code": summary.exit_code, "results": summary.results}
-        )
+        made = str(summary.store) if summary.store.is_dir() else None
+        print_json({"recipe": source, "store": made, "exit_code": summary.exit_code, "results": summary.results})
     else:
         _print(summary)
     return summary.exit_code
@@ -112,10 +111,12 @@ def _print(summary: IngestSummary) -> None:
         status: sum(r.status == status for r in summary.results)
         for status in ("done", "unchanged", "damaged", "failed")
     }
-    if count["unchanged"] == len(summary.results):
-        click.echo(
-            f"nothing to do: {len(summary.results)} of {len(summary.results)} logs are in {summary.store} already"
-        )
+    number = len(summary.results)
+    if count["unchanged"] == number:
+        click.echo(f"nothing to do: {number} of {number} logs are in {summary.store} already")
         return
-    said = ", ".join(f"{number} {status}" for status, number in count.items() if number)
+    if count["failed"] == number:
+        click.echo(f"no run came into {summary.store}: {number} of {number} logs failed")
+        return
+    said = ", ".join(f"{of} {status}" for status, of in count.items() if of)
     click.echo(f"{summary.store}: {said}")

@@ -39,8 +39,12 @@ def run_json(store: Path) -> dict:
 @pytest.mark.parametrize(("content", "store"), [(b"nonsense", "tcpipe-store"), (b"#ROSBAG V2.0\n", "deep/down/store")])
 def test_what_cannot_be_ingested_leaves_no_store(tmp_path, content, store):
     (tmp_path / "a.bag").write_bytes(content)
-    plain_lines(tcpipe("ingest", "a.bag", "--store", store, cwd=tmp_path), 1)
+    done = tcpipe("ingest", "a.bag", "--store", store, cwd=tmp_path)
+    plain_lines(done, 1)
+    assert done.stdout.splitlines()[-1] == f"no run came into {store}: 1 of 1 logs failed"
     assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
+    told = json.loads(tcpipe("ingest", "a.bag", "--store", store, "--json", cwd=tmp_path).stdout)
+    assert (told["store"], told["exit_code"], told["results"][0]["status"]) == (None, 1, "failed")
     (tmp_path / store).mkdir(parents=True)
     plain_lines(tcpipe("ingest", "a.bag", "--store", store, cwd=tmp_path), 1)
     assert (tmp_path / store).is_dir()
