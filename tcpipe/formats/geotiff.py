@@ -309,11 +309,11 @@ def write_geotiff(
     if bands == 4:
         profile |= {"photometric": "RGB", "alpha": "YES"}
     with atomic_file(path) as temporary, rasterio.open(temporary, "w", **profile) as dataset:
+        if palette is not None:  # before the first pixel: GDAL cannot change what is on disk already
+            dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
         for first in range(0, rows, _STRIP_ROWS):
             last = min(first + _STRIP_ROWS, rows)
             dataset.write(strip(first, last), window=Window(0, first, cols, last - first))
-        if palette is not None:
-            dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
 
 
 def write_cog(
