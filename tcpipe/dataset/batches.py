@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from tcpipe.dataset.split import Split
+from tcpipe.dataset.pixels import View
 
+Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Batch = tuple[Any, ...]
 
@@ -24,6 +24,16 @@ _POOL_PIECES = 16
 
 
 @dataclass(frozen=True, slots=True)
+class BatchContent:
+    """What batches are made of, sample by sample: pixels, labels, shape (N, 2), weights (N, 2) and named columns (N,) if wanted."""
+
+    view: View
+    labels: Floats
+    weights: Floats | None
+    features: tuple[tuple[str, NDArray[Any]], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class BatchRules:
     """How batches are made: what `Split.batches` was given."""
 
@@ -31,8 +41,6 @@ class BatchRules:
     shuffle: bool
     seed: int
     mirror: bool
-    weights: bool
-    features: tuple[str, ...]
     drop_last: bool
     from_disk: bool
     shard: tuple[int, int] = (0, 1)
@@ -46,14 +54,14 @@ class Batches:
     patches are replaced by ``(patches, features)``.
     """
 
-    def __init__(self, split: Split, rules: BatchRules) -> None:
-        self._split = split
+    def __init__(self, content: BatchContent, rules: BatchRules) -> None:
+        self._content = content
         self._rules = rules
         self._next = 0
         number, count = rules.shard
-        self._samples: Ints = np.arange(len(split))
+        self._samples: Ints = np.arange(len(content.view.at))
         if count > 1 and rules.from_disk:
-            piece_of = split.view.stored.pieces_of(split.view.at)
+            piece_of = content.view.stored.pieces_of(content.view.at)
             self._samples = np.flatnonzero(np.isin(piece_of, np.unique(piece_of)[number::count]))
         elif count > 1:
             self._samples = self._samples[number::count]
@@ -70,7 +78,7 @@ class Batches:
 
     def part(self, number: int, count: int) -> Batches:
         """Return the batches of one of ``count`` parts of the split, for processes that divide it among them."""
-        return Batches(self._split, replace(self._rules, shard=(number, count)))
+        return Batches(self._content, replace(self._rules, shard=(number, count)))
 
     def forever(self) -> Iterator[Batch]:
         """Iterate over epoch after epoch without an end; Keras wants ``steps_per_epoch=len(batches)`` with it."""
@@ -88,18 +96,18 @@ class Batches:
 
     def _full(self, rng: np.random.Generator) -> Iterator[tuple[dict[str, NDArray[Any]], Ints, Ints]]:
         """Yield pixels, rows in them and the samples that these are: whole batches, but for the last ones of the epoch."""
-        rules, split, mine = self._rules, self._split, self._samples
-        layers = split.view.form.layers
+        rules, view, mine = self._rules, self._content.view, self._samples
+        layers = view.form.layers
         if not rules.from_disk:
             order = mine[rng.permutation(len(mine))] if rules.shuffle else mine
             samples = order[: len(self) * rules.size]
-            yield split.view.stored.in_memory(layers), split.view.at[samples], samples
+            yield view.stored.in_memory(layers), view.at[samples], samples
             return
         pool: dict[str, NDArray[Any]] = {}
         left = np.empty(0, np.int64)  # samples that wait at the head of the pool for their batch to fill
         shuffler = rng if rules.shuffle else None
-        for pool, found, which in split.view.stored.pools(
-            split.view.at[mine], layers, pieces=_POOL_PIECES, spare=rules.size, rng=shuffler
+        for pool, found, which in view.stored.pools(
+            view.at[mine], layers, pieces=_POOL_PIECES, spare=rules.size, rng=shuffler
         ):
             rows, samples = np.append(np.arange(len(left)), found), np.append(left, mine[which])
             full = len(rows) // rules.size * rules.size
@@ -111,15 +119,17 @@ class Batches:
             yield pool, np.arange(len(left)), left
 
     def _batch(self, pixels: dict[str, NDArray[Any]], rows: Ints, samples: Ints, mirrors: np.random.Generator) -> Batch:
-        split, rules = self._split, self._rules
-        mirrored = mirrors.random(len(rows)) < 0.5 if rules.mirror else np.zeros(len(rows), np.bool_)
-        patches: Any = split.view.form.form(pixels, rows, mirrored)
-        if rules.features:
-            patches = (patches, _features(split, rules.features, samples, mirrored))
-        batch = (patches, split.labels[samples])
-        return (*batch, split.weights[samples]) if rules.weights else batch
+        content = self._content
+        mirrored = mirrors.random(len(rows)) < 0.5 if self._rules.mirror else np.zeros(len(rows), np.bool_)
+        patches: Any = content.view.form.form(pixels, rows, mirrored)
+        if content.features:
+            patches = (patches, _features(content.features, samples, mirrored))
+        batch = (patches, content.labels[samples])
+        return batch if content.weights is None else (*batch, content.weights[samples])
 
 
-def _features(split: Split, names: tuple[str, ...], samples: Ints, mirrored: NDArray[np.bool_]) -> NDArray[np.float32]:
-    columns = [np.where(mirrored & (name in _FLIPPED), -1.0, 1.0) * split.column(name)[samples] for name in names]
+def _features(
+    named: Sequence[tuple[str, NDArray[Any]]], samples: Ints, mirrored: NDArray[np.bool_]
+) -> NDArray[np.float32]:
+    columns = [np.where(mirrored & (name in _FLIPPED), -1.0, 1.0) * column[samples] for name, column in named]
     return np.column_stack(columns).astype(np.float32)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.dataset.pixels import StoredPixels
-from tcpipe.dataset.split import SampleColumns, Split, View
+from tcpipe.dataset.pixels import StoredPixels, View
+from tcpipe.dataset.split import SampleColumns, Split
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.dataset.tensor import TensorForm
 from tcpipe.formats.dataset_files import PatchFiles, layer_dtype
 
 Ints = NDArray[np.int64]
@@ -126,3 +128,12 @@ class StoredPixels:
             if len(self._pieces) > CACHED_PIECES:
                 self._pieces.popitem(last=False)
         return pixels
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Which of the stored samples a split has, ``at``, (N,), and how their tensors are formed."""
+
+    stored: StoredPixels
+    at: Ints
+    form: TensorForm

@@ -11,9 +11,9 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
-from tcpipe.dataset.batches import Batches, BatchRules
-from tcpipe.dataset.pixels import StoredPixels
-from tcpipe.dataset.tensor import TensorForm, tensor_form
+from tcpipe.dataset.batches import BatchContent, Batches, BatchRules
+from tcpipe.dataset.pixels import View
+from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_files import read_samples, sample_columns
 from tcpipe.tables.bits import Quality, name_of
@@ -50,15 +50,6 @@ class SampleColumns:
     def table(self) -> pa.Table:
         """Return all columns."""
         return read_samples(self.directory).take(pa.array(self.rows))
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """Which of the stored samples a split has, ``at``, (N,), and how their tensors are formed."""
-
-    stored: StoredPixels
-    at: Ints
-    form: TensorForm
 
 
 class Split:
@@ -236,11 +227,13 @@ class Split:
         """
         if size < 1:
             raise DatasetError(f"batches of {size} samples: wanted 1 or more")
-        textual = [name for name in features if self.column(name).dtype.kind not in "biuf"]
+        columns = tuple((name, self.column(name)) for name in features)
+        textual = [name for name, column in columns if column.dtype.kind not in "biuf"]
         if textual:
             raise DatasetError(f"features {', '.join(textual)}: wanted columns of numbers")
         disk = not self.view.stored.fit(self.view.form.layers) if from_disk is None else from_disk
-        return Batches(self, BatchRules(size, shuffle, seed, mirror, weights, tuple(features), drop_last, disk))
+        content = BatchContent(self.view, self.labels, self.weights if weights else None, columns)
+        return Batches(content, BatchRules(size, shuffle, seed, mirror, drop_last, disk))
 
     def torch_iterable(self, size: int, **rules: Any) -> TorchBatches:
         """Return `batches` as an iterable torch dataset, for ``DataLoader(…, batch_size=None, num_workers=n)``; imports torch."""
