@@ -6,8 +6,10 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from graphlib import TopologicalSorter
 from pathlib import Path
 
+import grimp
 import pytest
 
 from tcpipe.tables import levels
@@ -111,6 +113,12 @@ def test_imports_go_only_downward():
     linter = [sys.executable, "-c", "import importlinter.cli; importlinter.cli.lint_imports_command()", "--no-cache"]
     done = subprocess.run(linter, cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    imports = grimp.build_graph("tcpipe", cache_dir=None)
+    order = TopologicalSorter({module: imports.find_modules_directly_imported_by(module) for module in imports.modules})
+    order.prepare()  # raises CycleError, which names them; imports for type checks and inside functions count too
 
 
 def test_page_and_linter_show_the_same_floors():
