@@ -30,6 +30,7 @@ from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
 from tcpipe.logs.profiles import GENERIC, ROBOTS
+from tcpipe.terrain.classes import NODATA_ID
 
 logger = logging.getLogger("tcpipe")
 
@@ -98,6 +99,10 @@ def evaluate(
     check_fit(ours.card, data, str(model))
     names = {entry.id: entry.name for entry in ours.classes.classes}
     sets = {name: found for name in SPLITS if len((found := measured(data[name], names)).split)}
+    if not sets:
+        raise DatasetError(
+            f"{data.path}: no labelled samples in test nor unseen: nothing to evaluate on; build it with a --split"
+        )
     said = {name: predicted_costs(ours, found.split) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
@@ -110,6 +115,8 @@ def evaluate(
         train(dataset, place, config=replace(fitting, epochs=round(longer * fitting.epochs)), variant=variant)
         return load_model(place)
 
+    ablation = list(_ablation(ours, sets, config, trained))
+    energy = _energy(ours, data, sets, said, trained if config.baselines else None)
     values = {
         "kind": KIND,
         "schema_version": 1,
@@ -118,11 +125,11 @@ def evaluate(
         "dataset": {"name": data.card["name"], "sha256": dataset_checksum(data.card), "samples": data.card["splits"]},
         "config": asdict(config),
         "splits": {name: _split_values(found, said[name], plant) for name, found in sets.items()},
-        "ablation": list(_ablation(ours, sets, config, trained)),
-        "energy": _energy(ours, data, sets, said, trained if config.baselines else None),
+        "ablation": ablation,
+        "energy": energy,
         "time": _time(ours, sets, said),
         "repeatability": _repeatability(data.card),
-        "warnings": _warnings(ours, data, sets),
+        "warnings": [*_warnings(ours, data, sets), *_left_out(data, sets, energy)],
         "plots": {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
     }
     return dict(plain(values))
@@ -237,12 +244,12 @@ def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
     lines = []
     if "unseen" not in sets:
         lines.append(
-            "the dataset has no unseen samples: it was built without a --split region, or nothing lies outside it"
+            "the dataset has no unseen samples with labels: it was built without a --split region, or nothing lies outside it"
         )
     for name, found in sets.items():
         for class_id, called in found.names.items():
             count = int((found.class_ids == class_id).sum())
-            if class_id not in ours.class_counts:
+            if class_id not in {NODATA_ID, *ours.class_counts}:
                 lines.append(f"{called}: {count} samples of {name}, none in training: the model never saw this class")
     if dataset_checksum(data.card) != ours.card.dataset["sha256"]:
         lines.append(
@@ -250,6 +257,18 @@ def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
             "its test samples here may have been trained on there"
         )
     return lines
+
+
+def _left_out(data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Errors]]) -> Iterator[str]:
+    """Yield a line for samples that some figures are without."""
+    for name, found in sets.items():
+        if unlabelled := len(data[name]) - len(found.split):
+            yield f"{unlabelled} of {len(data[name])} samples of {name} have no label and are in no figure"
+        if PER_CLASS in energy and (without := len(found.split) - energy[PER_CLASS][name].count):
+            yield (
+                f"{without} of {len(found.split)} samples of {name} are of classes with too few training samples for a network of "
+                f"their own (fewer than {_FEWEST}, or none in a fold) and are not in the figures of '{PER_CLASS}'"
+            )
 
 
 def _plotted(found: Measured, said: Mapping[str, Any], count: int) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from tcpipe.learning import paper_tables as paper
 from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS, SPLITS
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
 from tcpipe.report.page import Number, Section, render_page
-from tcpipe.report.prediction_figures import predictions_by_patch
+from tcpipe.report.prediction_figures import MOST_PERCENT, predictions_by_patch
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """What an error can hardly be less than, and what the page calls it."""
@@ -104,10 +104,9 @@ def _by_class(values: Mapping[str, Any]) -> list[Section]:
                 rows.append((f"{quantity}, {called} [{_unit(measure, quantity)}]", "here", *ours))
                 told = dict(zip(paper.CLASSES, paper.BY_CLASS[name, quantity, measure], strict=True))
                 rows.append(("", "the paper", *(_paper_figure(told.get(entry)) for entry in classes)))
-                for floor, said in FLOORS.items():
-                    if floor in part:
-                        noise = [_figure(part[floor][quantity].get(entry), measure, quantity) for entry in classes]
-                        rows.append(("", said, *noise))
+                for said, floors in _floors(values, name):
+                    noise = [_figure(floors[quantity].get(entry), measure, quantity) for entry in classes]
+                    rows.append(("", said, *noise))
                 repeats = values["repeatability"][quantity]
                 if measure == "rmse" and repeats is not None:
                     blank = [""] * len(part["classes"])
@@ -143,21 +142,42 @@ def _ablation(values: Mapping[str, Any]) -> Section:
             if row["how"] == "noise" and key in paper.ABLATION:
                 told = paper.ABLATION[key][SPLITS.index(split)]
                 rows.append(("", "", "the paper", *(_paper_figure(value) for value in told)))
+    for split in splits:
+        for said, floors in _floors(values, split):
+            figures = [
+                _figure(floors[quantity][ALL], measure, quantity) for quantity, measure in paper.ABLATION_COLUMNS
+            ]
+            rows.append((said, split, "", *figures))
     header = ("layers", "", "", *(f"{q} {MEASURES[m]} [{_unit(m, q)}]" for q, m in paper.ABLATION_COLUMNS))
     draws = values["config"]["draws"]
     text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them."
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
 
 
-def _compared(title: str, text: str, found: Mapping[str, Any], told: Mapping[str, Any], quantity: str) -> Section:
+def _floors(values: Mapping[str, Any], split: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+    """Yield what errors on a split can hardly be less than: its name, and errors by quantity and class."""
+    part = values["splits"][split]
+    yield from ((said, part[floor]) for floor, said in FLOORS.items() if floor in part)
+
+
+def _compared(title: str, text: str, values: Mapping[str, Any], table: tuple[str, Mapping[str, Any], str]) -> Section:
+    """Return table IV or V: ``table`` is its key among the values, the paper's figures, its quantity."""
+    key, told, quantity = table
+    found = values[key]
     splits = [split for split in SPLITS if split in found[OURS]]
     rows = []
     for what, by_split in ((what, found[what]) for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED) if what in found):
         cells = [_figure(by_split[split], measure, quantity) for split in splits for measure in MEASURES]
         rows.append((what, "here", *cells))
         if what in told:
-            values = [value for split in splits for value in told[what][SPLITS.index(split)]]
-            rows.append(("", "the paper", *(_paper_figure(value) for value in values)))
+            figures = [value for split in splits for value in told[what][SPLITS.index(split)]]
+            rows.append(("", "the paper", *(_paper_figure(value) for value in figures)))
+    for floors in zip(*(_floors(values, split) for split in splits), strict=True):
+        cells = [_figure(floor[quantity][ALL], measure, quantity) for _, floor in floors for measure in MEASURES]
+        rows.append((floors[0][0], "", *cells))
+    repeats = values["repeatability"][quantity]
+    if repeats is not None:
+        rows.append(("repeats to, driven again", "", *([f"{repeats['std']:.{_DIGITS[quantity]}f}", ""] * len(splits))))
     header = (
         "",
         "",
@@ -168,12 +188,12 @@ def _compared(title: str, text: str, found: Mapping[str, Any], told: Mapping[str
 
 def _energy(values: Mapping[str, Any]) -> Section:
     text = "Wei and Isler predict E from heights alone: one network of grass, or one for every class."
-    return _compared("Table IV: energy against Wei and Isler", text, values["energy"], paper.ENERGY, "E")
+    return _compared("Table IV: energy against Wei and Isler", text, values, ("energy", paper.ENERGY, "E"))
 
 
 def _time(values: Mapping[str, Any]) -> Section:
     text = "The expected time is d / v at the robot's greatest speed."
-    return _compared("Table V: time against the expected time", text, values["time"], paper.TIME, "T")
+    return _compared("Table V: time against the expected time", text, values, ("time", paper.TIME, "T"))
 
 
 def _pictures(values: Mapping[str, Any]) -> list[Section]:
@@ -188,5 +208,6 @@ def _pictures(values: Mapping[str, Any]) -> list[Section]:
                 plot["class"],
                 label=label,
             )
-            sections.append(Section(f"{label}, {split}: measured and predicted", svg=svg))
+            text = f"Below: the absolute percentage error; an arrow is one of more than {MOST_PERCENT:.0f} %."
+            sections.append(Section(f"{label}, {split}: measured and predicted", text, svg=svg))
     return sections

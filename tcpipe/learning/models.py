@@ -24,8 +24,9 @@ from numpy.typing import NDArray
 from tcpipe.errors import ModelError, StoreError
 from tcpipe.formats.atomic import atomic_directory, write_text
 from tcpipe.formats.dataset_files import checksums_to_json, file_checksum
-from tcpipe.formats.json_files import digest, read_json, write_json
+from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.seals import write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.model_card import ModelCard, card_from_json, card_to_json
 from tcpipe.learning.network import named_weights, resnet18
@@ -33,7 +34,13 @@ from tcpipe.terrain.classes import ClassTable
 
 Floats = NDArray[np.float32]
 
-CARD, WEIGHTS, RESIDUALS, HISTORY, README = "model.json", "weights.npz", "residuals.parquet", "history.csv", "MODEL.md"
+FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
+    "model.json",
+    "weights.npz",
+    "residuals.parquet",
+    "history.csv",
+    "MODEL.md",
+)
 
 LEAST_VELOCITY_MPS = 0.05
 """A predicted velocity is never below it, so that T = d / v stays finite: slower is standing."""
@@ -84,6 +91,11 @@ class Model:
     def chord_m(self) -> float:
         """Length of ground that a patch's cost is of [m]."""
         return self.card.chord_m
+
+    @property
+    def label_velocity(self) -> str:
+        """``ground`` or ``fused``: which velocity it predicts."""
+        return self.card.label_velocity
 
     @property
     def robot(self) -> str:
@@ -138,7 +150,7 @@ def write_model(place: Path, *, card: ModelCard, network: Any, residuals: pa.Tab
         write_table(residuals, directory / RESIDUALS)
         write_text(directory / HISTORY, history)
         write_text(directory / README, readme)
-        write_json(directory / CARD, {**card_to_json(card), "checksums": checksums_to_json(directory)})
+        write_sealed(directory / CARD, {**card_to_json(card), "checksums": checksums_to_json(directory)})
 
 
 def load_model(path: str | Path) -> Model:

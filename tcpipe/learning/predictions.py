@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Dataset, Split
-from tcpipe.errors import DatasetError, ModelError
+from tcpipe.errors import ModelError
 from tcpipe.learning.metrics import Array, costs
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
@@ -110,11 +110,9 @@ def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
+    if len(card.outputs) != len(told["label"]["columns"]):
+        problems.append(f"it predicts {', '.join(card.outputs)} alone, wanted {' and '.join(told['label']['columns'])}")
     absent = [channel for channel in card.channels if channel not in told["layers"]]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:
         raise ModelError(*(f"{name} does not fit {data.path}: {problem}" for problem in problems))
-    if not len(data["test"]) and not len(data["unseen"]):
-        raise DatasetError(
-            f"{data.path}: no samples in split test nor unseen: nothing to evaluate on; build it with a --split"
-        )

@@ -18,12 +18,12 @@ from tcpipe.formats.json_files import digest
 from tcpipe.learning.checkpoint import Progress
 from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
 from tcpipe.learning.keras_backend import device_name
-from tcpipe.learning.model_card import ModelCard, Seen
+from tcpipe.learning.model_card import KIND, ModelCard, Seen
 from tcpipe.learning.model_readme import model_readme
-from tcpipe.learning.models import CARD, read_model_card, write_model
+from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.learning.network import Architecture
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import HEIGHT_STEP_M
+from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
+from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M
 
 logger = logging.getLogger("tcpipe")
 
@@ -84,8 +84,8 @@ def train(
     dataset
         What ``tcpipe build-dataset`` wrote.
     out
-        The folder: new, or a model, which is replaced unless it was trained on the same with the same options. While training runs
-        its state is kept beside it, in ``<out>.checkpoint``, and gone on from.
+        The folder: new, or a model and nothing else, which is replaced unless it is whole and was trained on the same with the same
+        options. While training runs its state is kept beside it, in ``<out>.checkpoint``, and gone on from.
     config
         How.
     variant
@@ -96,15 +96,18 @@ def train(
     Raises
     ------
     DatasetError, ModelError
-        The dataset has nothing to train on, ``out`` is something else, or the state is cut short or of another training.
+        The dataset has nothing to train on or to weigh by, ``out`` is something else, or the state is cut short or of another training.
 
     """
     rules, other, place, data = config or FitConfig(), variant or Variant(), Path(out), open_dataset(dataset)
     key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
-    if (known := _known(place)) is not None and known["training"].get("key") == key and not fresh:
+    if (known := _known(place)) is not None and known["training"].get("key") == key and not fresh and _is_whole(place):
         return _unchanged(place, known)
     task = training_task(data, rules.fold, other)
-    checkpoint = place.with_name(f"{place.name}.checkpoint")
+    _refuse_strangers(place)
+    if rules.weights and not other.energy_only:
+        _refuse_without_deviations(task, data)
+    checkpoint = _checkpoint_of(place)
     if fresh:
         checkpoint.unlink(missing_ok=True)
     logger.info("%s: %d samples to fit, %d to stop by, on %s", place, len(task.fit), len(task.held), device_name())
@@ -139,6 +142,8 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     """
     train, outputs = data["train"], (ENERGY,) if variant.energy_only else tuple(data.card["label"]["columns"])
     wanted = np.isfinite(train.labels).all(axis=1)
+    if unlabelled := len(train) - int(wanted.sum()):
+        logger.info("%s: %d of %d samples of train have no label and are left out", data.path, unlabelled, len(train))
     if variant.classes:
         wanted &= np.isin(train.column("terrain_class"), variant.classes)
     train = train.take(wanted)
@@ -166,10 +171,10 @@ def what_was_seen(split: Split) -> Seen:
     for first in range(0, len(split), _READ_TOGETHER):
         layers = split.layers(np.arange(first, min(first + _READ_TOGETHER, len(split))))
         if "terrain" in layers:
-            pixel_classes |= set(np.flatnonzero(np.bincount(layers["terrain"].ravel())).tolist())
-        if "height" in layers:
-            spans_m = (layers["height"].max(axis=(1, 2)) - layers["height"].min(axis=(1, 2))) * HEIGHT_STEP_M
-            reliefs_m += [float(spans_m.min()), float(spans_m.max())]
+            pixel_classes |= set(np.flatnonzero(np.bincount(layers["terrain"].ravel())).tolist()) - {NODATA_ID}
+        if "height" in layers:  # above the patch's lowest pixel
+            highest = np.where(layers["height"] == HEIGHT_NODATA, 0, layers["height"]).max(axis=(1, 2)) * HEIGHT_STEP_M
+            reliefs_m += [float(highest.min()), float(highest.max())]
     ranges = {name: _range(split.column(name)) for name in ("slope_rad", "cross_slope_rad")}
     if reliefs_m:
         ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))
@@ -190,9 +195,43 @@ def _known(place: Path) -> dict[str, Any] | None:
     """Return model.json of what is there, None if nothing is; `ModelError` if it is something else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None
-    if not place.is_dir() or not (place / CARD).is_file():
+    found = read_model_card(place) if (place / CARD).is_file() else {}
+    if found.get("kind") != KIND:
         raise ModelError(f"{place}: exists and is no model; it is left alone; give another OUT")
-    return read_model_card(place)
+    return found
+
+
+def _refuse_strangers(place: Path) -> None:
+    """Raise an error if replacing the folder would take something with it that is no part of a model."""
+    entries = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
+    strangers = sorted(name for name in entries - set(FILES) if not name.startswith("."))
+    if strangers:
+        raise ModelError(
+            f"{place}: holds {', '.join(strangers)} beside a model, and would be replaced; move that away, or give another OUT"
+        )
+
+
+def _checkpoint_of(place: Path) -> Path:
+    """Return where training keeps its state: beside the folder, also of one called ``.`` or ``..``."""
+    named = place if place.name not in {"", ".."} else place.resolve()
+    return named.with_name(f"{named.name}.checkpoint")
+
+
+def _is_whole(place: Path) -> bool:
+    try:
+        load_model(place)
+    except ModelError:
+        return False
+    return True
+
+
+def _refuse_without_deviations(task: Task, data: Dataset) -> None:
+    """Raise an error if labels are to be weighed by deviations that no sample has."""
+    none = [label for label, weights in zip(task.outputs, task.fit.weights.T, strict=True) if not weights.any()]
+    if none:
+        raise DatasetError(
+            f"{data.path}: no sample has a standard deviation of {', '.join(none)} to weigh it by; train without --weights"
+        )
 
 
 def _unchanged(place: Path, known: Mapping[str, Any]) -> TrainResult:

@@ -10,6 +10,8 @@ from tcpipe.report.figures import FAINT, INK, Array, figure_svg
 
 MEASURED = "#b3202a"
 PREDICTED = "#2a6fb0"
+MOST_PERCENT = 50.0
+"""Where the axis of errors ends, as the paper's; an arrow stands where one is larger."""
 
 
 def predictions_by_patch(measured: Array, predicted: Array, classes: Sequence[str], *, label: str) -> str:
@@ -32,9 +34,12 @@ def predictions_by_patch(measured: Array, predicted: Array, classes: Sequence[st
         values.plot(number, predicted, color=PREDICTED, lw=1.1, label="predicted")
         values.set_ylabel(label)
         values.legend(loc="lower right", bbox_to_anchor=(1.0, 1.14), ncols=2, frameon=False, borderaxespad=0.0)
-        error.plot(number, 100.0 * np.abs(predicted - measured) / np.abs(measured), color=INK, lw=1.1)
+        percent = 100.0 * np.abs(predicted - measured) / np.abs(measured)
+        error.plot(number, percent, color=INK, lw=1.1)
         error.set_ylabel("absolute error [%]")
-        error.set_ylim(0.0, 50.0)
+        error.set_ylim(0.0, MOST_PERCENT)
+        beyond = number[percent > MOST_PERCENT]
+        error.plot(beyond, np.full(len(beyond), 0.94 * MOST_PERCENT), "^", color=MEASURED, ms=4)
         error.set_xlabel("patch number")
         for shade, name in enumerate(dict.fromkeys(classes)):
             here = number[[entry == name for entry in classes]]

@@ -2,9 +2,11 @@
 
 import json
 import os
+import signal
+import subprocess
 
 import pytest
-from installed_command import plain_lines, tcpipe
+from installed_command import COMMAND, plain_lines, tcpipe
 
 pytest.importorskip("torch")
 pytest.importorskip("keras")
@@ -75,11 +77,37 @@ def test_train_and_evaluate_by_hand(reproduced):
     assert "The data are simulated" not in page  # a dataset does not say so of itself
 
 
+def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):
+    """Ctrl-C in the second epoch, then the same command again: the model is the same, byte for byte."""
+    here, _ = reproduced
+    options = ("train", here / "here" / "dataset", "--width", "4", "--epochs", "6", "--batch", "16")
+    with subprocess.Popen(
+        [COMMAND, *options, "stopped"], cwd=tmp_path, env={**os.environ, **ENV}, stderr=subprocess.PIPE, text=True
+    ) as running:
+        assert next(line for line in running.stderr if "epoch 1 of" in line)
+        running.send_signal(signal.SIGINT)
+        told = running.communicate(timeout=120)[1]
+    assert running.returncode == 130, told
+    assert "nothing is half-written" in told
+    assert [path.name for path in tmp_path.iterdir()] == ["stopped.checkpoint"]
+    resumed, whole = (tcpipe(*options, name, cwd=tmp_path, env=ENV) for name in ("stopped", "whole"))
+    assert "stopped: goes on after epoch" in resumed.stderr
+    assert whole.returncode == 0
+    assert {path.name: path.read_bytes() for path in (tmp_path / "stopped").iterdir()} == {
+        path.name: path.read_bytes() for path in (tmp_path / "whole").iterdir()
+    }
+
+
 def test_bad_input_is_one_plain_line(reproduced):
     here, _ = reproduced
     assert "there is no such directory" in plain_lines(tcpipe("train", "nowhere", cwd=here, env=ENV), 1)
     assert "run 'tcpipe train' first" in plain_lines(
         tcpipe("evaluate", "nowhere", "here/dataset", cwd=here, env=ENV), 1
+    )
+    networks = here / "here" / "seed-0" / "evaluation" / "networks"
+    baseline = next(networks.glob("wei_isler_*"))
+    assert "it predicts energy_joule alone" in plain_lines(
+        tcpipe("evaluate", baseline, "here/dataset", "of-energy", cwd=here, env=ENV), 1
     )
     (here / "mine").mkdir()
     (here / "mine" / "thesis.txt").write_text("important")

@@ -2,18 +2,22 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from made_models import CARD, made_model
+from synthetic_store import small_store
 
-from tcpipe.dataset import open_dataset
-from tcpipe.errors import ModelError, UsageError
+from tcpipe.dataset import Split, open_dataset
+from tcpipe.errors import DatasetError, ModelError, UsageError
 from tcpipe.learning.evaluation import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.models import load_model
 from tcpipe.learning.predictions import predicted_costs
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.recipe import Recipe
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
 pytest.importorskip("torch")
@@ -83,6 +87,9 @@ def test_its_files_say_the_same(evaluated):
     page = (place / "evaluation.html").read_text()
     for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "<svg"):
         assert told in page
+    tables = re.split(r"Table [IV]+:", page)[1:]
+    assert len(tables) == 5
+    assert all("label noise alone" in table for table in tables)
     assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
         "http://creativecommons.org", ""
     )
@@ -115,6 +122,44 @@ def test_a_model_that_does_not_fit_is_told_every_reason(dataset, tmp_path):
         "label.velocity is 'fused'",
     ):
         assert reason in told
+
+
+def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
+    architecture = replace(CARD.architecture, outputs=1, depth=1)
+    place = made_model(
+        tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
+    )
+    with pytest.raises(ModelError, match="it predicts energy_joule alone, wanted power_watt and velocity_mps"):
+        run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
+
+
+def test_samples_without_a_label_are_counted(model, dataset, tmp_path, monkeypatch):
+    real = Split.labels.fget
+    monkeypatch.setattr(
+        Split,
+        "labels",
+        property(
+            lambda split: np.where((split.name == "unseen") & (np.arange(len(split)) < 3)[:, None], np.nan, real(split))
+        ),
+    )
+    values = run_evaluation(model, dataset, tmp_path / "evaluation", config=CONFIG).values
+    count = len(open_dataset(dataset)["unseen"])
+    assert f"3 of {count} samples of unseen have no label and are in no figure" in values["warnings"]
+    assert values["splits"]["unseen"]["errors"]["w"]["all"]["count"] == count - 3
+
+
+def test_without_an_unseen_area_it_says_so(model, tmp_path):
+    build_dataset(tmp_path / "dataset", store=small_store(tmp_path).root, recipe=Recipe())
+    values = run_evaluation(model, tmp_path / "dataset", tmp_path / "evaluation", config=CONFIG).values
+    assert list(values["splits"]) == ["test"]
+    assert any(line.startswith("the dataset has no unseen samples") for line in values["warnings"])
+    assert "Table II:" not in (tmp_path / "evaluation" / "evaluation.html").read_text()
+
+
+def test_nothing_with_a_label_is_nothing_to_evaluate(model, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), np.nan, np.float32)))
+    with pytest.raises(DatasetError, match="no labelled samples in test nor unseen: nothing to evaluate on"):
+        run_evaluation(model, dataset, tmp_path / "evaluation", config=CONFIG)
 
 
 def test_a_folder_of_something_else_is_left_alone(model, dataset, tmp_path):

@@ -1,18 +1,21 @@
 """Training: seeded, stopped by a fold of train, gone on from a checkpoint as if nothing had happened."""
 
 import csv
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tcpipe.dataset import open_dataset
+from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError
 from tcpipe.formats.weights import read_arrays
 from tcpipe.learning import fitting
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import HISTORY, WEIGHTS, load_model
-from tcpipe.learning.training import Variant, train, training_task
+from tcpipe.learning.training import Variant, train, training_task, what_was_seen
+from tcpipe.terrain.classes import NODATA_ID
+from tcpipe.terrain.layers import HEIGHT_NODATA
 
 pytest.importorskip("torch")
 pytest.importorskip("keras")
@@ -111,8 +114,6 @@ def test_another_seed_is_another_model(trained, dataset, tmp_path):
 
 def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
     """With all deviations alike weights change nothing; with one class's a hundred times larger they do."""
-    from tcpipe.dataset.split import Split
-
     config = replace(CONFIG, epochs=1)
     train(dataset, tmp_path / "plain", config=config)
     real = Split.weights.fget
@@ -122,7 +123,9 @@ def test_weights_count_what_is_certain(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(
         Split,
         "weights",
-        property(lambda split: np.where(split.column("terrain_class")[:, None] == 4, 1.0, 0.01).astype(np.float32)),
+        property(
+            lambda split: np.where(split.column("terrain_class")[:, None] == 4, [1.0, 1.0], 0.01).astype(np.float32)
+        ),
     )
     train(dataset, tmp_path / "unlike", config=replace(config, weights=True))
     assert not _same(_weights(tmp_path / "plain"), _weights(tmp_path / "unlike"))
@@ -146,12 +149,68 @@ def test_the_fold_is_of_train_alone(dataset):
     assert not fit & held
 
 
-def test_what_cannot_be_trained_on(dataset, tmp_path):
+def test_what_cannot_be_trained_on(dataset, tmp_path, monkeypatch):
     with pytest.raises(DatasetError, match="fold 9 of train leaves"):
         train(dataset, tmp_path / "model", config=replace(CONFIG, fold=9))
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "thesis.txt").write_text("important")
-    with pytest.raises(ModelError, match="exists and is no model; it is left alone"):
-        train(dataset, tmp_path / "mine", config=CONFIG)
     with pytest.raises(DatasetError, match="no labelled samples in split train"):
         training_task(open_dataset(dataset), 0, Variant(classes=(1,)))
+    real = Split.weights.fget
+    monkeypatch.setattr(Split, "weights", property(lambda split: real(split) * np.array([1.0, 0.0])))
+    with pytest.raises(DatasetError, match="no sample has a standard deviation of velocity_mps to weigh it by"):
+        train(dataset, tmp_path / "model", config=replace(CONFIG, weights=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "text"), [("thesis.txt", "important"), ("model.json", '{"kind": "of another program"}')]
+)
+def test_a_folder_of_something_else_is_left_alone(dataset, tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ModelError, match="exists and is no model; it is left alone"):
+        train(dataset, tmp_path, config=CONFIG)
+    assert (tmp_path / name).read_text() == text
+
+
+def test_what_lies_beside_a_model_is_not_replaced_with_it(trained, dataset, tmp_path):
+    place = tmp_path / "model"
+    shutil.copytree(trained[0], place)
+    (place / "notes.txt").write_text("important")
+    assert train(dataset, place, config=CONFIG).status == "unchanged"
+    with pytest.raises(ModelError, match=r"holds notes.txt beside a model, and would be replaced"):
+        train(dataset, place, config=replace(CONFIG, seed=1))
+    assert (place / "notes.txt").exists()
+
+
+def test_a_damaged_model_is_trained_again_by_the_same_command(trained, dataset, tmp_path, monkeypatch):
+    place = tmp_path / "model"
+    shutil.copytree(trained[0], place)
+    (place / WEIGHTS).write_bytes((place / WEIGHTS).read_bytes()[:-100])
+    monkeypatch.chdir(place)
+    assert train(dataset, ".", config=CONFIG).status == "done"
+    assert _same(_weights(trained[0]), _weights(place))
+    assert not list(tmp_path.glob("*.checkpoint"))
+
+
+def test_pixels_without_data_are_not_seen(dataset, monkeypatch):
+    split = open_dataset(dataset)["train"]
+    seen, real = what_was_seen(split), Split.layers
+
+    def with_a_hole(split, indices):
+        layers = real(split, indices)
+        layers["height"][:, 0, 0], layers["terrain"][:, 0, 0] = HEIGHT_NODATA, NODATA_ID
+        return layers
+
+    monkeypatch.setattr(Split, "layers", with_a_hole)
+    holed = what_was_seen(split)
+    assert holed.pixel_classes == seen.pixel_classes
+    assert holed.ranges["relief_m"] == pytest.approx(seen.ranges["relief_m"], abs=0.05)
+
+
+def test_samples_without_a_label_are_left_out(dataset, monkeypatch):
+    real = Split.labels.fget
+    monkeypatch.setattr(
+        Split,
+        "labels",
+        property(lambda split: np.where(split.column("terrain_class")[:, None] == 4, np.nan, real(split))),
+    )
+    task = training_task(open_dataset(dataset), 1, Variant())
+    assert 4 not in {*task.fit.column("terrain_class"), *task.held.column("terrain_class")}
