@@ -16,7 +16,7 @@ from tcpipe.cli.options import json_option, quiet_option
     default="demo",
     show_default=True,
     metavar="NAME",
-    help="demo, hills12, paper, manoeuvres, tiny; see docs/reference/simulation.md.",
+    help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
 )
 @click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same bytes.")
 @json_option
