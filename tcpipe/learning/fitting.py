@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -81,10 +81,10 @@ class Fitted:
     network: Any
     scale: tuple[float, ...]
     progress: Progress
-    spent: Spent = field(default_factory=Spent)
+    spent: Spent
 
 
-def fit(task: Task, config: FitConfig, *, name: str, key: str = "", checkpoint: Path | None = None) -> Fitted:
+def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path) -> Fitted:
     """Train until the held-out fold gets no better, and return the network as it was best.
 
     Parameters
@@ -96,7 +96,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str = "", checkpoint: 
     key
         Of dataset and options, kept in the checkpoint.
     checkpoint
-        Written after every epoch, and gone on from where it is; None writes none.
+        Written after every epoch, and gone on from where it is.
 
     """
     keras = load_keras()
@@ -108,7 +108,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str = "", checkpoint: 
     network.compile(keras.optimizers.Adam(config.learning_rate), loss=keras_loss(factors))
     network.optimizer.build(network.trainable_variables)
     progress, best = Progress(key), named_weights(network)
-    if checkpoint is not None and checkpoint.exists():
+    if checkpoint.exists():
         progress, parts = read_checkpoint(checkpoint, key)
         _restore(network, parts, checkpoint)
         best = parts["best"]
@@ -121,9 +121,8 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str = "", checkpoint: 
         progress.history.append((progress.epoch, loss, held))
         if held < progress.best_loss:
             progress.best_loss, progress.best_epoch, best = held, progress.epoch, named_weights(network)
-        if checkpoint is not None:
-            parts = {"now": named_weights(network), "best": best, "optimizer": _optimizer_arrays(network)}
-            write_checkpoint(checkpoint, progress, parts)
+        parts = {"now": named_weights(network), "best": best, "optimizer": _optimizer_arrays(network)}
+        write_checkpoint(checkpoint, progress, parts)
         _say(name, progress, config, spent)
     network.set_weights(list(best.values()))
     return Fitted(network, scale, progress, spent)
