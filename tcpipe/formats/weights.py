@@ -30,6 +30,8 @@ def read_arrays(path: Path) -> dict[str, NDArray[Any]]:
         The file is cut short, damaged, or none of its kind.
 
     """
+    if path.is_file() and not zipfile.is_zipfile(path):
+        raise ModelError(f"{path}: cut short or damaged (no end of an archive in it)")
     try:
         with path.open("rb") as stream, np.load(stream, allow_pickle=False) as found:
             return {name: found[name] for name in found.files}

@@ -12,7 +12,7 @@ import numpy as np
 
 from tcpipe import __version__
 from tcpipe.dataset import Dataset, Split, open_dataset
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, ModelError
 from tcpipe.formats.json_files import plain
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import (
@@ -97,6 +97,7 @@ def evaluate(
     """
     ours, data = load_model(model), open_dataset(dataset)
     check_fit(ours.card, data, str(model))
+    fitting, fitted = _how_it_was_trained(ours)
     names = {entry.id: entry.name for entry in ours.classes.classes}
     sets = {name: found for name in SPLITS if len((found := measured(data[name], names)).split)}
     if not sets:
@@ -106,12 +107,11 @@ def evaluate(
     said = {name: predicted_costs(ours, found.split) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
-    fitting = FitConfig(**ours.card.training["config"])
 
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
         few = len(training_task(data, fitting.fold, variant).fit)
-        longer = min(_MORE_EPOCHS, ours.card.training["samples"]["fitted"] / few)
+        longer = min(_MORE_EPOCHS, fitted / few)
         train(dataset, place, config=replace(fitting, epochs=round(longer * fitting.epochs)), variant=variant)
         return load_model(place)
 
@@ -133,6 +133,14 @@ def evaluate(
         "plots": {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
     }
     return dict(plain(values))
+
+
+def _how_it_was_trained(model: Model) -> tuple[FitConfig, int]:
+    """Return options and number of fitted samples, by which networks beside the model are trained."""
+    try:
+        return FitConfig(**model.card.training["config"]), int(model.card.training["samples"]["fitted"])
+    except (KeyError, TypeError):
+        raise ModelError(f"{model.name}: its card does not say how it was trained; train the model again") from None
 
 
 def _repeatability(card: Mapping[str, Any]) -> dict[str, Any]:

@@ -189,7 +189,8 @@ def read_model_card(place: Path) -> dict[str, Any]:
     try:
         return read_json(place / CARD)
     except StoreError as error:
-        raise ModelError(*error.problems) from None
+        reason = error.problems[0].partition(";")[0]
+        raise ModelError(f"{reason}; remove the folder and train the model again") from None
 
 
 def set_weights(network: Any, arrays: Mapping[str, NDArray[Any]], where: str) -> None:

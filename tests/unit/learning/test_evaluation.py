@@ -112,7 +112,7 @@ def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch)
 def test_a_model_that_does_not_fit_is_told_every_reason(dataset, tmp_path):
     grass = replace(PAPER_CLASSES.classes[3], name="lawn")
     classes = ClassTable((*PAPER_CLASSES.classes[:3], grass, *PAPER_CLASSES.classes[4:]))
-    place = made_model(tmp_path / "other", classes=classes, chord_m=2.0, label_velocity="fused", training=CARD.training)
+    place = made_model(tmp_path / "other", classes=classes, chord_m=2.0, label_velocity="fused")
     with pytest.raises(ModelError) as told:
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
     told = "\n".join(told.value.problems)
@@ -130,6 +130,12 @@ def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
         tmp_path / "energy", architecture=architecture, channels=("height",), outputs=("energy_joule",), scale=(400.0,)
     )
     with pytest.raises(ModelError, match="it predicts energy_joule alone, wanted power_watt and velocity_mps"):
+        run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
+
+
+def test_a_card_that_does_not_say_how_it_was_trained(dataset, tmp_path):
+    place = made_model(tmp_path / "made", training={})
+    with pytest.raises(ModelError, match="made: its card does not say how it was trained; train the model again"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
 
 

@@ -1,8 +1,10 @@
 """Model folders: what is read is what was written, and anything else is one plain line."""
 
 import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from made_models import CARD, made_model
 
 from tcpipe.errors import ModelError
 from tcpipe.learning.models import WEIGHTS, load_model
+from tcpipe.pipeline.verify import verify
 
 pytest.importorskip("torch")
 pytest.importorskip("keras")
@@ -53,6 +56,9 @@ def test_patches_of_another_shape(place):
 def test_no_model_and_half_a_model(tmp_path, place):
     _refused(tmp_path / "nowhere", "there is no such model; run 'tcpipe train' first")
     _refused(tmp_path, "not a model: it has no model.json")
+    cut = made_model(tmp_path / "card")
+    (cut / "model.json").write_text((cut / "model.json").read_text()[:200])
+    _refused(cut, r"model.json: not a readable JSON file \(.*\); remove the folder and train the model again")
     cut = made_model(tmp_path / "cut")
     (cut / WEIGHTS).write_bytes((cut / WEIGHTS).read_bytes()[:-100])
     _refused(cut, "weights.npz: gone, cut short or damaged")
@@ -87,3 +93,20 @@ def test_without_keras_there_is_one_line(place, monkeypatch):
     monkeypatch.setattr("tcpipe.learning.keras_backend.find_spec", lambda _: None)
     with pytest.raises(ModelError, match=r"keras and torch not installed, .* pip install 'tcpipe\[train\]'"):
         load_model(place).predict(np.zeros((1, 40, 40, 3), np.float32))
+
+
+@pytest.mark.parametrize("name", ["model.json", "weights.npz", "residuals.parquet", "history.csv", "MODEL.md"])
+def test_a_changed_byte_is_found_and_its_file_is_named(tmp_path, place, name):
+    model = Path(shutil.copytree(place, tmp_path / "model"))
+    assert (verify(model).kind, verify(model).problems) == ("model", ())
+    data = bytearray((model / name).read_bytes())
+    data[len(data) // 2] ^= 1
+    (model / name).write_bytes(data)
+    (problem,) = verify(model).problems
+    assert str(model / name) in problem
+
+
+def test_what_does_not_belong_to_a_model_is_named(tmp_path, place):
+    model = Path(shutil.copytree(place, tmp_path / "model"))
+    (model / "mine.txt").touch()
+    assert verify(model).problems == (f"{model / 'mine.txt'}: is no file of this model",)
