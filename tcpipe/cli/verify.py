@@ -13,7 +13,10 @@ from tcpipe.cli.options import json_option
 @click.argument("path", metavar="PATH")
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
-    """Re-read the dataset, run, store or map at PATH and compare counts, checksums and contracts; exit code 1 if anything differs."""
+    """Re-read the dataset, run, store, map, model or cost map at PATH: compare counts, checksums, contracts.
+
+    Exit code 1: something is not as it was written.
+    """
     from tcpipe.cli.output import print_json, say
     from tcpipe.pipeline.verify import verify as run
 

@@ -5,15 +5,26 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats.dataset_files import CARD
+from tcpipe.formats.json_files import read_json
+from tcpipe.formats.seals import broken_checksums, broken_seal
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
 from tcpipe.store import Store, is_store
 
 Finding = tuple[str, int] | str
 """What was read and how much of it, or a problem."""
+
+_KNOWN = "dataset, run, store, map (.zarr), model or cost map"
+
+_SEALED_CARDS = {"model.json": "model", "cost-map.json": "cost map"}
+"""Documents that prove all files beside them, and what the directory is."""
+
+_BESIDE = ".aux.xml"
+"""Ending of the statistics that GDAL and QGIS put beside a raster that they look at."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,7 +33,7 @@ class Verified:
 
     path: Path
     kind: str
-    """``dataset``, ``run``, ``store`` or ``map``."""
+    """``dataset``, ``run``, ``store``, ``map``, ``model`` or ``cost map``."""
     read: Mapping[str, int]
     problems: tuple[str, ...]
 
@@ -39,7 +50,7 @@ class Verified:
 
 
 def verify(path: Path) -> Verified:
-    """Re-read a dataset, a run, a store or a map.
+    """Re-read a dataset, a run, a store, a map, a model or a cost map.
 
     Raises
     ------
@@ -48,7 +59,7 @@ def verify(path: Path) -> Verified:
 
     """
     if not path.exists():
-        raise UsageError(f"{path}: there is no such directory; give a dataset, a run, a store or a map")
+        raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
     kind, findings = _what(path)
     read: dict[str, int] = {}
     problems: list[str] = []
@@ -76,4 +87,22 @@ def _what(path: Path) -> tuple[str, Iterator[Finding]]:
         return "run", verify_run(Store(place.parents[2]), place.parent.name, place.name)
     if is_store(path):
         return "store", verify_store(Store(path))
-    raise UsageError(f"{path}: is no dataset, run, store or map (.zarr); give one of these directories")
+    for card, kind in _SEALED_CARDS.items():
+        if (path / card).is_file():
+            return kind, _sealed_directory(path, card)
+    raise UsageError(f"{path}: is no {_KNOWN}; give one of these directories")
+
+
+def _sealed_directory(directory: Path, card: str) -> Iterator[Finding]:
+    """Compare every file with what the card has of it; name those that it does not know."""
+    problem = broken_seal(directory / card)
+    if problem:
+        yield problem
+        return
+    checksums: Mapping[str, Any] = read_json(directory / card)["checksums"]
+    yield from broken_checksums(directory, checksums)
+    yield "files", len(checksums) + 1
+    there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
+    for name in sorted(there - {*checksums, card}):
+        if not name.endswith(_BESIDE):
+            yield f"{directory / name}: is no file of this {_SEALED_CARDS[card]}"
