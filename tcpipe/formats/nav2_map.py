@@ -1,7 +1,7 @@
 """Maps that Nav2's map_server loads: a grey picture (.pgm) and what it means (.yaml), mode ``scale``.
 
-In that mode grey falls from white (cost 0) to black (100, lethal) in even steps. A .pgm has no alpha, so unknown cannot be told from
-lethal: what is not known is lethal here.
+In that mode grey falls from white (cost 0) in even steps to almost black (99). Black alone is above ``occupied_thresh``: lethal to every
+reader, also to those that end the scale at 99. A .pgm has no alpha, so unknown cannot be told from lethal: what is not known is lethal.
 """
 
 from __future__ import annotations
@@ -20,6 +20,9 @@ LETHAL = 100
 HIGHEST = 99
 """Largest cost of what can be crossed."""
 
+_OCCUPIED = 0.995
+"""Between the darkest grey of `HIGHEST` and black."""
+
 
 def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, meaning: str) -> None:
     """Write ``path`` (.yaml) and the picture beside it.
@@ -35,7 +38,7 @@ def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, meanin
     meaning
         One line that says what a cost is.
     """
-    grey = np.rint(255.0 * (1.0 - cost / LETHAL)).astype(np.uint8)
+    grey = np.where(cost == LETHAL, 0.0, np.rint(255.0 * (1.0 - _OCCUPIED * cost / 100.0))).astype(np.uint8)
     picture = path.with_suffix(".pgm")
     with atomic_file(picture) as temporary:
         temporary.write_bytes(f"P5\n{grid.cols} {grid.rows}\n255\n".encode() + grey.tobytes())
@@ -48,7 +51,7 @@ def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, meanin
         f"resolution: {grid.pitch_m!r}",
         f"origin: [{x_min!r}, {y_min!r}, 0.0]",
         "negate: 0",
-        "occupied_thresh: 1.0",
+        f"occupied_thresh: {_OCCUPIED}",
         "free_thresh: 0.0",
         "",
     )
