@@ -68,8 +68,11 @@ def plan_path(
     store: str,
     as_json: bool,
     quiet: bool,
-) -> None:
-    """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel."""
+) -> int:
+    """Find the path of least energy, time or distance between two points, over costs that depend on the direction of travel.
+
+    Exit code 3: some of the path has no cost, because --step is large.
+    """
     from dataclasses import asdict
 
     from tcpipe.cli.output import print_json, progress, say_lines
@@ -86,3 +89,4 @@ def plan_path(
         print_json(asdict(result))
     else:
         say_lines(result)
+    return result.exit_code

@@ -24,14 +24,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import MapError, StoreError, UsageError
 from tcpipe.formats.atomic import atomic_directory, exclusive
 from tcpipe.formats.dataset_files import checksums_to_json
 from tcpipe.formats.geotiff import read_bands, write_cog
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.map_files import MapFile
 from tcpipe.formats.nav2_map import HIGHEST, LETHAL, write_nav2_map
-from tcpipe.formats.seals import write_sealed
+from tcpipe.formats.seals import broken_checksums, broken_seal, write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
@@ -119,46 +119,39 @@ def make_cost_map(
     """
     check_model(model, source)
     grid, key = grid_over(source, step_m), cost_map_key(model, source, step_m)
-    found = read_cost_map_card(out)
-    if found is None and out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claimed(out) as place:
         found = read_cost_map_card(out)  # another process may have been first
-        if found is not None and found["key"] == key and _is_whole(out, found):
+        if found is not None and found["key"] == key and not any(broken_checksums(out, found["checksums"])):
             return CostMapResult(out, "unchanged", found)
         spool = _spool(place, key, grid)
         _fill(model, source, spool, step)
         about = {"kind": KIND, "version": VERSION, "key": key, "map": source.name, "model": model.checksum}
         with atomic_directory(out) as directory:
             card = {**about, "robot": model.robot, **_write(directory, spool.costs)}
-            write_sealed(directory / CARD, {**card, "checksums": checksums_to_json(directory)})
+            card["checksums"] = checksums_to_json(directory)
+            write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(out, "done", card)
 
 
 def read_cost_map_card(path: Path) -> dict[str, Any] | None:
-    """Return the card of a cost map, or None where there is none."""
-    if not (path / CARD).is_file():
+    """Return the card of a cost map, or None where there is none, or one that is not as it was written."""
+    if not (path / CARD).is_file() or broken_seal(path / CARD):
         return None
-    try:
-        card = read_json(path / CARD)
-    except StoreError:
-        return None
+    card = read_json(path / CARD)
     return card if card.get("kind") == KIND else None
 
 
 def open_cost_map(path: Path, card: Mapping[str, Any]) -> CostGrid:
-    """Read the costs of a cost map into memory; `MapError` names a file that is damaged."""
+    """Read the costs of a cost map into memory; `MapError` names every file that is damaged."""
+    read = {f"{name}.tif": card["checksums"][f"{name}.tif"] for name in ("power", "velocity", "reasons", "height")}
+    if problems := list(broken_checksums(path, read)):
+        raise MapError(*(f"{problem}; make the cost map again" for problem in problems))
     courses = range(1, COURSES + 1)
     power, velocity, reasons = (read_bands(path / f"{name}.tif", courses) for name in ("power", "velocity", "reasons"))
     return CostGrid(MapGrid(**card["grid"]), power, velocity, reasons, read_bands(path / "height.tif", (1,))[0])
-
-
-def _is_whole(path: Path, card: Mapping[str, Any]) -> bool:
-    return all(
-        (path / name).is_file() and (path / name).stat().st_size == entry["size_bytes"]
-        for name, entry in card["checksums"].items()
-    )
 
 
 _ARRAYS = ("power_watt", "velocity_mps", "reasons", "height_m")
@@ -182,7 +175,8 @@ class _Spool:
 @contextmanager
 def _claimed(out: Path) -> Iterator[Path]:
     """Yield the directory beside ``out`` where its costs wait, for one process at a time; it stays when that is interrupted."""
-    place = out.parent / f".{out.name}.partial"
+    whole = out.absolute()
+    place = whole.parent / f".{whole.name}.partial"
     try:
         place.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -204,8 +198,7 @@ def _spool(place: Path, key: str, grid: MapGrid) -> _Spool:
             one = getattr(nothing, name)
             shape = (*one.shape[:-2], grid.rows, grid.cols)
             array = np.lib.format.open_memmap(place / f"{name}.npy", "w+", one.dtype, shape)
-            with (place / f"{name}.npy").open("r+b") as opened:  # a full disk is an error here, not a crash later
-                os.posix_fallocate(opened.fileno(), 0, array.offset + array.nbytes)
+            _allocate(place / f"{name}.npy", array.offset + array.nbytes)
             array[...] = one
         np.save(place / "done.npy", np.zeros(grid.rows * grid.cols, np.uint8))
         write_json(place / "job.json", {"key": key})
@@ -213,6 +206,15 @@ def _spool(place: Path, key: str, grid: MapGrid) -> _Spool:
     files = tuple(held.values())
     done = held.pop("done")
     return _Spool(CostGrid(grid, **held), done, files)
+
+
+def _allocate(path: Path, size_bytes: int) -> None:
+    """Take room on the disk: where it is full that is an error here, not a crash later."""
+    try:
+        with path.open("r+b") as opened:
+            os.posix_fallocate(opened.fileno(), 0, size_bytes)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written ({error.strerror}); wanted {size_bytes / 1e6:.0f} MB") from None
 
 
 def _job(place: Path) -> str | None:

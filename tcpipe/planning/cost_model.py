@@ -26,7 +26,7 @@ BATCH_PATCHES = 2_048
 
 
 class CostModel(Protocol):
-    """A model of power [W] and velocity [m/s] of a patch."""
+    """A model of power [W] and velocity [m/s] of a patch; which velocity, ``label_velocity`` says."""
 
     @property
     def name(self) -> str:
@@ -59,6 +59,10 @@ class CostModel(Protocol):
     @property
     def chord_m(self) -> float:
         """Length of the segments that it was trained on [m]."""
+
+    @property
+    def label_velocity(self) -> str:
+        """``ground``: chord over duration; ``fused``: forward velocity along the surface (docs/adr, Velocity is chord over duration)."""
 
     @property
     def class_counts(self) -> Mapping[int, int]:

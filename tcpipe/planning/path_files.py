@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcpipe.errors import StoreError
+from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.dataset_files import file_checksum
 from tcpipe.formats.geojson_lines import read_line
 from tcpipe.formats.json_files import digest, read_json
@@ -86,6 +86,8 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
     """
     if out is not None:
         check_ending(out)
+        if out.resolve() == path.resolve():
+            raise UsageError(f"{out}: is the path itself; give the table another name")
     lonlat_deg = read_line(path)
     line = {"lonlat_deg": lonlat_deg.tolist(), "version": VERSION}
     key = digest({**line, "model": model.checksum, "map": source.summary()})

@@ -1,13 +1,15 @@
 """The least-cost path between two points (the paper's purpose, section I), proved against all the ground that was not looked at.
 
-A path over a point p is at least as long as the straight ways start-p-goal. So once a path of cost C is found, no point can lie on a
-better one for which that length times the cost of a cheap metre exceeds C: all others are inside an ellipse. The ellipse is looked at,
-first without predictions (what can be driven at all, and the shortest way), then with; it grows until it holds every point that could
-matter, as long as the ground outside is nowhere cheaper than the cheapest tenth of that inside.
+A path over a point p is at least as long as the straight ways start-p-goal. So no point outside an ellipse can lie on a path shorter than
+one that is known: the ellipse is looked at, without predictions, and grows until the shortest way is proved. Then the model is asked, first
+about the ground of the shortest way and a little of every class, then about whatever could lie on a better path than the best so far
+(`tcpipe.planning.bounds`), the likeliest first, until nothing could.
 """
 
 from __future__ import annotations
 
+import logging
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -16,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import PathError
+from tcpipe.planning.bounds import could_be_better, probe_cells
 from tcpipe.planning.cost_grid import BARRED
+from tcpipe.planning.courses import COURSES
 from tcpipe.planning.path_cost import PathCost, cost_of_path, off_map_text, projection_of
 from tcpipe.planning.reasons import names_of
 from tcpipe.planning.search import Found, least_cost_path, steps_of
@@ -24,6 +28,8 @@ from tcpipe.planning.straight import straightened
 from tcpipe.planning.survey import Mask, Survey
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.point_classes import classes_at
+
+logger = logging.getLogger("tcpipe")
 
 Floats = NDArray[np.float64]
 Objective = Literal["energy", "time", "distance"]
@@ -34,6 +40,9 @@ _FIRST = 1.3
 """The first ellipse is of all points that make the straight way no longer than so many times."""
 
 _GROWTH = 1.5
+
+_FEWEST_ASKED = 512
+"""Cells asked about together, at least: a few seconds, more than finding the next takes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,7 +101,7 @@ def plan_path(
     allow_unseen
         Whether ground unlike any that the model was trained on may be crossed.
     step
-        Is told how many blocks of how many are predicted.
+        Is told how many blocks of how many are looked at, or predicted, in each round.
 
     Raises
     ------
@@ -155,6 +164,9 @@ class _Search:
             problems.append(
                 f"{labels[0]} and {labels[1]} are {apart_m:.2f} m apart; wanted at least {self.survey.model.chord_m:g} m"
             )
+        elif len(set(self._cells.tolist())) == 1:
+            pitch_m = self.survey.costs.grid.pitch_m
+            problems.append(f"{labels[0]} and {labels[1]} lie in one cell of {pitch_m:g} m; choose a smaller --step")
         if problems:
             raise PathError(*problems)
 
@@ -176,7 +188,7 @@ class _Search:
     def _ellipse(self, bound_m: float) -> Mask:
         """Return the cells over which a path from start to goal need not be longer than ``bound_m``, and those beside the ends."""
         grid = self.survey.costs.grid
-        scale = self._metres().max()
+        scale = self._metres().min()
         x = grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pitch_m
         y = grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pitch_m
         away = sum(np.hypot(x[None, :] - end[0], y[:, None] - end[1]) for end in self.ends_xy_m)
@@ -199,6 +211,8 @@ class _Search:
         bound_m = straight_m * _FIRST
         while True:
             ellipse = self._ellipse(bound_m)
+            if not self.survey.judged[ellipse].all():
+                logger.info("looking at the ground of %d cells", np.count_nonzero(ellipse & ~self.survey.judged))
             self.survey.judge(ellipse, self.step)
             self._check_open()
             found = self._found("distance", self.survey.judged)
@@ -210,16 +224,53 @@ class _Search:
 
     def best(self, objective: Objective, bound_m: float) -> Found:
         """Return the least-cost path; the model is asked about every cell that could be on it."""
+        survey = self.survey
+        class_id, open_ = survey.class_id(), np.asarray(self._maybe_open().any(axis=0))
+        probes, ellipse = probe_cells(class_id, open_), self._ellipse(bound_m) & open_
+        if not survey.predicted[probes | ellipse].all():
+            logger.info(
+                "without --cost-map the model is asked about the ground that could matter: %d to %d cells, %d courses each; "
+                "with one, which tcpipe cost-map makes once, a plan takes seconds",
+                *(int(np.count_nonzero(cells & ~survey.predicted)) for cells in (probes | ellipse, open_)),
+                COURSES,
+            )
+        pace_s = self._ask(probes, 0.0)
+        pace_s = self._ask(ellipse, pace_s)
         while True:
-            ellipse = self._ellipse(bound_m)
-            self.survey.predict(ellipse, self.step)
-            found = self._found(objective, self.survey.predicted)
-            if found is None and ellipse.all():
-                raise PathError(self._no_way())
-            reach_m = found.reduced_cost / found.cheap_per_m if found and found.cheap_per_m > 0.0 else np.inf
-            if found and (reach_m <= bound_m or ellipse.all()):
+            found = self._found(objective, survey.predicted)
+            wanted = self._could_be_better(objective, found, class_id)
+            if not wanted.any():
+                if found is None:
+                    raise PathError(self._no_way())
                 return found
-            bound_m = min(bound_m * _GROWTH, reach_m) if found else bound_m * _GROWTH
+            pace_s = self._ask(wanted, pace_s)
+
+    def _maybe_open(self) -> NDArray[np.bool_]:
+        """Return where a course may be driven as far as is known, shape (16, rows, cols)."""
+        return np.asarray(self.survey.costs.open_courses(allow_unseen=self.allow_unseen) | ~self.survey.judged)
+
+    def _could_be_better(self, objective: Objective, found: Found | None, class_id: NDArray[np.uint8]) -> Mask:
+        """Return those cells to ask about next that are the likeliest of all that could lie on a better path."""
+        survey, (start, goal) = self.survey, self._cells.tolist()
+        if survey.predicted.all():
+            return ~survey.predicted
+        steps = steps_of(survey.costs, objective, self._maybe_open(), self._metres())
+        over, better = could_be_better(steps, class_id, found, start, goal)
+        cells = np.flatnonzero(better & ~survey.predicted.reshape(-1))
+        most = max(_FEWEST_ASKED, int(survey.predicted.sum()) // 2)
+        wanted = np.zeros(survey.predicted.shape, np.bool_)
+        wanted.reshape(-1)[cells[np.argsort(over[cells], kind="stable")[:most]]] = True
+        return wanted
+
+    def _ask(self, wanted: Mask, pace_s: float) -> float:
+        """Ask the model about cells; say how many, and how long that takes at ``pace_s`` a cell. Return the pace."""
+        count = int(np.count_nonzero(wanted & ~self.survey.predicted))
+        if not count:
+            return pace_s
+        logger.info("asking the model about %d cells%s", count, f", about {count * pace_s:.0f} s" if pace_s else "")
+        begun_s = time.monotonic()
+        self.survey.predict(wanted, self.step)
+        return (time.monotonic() - begun_s) / count
 
     def straight(self, found: Found, objective: Objective) -> tuple[Floats, float]:
         """Return the path's points in the map's CRS [m], from end to end as they were given, and its cost; bends that cost are left out."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,8 @@ from tcpipe.formats.dataset_files import file_checksum
 from tcpipe.formats.geojson_lines import check_lonlat, write_lines
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.map_files import MapFile
-from tcpipe.planning.cost_map import cost_map_key, open_cost_map, read_cost_map_card
+from tcpipe.formats.seals import broken_seal
+from tcpipe.planning.cost_map import CARD, cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_files import cost_text
 from tcpipe.planning.plan import OBJECTIVES, Objective, plan_path
@@ -47,11 +48,18 @@ class PlanResult:
     plans: Mapping[str, Mapping[str, Any]]
     """Properties of each plan by objective, the one that was asked for first."""
 
+    @property
+    def exit_code(self) -> int:
+        """Return 3 if some of the path that was asked for has no cost, else 0."""
+        return 0 if self.plans[self.objective]["complete"] else 3
+
     def __str__(self) -> str:
         """Return what each path costs and where it is, as plain lines."""
         first = next(iter(self.plans.values()))
         lines = [f"least {name}: {cost_text(plan)}" for name, plan in self.plans.items()]
         lines += [f"warning: {count} pieces: {name.replace('_', ' ')}" for name, count in first["reasons"].items()]
+        if not first["complete"]:
+            lines.append("warning: cells are so large that ground without a cost lies between; choose a smaller --step")
         if first["negative_steps"]:
             lines.append(
                 f"warning: {first['negative_steps']} steps give back more than their height explains; taken as free"
@@ -85,12 +93,13 @@ def plan(
         check_lonlat(label, end[None])
     check_model(model, source)
     drawn = picture is not None
-    key = digest(
-        {"model": model.checksum, "map": source.summary(), "request": request, "drawn": drawn, "version": VERSION}
-    )
+    card = None if request.cost_map is None else _card_of(request.cost_map, model, source)
+    rules = replace(request, cost_map=None, step_m=card["grid"]["pitch_m"] if card else request.step_m)
+    made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": drawn}
+    key = digest({**made_from, "cost_map": card is not None, "version": VERSION})
     if (found := _plans_of(out, picture, key)) is not None:
         return PlanResult(request.objective, out, picture, "unchanged", found)
-    survey = _survey(model, source, request)
+    survey = _survey(model, source, request, card)
     wanted = (request.objective, *(name for name in OBJECTIVES if drawn and name != request.objective))
     plans = {
         name: plan_path(survey, start, goal, name, allow_unseen=request.allow_unseen, step=step) for name in wanted
@@ -115,28 +124,36 @@ def _check_names(out: Path, picture: Path | None) -> None:
         raise UsageError(f"{picture}: wanted the name of a file that ends in .png")
 
 
-def _survey(model: CostModel, source: MapFile, request: PlanRequest) -> Survey:
-    """Return what a cost map knows, or nothing yet."""
-    if request.cost_map is None:
-        return new_survey(model, source, request.step_m)
-    card = read_cost_map_card(request.cost_map)
+def _card_of(path: Path, model: CostModel, source: MapFile) -> Mapping[str, Any]:
+    """Return the card of a cost map of this model and map; `ModelError` if it is none."""
+    card = read_cost_map_card(path)
     if card is None:
-        raise ModelError(f"{request.cost_map}: not a cost map; make one with tcpipe cost-map")
+        problem = broken_seal(path / CARD) if (path / CARD).is_file() else f"{path}: not a cost map"
+        raise ModelError(f"{problem}; make one with tcpipe cost-map")
     if card["key"] != cost_map_key(model, source, card["grid"]["pitch_m"]):
         raise ModelError(
-            f"{request.cost_map}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
+            f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
         )
+    return card
+
+
+def _survey(model: CostModel, source: MapFile, request: PlanRequest, card: Mapping[str, Any] | None) -> Survey:
+    """Return what a cost map knows, or nothing yet."""
+    if request.cost_map is None or card is None:
+        return new_survey(model, source, request.step_m)
     return survey_from(model, source, open_cost_map(request.cost_map, card))
 
 
 def _plans_of(out: Path, picture: Path | None, key: str) -> dict[str, Any] | None:
-    """Return what was found before, if it is made from the same, and whole; else None."""
-    if not out.is_file():
+    """Return what was found before, if it is made from the same, and whole; else None. `UsageError` for a file that is no plan."""
+    if not out.exists():
         return None
     try:
-        about = read_json(out).get("tcpipe") or {}
+        about = read_json(out).get("tcpipe")
     except StoreError:
-        return None
+        about = None
+    if not isinstance(about, dict):
+        raise UsageError(f"{out}: exists and is no plan; it is left alone; give another --out")
     if about.get("key") != key:
         return None
     if picture is not None and not (picture.is_file() and file_checksum(picture)[1] == about.get("picture_sha256")):

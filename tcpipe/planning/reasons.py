@@ -90,8 +90,8 @@ def reasons_of(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, so
     for reason, (values, name) in ranges.items():
         low, high = model.seen[name]
         bits[~((values >= low) & (values <= high))] |= np.uint16(reason)
-    if patches.terrain is not None and model.classes == source.classes:
-        bits |= _class_reasons(patches, patches.terrain, model)
+    if patches.terrain is not None:
+        bits |= _class_reasons(patches, patches.terrain, model, source)
     bits[~on_map] = Reason.OUTSIDE_MAP
     bits[bits & Reason.NODATA != 0] = Reason.NODATA
     return bits
@@ -104,14 +104,17 @@ def relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
     return steps.astype(np.float64) * HEIGHT_STEP_M
 
 
-def _class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: CostModel) -> Bits:
-    traversable = model.classes.traversable()
+def _class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: CostModel, source: MapReader) -> Bits:
+    """Return what the map's classes forbid, and which of them training has not met; a model of another table takes no terrain."""
+    traversable = source.classes.traversable()
     bits = np.zeros(len(terrain), np.uint16)
     bits[~traversable[patches.terrain_class]] |= np.uint16(Reason.NOT_TRAVERSABLE)
     bits[patches.terrain_class == NODATA_ID] |= np.uint16(Reason.NODATA)
     seen, known = np.zeros(256, np.bool_), np.zeros(256, np.uint8)
     seen[[class_id for class_id, count in model.class_counts.items() if count > 0]] = True
     known[list(model.pixel_classes)] = 1
+    if model.classes != source.classes:
+        seen[:], known[:] = True, 1
     px = terrain.shape[1]
     lane = np.flatnonzero(np.abs((np.arange(px) + 0.5) / px - 0.5) * model.patch_m <= LANE_M / 2.0)
     unknown, shut = np.empty(len(terrain), np.bool_), np.empty(len(terrain))

@@ -31,9 +31,6 @@ _STEEPEST_PER_M = 1e5
 
 _PRECISION = 1e-3
 
-_CHEAP = 0.1
-"""Ground that was not looked at is taken as no cheaper than the cheapest tenth of what was: no path is made of the best metres alone."""
-
 
 @dataclass(frozen=True, slots=True)
 class Steps:
@@ -42,7 +39,7 @@ class Steps:
     Attributes
     ----------
     begin, end : flat indices of cells, shape (M,).
-    cost : of the step, in the objective's unit, shape (M,).
+    cost : of the step, in the objective's unit, shape (M,); NaN where a cell that it crosses is not predicted.
     length_m : on the ground [m], shape (M,).
     rise_m : height of the end above the begin [m], shape (M,).
     """
@@ -56,12 +53,12 @@ class Steps:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """A least-cost path: flat indices of its cells and its cost; both without the grade, too, and what a cheap metre costs without it."""
+    """A least-cost path: flat indices of its cells, its cost, its cost without the grade, and the potential a metre that takes it out."""
 
     cells: NDArray[np.int64]
     cost: float
     reduced_cost: float
-    cheap_per_m: float
+    potential: float
     negative_steps: int
 
 
@@ -135,17 +132,31 @@ def least_cost_path(steps: Steps, cells: int, start: int, goal: int) -> Found | 
     k = best_potential(steps)
     reduced = steps.cost - k * steps.rise_m
     negative = int(np.count_nonzero(reduced < 0.0))
-    graph = csr_array((np.maximum(reduced, _LEAST), (steps.begin, steps.end)), shape=(cells, cells))
-    cost, before = dijkstra(graph, indices=start, return_predecessors=True)
+    cost, before = dijkstra(_graph(steps, reduced, cells), indices=start, return_predecessors=True)
     if not np.isfinite(cost[goal]):
         return None
     path = [goal]
     while path[-1] != start:
         path.append(int(before[path[-1]]))
     order = np.array(path[::-1])
-    total = float(path_cost(steps, order, cells))
-    cheapest = max(float(np.quantile(reduced / steps.length_m, _CHEAP)), 0.0)
-    return Found(order, total, float(cost[goal]), cheapest, negative)
+    return Found(order, float(path_cost(steps, order, cells)), float(cost[goal]), k, negative)
+
+
+def least_over_cells(steps: Steps, reduced: Floats, cells: int, start: int, goal: int, *, limit: float) -> Floats:
+    """Return what the cheapest path over each cell costs, shape (cells,); infinite where that is more than ``limit``.
+
+    Parameters
+    ----------
+    steps, reduced : all steps, and what each is taken to cost without the grade, shape (M,).
+    """
+    graph = _graph(steps, reduced, cells)
+    there = dijkstra(graph, indices=start, limit=limit)
+    back = dijkstra(graph.T.tocsr(), indices=goal, limit=limit)
+    return np.asarray(there + back)
+
+
+def _graph(steps: Steps, reduced: Floats, cells: int) -> csr_array:
+    return csr_array((np.maximum(reduced, _LEAST), (steps.begin, steps.end)), shape=(cells, cells))
 
 
 def path_cost(steps: Steps, path: NDArray[np.int64], cells: int) -> float:

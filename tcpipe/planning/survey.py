@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -12,9 +11,8 @@ from numpy.typing import NDArray
 from tcpipe.planning.cost_grid import CellFrames, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.verdicts import verdicts_of
+from tcpipe.terrain.point_classes import classes_at
 from tcpipe.terrain.tiles import MapReader
-
-logger = logging.getLogger("tcpipe")
 
 Mask = NDArray[np.bool_]
 
@@ -41,13 +39,21 @@ class Survey:
         self.judged[wanted] = True
         self.predicted[wanted] = True
 
+    def class_id(self) -> NDArray[np.uint8]:
+        """Return the class under the middle of each cell, shape (rows, cols); 0 without data, or without classes."""
+        grid = self.costs.grid
+        if "terrain" not in self.source.layers:
+            return np.zeros((grid.rows, grid.cols), np.uint8)
+        row, col = np.mgrid[: grid.rows, : grid.cols]
+        middle = grid.xy_from_px(np.stack([col, row], axis=-1).reshape(-1, 2).astype(np.float64))
+        return np.maximum(classes_at(self.source, middle), 0).astype(np.uint8).reshape(grid.rows, grid.cols)
+
     def _learn(self, wanted: Mask, step: Callable[[int, int], None], *, ask: bool) -> None:
         todo = list(blocks(self.source, self.model, self.costs.grid, wanted))
         answers = verdicts_of(self.model, self.source, (self.frames.of(cells) for cells in todo), ask=ask)
         for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
             self.costs.put(cells, found)
-            if ask:
-                step(number, len(todo))
+            step(number, len(todo))
 
 
 def new_survey(model: CostModel, source: MapReader, step_m: float) -> Survey:

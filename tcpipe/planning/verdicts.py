@@ -27,7 +27,8 @@ BATCH = 4_096
 class Verdicts:
     """What is said of N metres, shape (N,): `Reason` bits, predictions (NaN without a cost), and what the ground is.
 
-    ``height_m`` is that of the metre's middle, NaN where the map has none.
+    ``velocity_mps`` is horizontal, whichever velocity the model predicts: a metre of the map takes its inverse. ``height_m`` is that of
+    the metre's middle, NaN where the map has none.
     """
 
     reasons: Bits
@@ -71,11 +72,12 @@ def _judged(model: CostModel, source: MapReader, patches: Patches, on_map: NDArr
     said = predict_patches(model, patches, asked)
     bits[asked & np.isnan(said.velocity_mps)] |= np.uint16(Reason.NO_MOTION)
     known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
+    horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0
     middle = patches.height[:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
     return Verdicts(
         reasons=bits,
         power_watt=said.power_watt,
-        velocity_mps=said.velocity_mps,
+        velocity_mps=said.velocity_mps * horizontal,
         terrain_class=patches.terrain_class,
         slope_rad=np.where(known, patches.slope_rad, np.nan),
         cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),

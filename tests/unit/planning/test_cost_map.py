@@ -15,6 +15,7 @@ from planning_worlds import plane
 from ruamel.yaml import YAML
 
 from tcpipe.errors import MapError, ModelError, UsageError
+from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_grid import blocks, grid_over
 from tcpipe.planning.cost_map import cost_map_key, make_cost_map, open_cost_map, read_cost_map_card
 from tcpipe.planning.courses import ANGLES_DEG
@@ -94,6 +95,8 @@ def test_bands_say_what_they_are_and_the_last_three_sum_up_the_courses(made):
         assert dataset.transform[:6] == (1.0, 0.0, 500_000.0, 0.0, -1.0, 5_200_000.0)
         assert dataset.crs.to_epsg() == 32633
         energy = dataset.read()
+        north = dataset.sample([(500_004.5, 5_200_000.0 - 12.5), (500_012.5, 5_200_000.0 - 12.5)], indexes=5)
+        np.testing.assert_allclose(np.ravel(list(north)), energy_joule([5, 4], 0.1 * 0.9996), rtol=4e-3)
     known = energy[:, 12, 12]
     assert known[16] == known[:16].min()
     assert known[17] == pytest.approx(known[:16].mean(), rel=1e-6)
@@ -109,10 +112,11 @@ def test_nav2_finds_a_scale_map_with_trees_that_are_lethal(made):
     _, result = made
     about = YAML(typ="safe").load((result.path / "energy.yaml").read_text())
     assert about["mode"] == "scale"
+    assert about["free_thresh"] == 0.0
     assert about["origin"] == [500_000.0, 5_200_000.0 - 24.0, 0.0]
     grey = matplotlib.image.imread(result.path / about["image"])
     occupied = (255 - grey.astype(float)) / 255.0
-    cost = np.where(occupied >= about["occupied_thresh"], 100, np.rint(100.0 * occupied))  # as Nav2's map_io does
+    cost = np.where(occupied > about["occupied_thresh"], 100, np.rint(100.0 * occupied / about["occupied_thresh"]))
     assert grey.shape == (24, 24)
     assert cost[5, 20] == 100
     assert cost[12, 12] < 100
@@ -166,6 +170,26 @@ def test_a_second_call_does_nothing_and_another_step_replaces_it(tmp_path: Path)
         cost_map_key(replace(MODEL, checksum="1" * 64), source, 3.0)
         != json.loads((out / "cost-map.json").read_text())["key"]
     )
+
+
+def test_a_damaged_file_is_named_by_verify_and_by_who_reads_it_and_a_second_call_mends_it(tmp_path: Path):
+    source, out = _map(side_m=6.0), tmp_path / "c"
+    card = make_cost_map(MODEL, source, out, step_m=2.0).card
+    assert (verify(out).kind, verify(out).problems) == ("cost map", ())
+    (out / "energy.tif.aux.xml").write_text("statistics that a viewer left")
+    data = bytearray((out / "power.tif").read_bytes())
+    data[-20] ^= 1
+    (out / "power.tif").write_bytes(data)
+    (problem,) = verify(out).problems
+    assert str(out / "power.tif") in problem
+    with pytest.raises(MapError, match=r"power\.tif: its sha256 is"):
+        open_cost_map(out, card)
+    assert make_cost_map(MODEL, source, out, step_m=2.0).status == "done"
+    (out / "cost-map.json").write_text((out / "cost-map.json").read_text().replace("16", "17"))
+    assert "not as it was written" in verify(out).problems[0]
+    assert read_cost_map_card(out) is None
+    assert make_cost_map(MODEL, source, out, step_m=2.0).status == "done"
+    assert verify(out).problems == ()
 
 
 def test_what_cannot_be_mapped_is_one_line(tmp_path: Path):

@@ -130,6 +130,28 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
         plan(MODEL, source, _request(source, cost_map=tmp_path), out=tmp_path / "p.json", picture=None)
 
 
+def test_a_cost_map_of_other_cells_gives_another_plan_and_a_damaged_one_is_refused(source, tmp_path):
+    costs, out = tmp_path / "costs", tmp_path / "plan.geojson"
+    request = _request(source, cost_map=costs)
+    for step_m in (2.0, 3.0):
+        make_cost_map(MODEL, source, costs, step_m=step_m)
+        assert plan(MODEL, source, request, out=out, picture=None).status == "done"
+        assert plan(MODEL, source, request, out=out, picture=None).status == "unchanged"
+    (costs / "cost-map.json").write_text("{}")
+    with pytest.raises(ModelError, match="not as it was written"):
+        plan(MODEL, source, request, out=out, picture=None)
+
+
+def test_files_of_the_user_are_left_alone(source, path):
+    before = path.read_bytes()
+    with pytest.raises(UsageError, match="is no plan; it is left alone"):
+        plan(MODEL, source, _request(source, step_m=2.0), out=path, picture=None)
+    mine = path.rename(path.with_suffix(".json"))
+    with pytest.raises(UsageError, match="is the path itself"):
+        predict_path(MODEL, source, mine, mine)
+    assert mine.read_bytes() == before
+
+
 def test_names_and_points_that_cannot_be_are_one_line(source, path, tmp_path):
     with pytest.raises(UsageError, match=r"ends in \.csv"):
         predict_path(MODEL, source, path, tmp_path / "pieces.xlsx")

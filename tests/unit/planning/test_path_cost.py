@@ -33,6 +33,17 @@ def test_uphill_and_downhill_on_a_plane():
     assert down.energy_joule < up.energy_joule
 
 
+def test_a_model_of_the_velocity_along_the_surface_takes_longer_for_a_metre_of_the_map():
+    source = plane(rise_east=0.4)
+    along, ground = (
+        _cost(source, (2.0, 12.0), (22.0, 12.0), model=replace(MODEL, label_velocity=label))
+        for label in ("fused", "ground")
+    )
+    longer = np.hypot(1.0, 0.4 / SCALE)  # a metre of the map on the slope
+    assert along.duration_s == pytest.approx(ground.duration_s * longer, rel=2e-3)
+    assert along.energy_joule == pytest.approx(ground.energy_joule * longer, rel=2e-3)
+
+
 def test_the_rest_of_a_path_is_paid_by_its_length():
     source = plane()
     found = _cost(source, (5.0, 5.0), (5.0 + 7.4 / SCALE, 5.0))

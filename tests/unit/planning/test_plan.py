@@ -5,13 +5,14 @@ from dataclasses import replace
 import matplotlib.image
 import numpy as np
 import pytest
-from physics_model import PhysicsModel, velocity_mps
+from physics_model import PhysicsModel, energy_joule, velocity_mps
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import PathError
 from tcpipe.planning.picture import draw_plans
 from tcpipe.planning.plan import OBJECTIVES, plan_path
 from tcpipe.planning.survey import new_survey
+from tcpipe.terrain.classes import ClassTable, TerrainClass
 
 MODEL = PhysicsModel()
 
@@ -75,6 +76,22 @@ def test_looking_at_less_of_the_map_finds_the_same_path():
         assert one.predicted_cells < 0.7 * other.predicted_cells
 
 
+def test_a_road_out_of_sight_is_found_without_a_cost_map(caplog):
+    """It lies beyond all that the shortest way needs, and is worth the detour."""
+    source = plane(72.0, pitch_m=0.2, classes=lambda _, north: np.where(np.abs(north - 36.0) < 2.0, 4, 7))
+    lazy, model = new_survey(replace(MODEL, patch_px=8), source, 1.0), replace(MODEL, patch_px=8)
+    with caplog.at_level("INFO", "tcpipe"):
+        found = _plan(source, (6.0, 22.0), (66.0, 22.0), "energy", model=model, survey=lazy)
+    straight, metres = energy_joule(7, 0.0) * 60.0, 60.0 / 0.9996
+    assert found.cost.length_m > 1.03 * metres
+    assert found.cost.energy_joule < 0.95 * straight
+    assert found.predicted_cells < 0.5 * lazy.predicted.size
+    ground, first, *rest = caplog.messages
+    assert ground.startswith("looking at the ground of")
+    assert "without --cost-map" in first
+    assert any(line.startswith("asking the model about") and line.endswith(" s") for line in rest)
+
+
 def test_ends_that_cannot_be_used_are_named_together():
     source = plane(30.0, classes=_wall)
     with pytest.raises(PathError) as error:
@@ -85,6 +102,8 @@ def test_ends_that_cannot_be_used_are_named_together():
         _plan(source, (15.0, 4.0), (4.0, 4.0), "time")
     with pytest.raises(PathError, match=r"are 0\.\d+ m apart"):
         _plan(source, (4.0, 4.0), (4.3, 4.0), "time")
+    with pytest.raises(PathError, match="lie in one cell of 5 m; choose a smaller --step"):
+        _plan(source, (1.0, 4.0), (4.0, 4.0), "time", survey=new_survey(MODEL, source, 5.0))
     swapped = lonlat(source, (4.0, 4.0), (26.0, 4.0))[:, ::-1]
     with pytest.raises(PathError, match="axes look swapped") as error:
         plan_path(new_survey(MODEL, source, 1.0), swapped[0], swapped[1], "time")
@@ -110,6 +129,15 @@ def test_an_end_on_ground_that_is_not_known_says_so_before_all_the_map_is_looked
         _plan(source, (22.0, 4.0), (33.0, 4.0), "time", survey=survey)
     assert survey.judged.mean() < 0.5
     assert not survey.predicted.any()
+
+
+def test_a_model_that_takes_no_classes_keeps_to_what_the_map_s_own_allow():
+    source = plane(30.0, classes=_wall)
+    model = replace(MODEL, channels=("height",), classes=ClassTable((TerrainClass(1, "all", traversable=True),)))
+    found = _plan(source, (4.0, 4.0), (26.0, 4.0), "time", model=model)
+    assert found.cost.complete
+    assert found.cost.length_m > 40.0
+    assert set(found.cost.reasons) <= {"curved"}
 
 
 def test_a_model_of_heights_alone_needs_no_other_layer_and_its_plans_can_be_drawn(tmp_path):

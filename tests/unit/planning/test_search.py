@@ -6,9 +6,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
+from tcpipe.planning.bounds import could_be_better, probe_cells
 from tcpipe.planning.cost_grid import CostGrid
 from tcpipe.planning.courses import COURSES, MOVES, touches
-from tcpipe.planning.search import best_potential, least_cost_path, steps_of
+from tcpipe.planning.search import best_potential, least_cost_path, least_over_cells, steps_of
 from tcpipe.planning.straight import straightened
 from tcpipe.terrain.grid import MapGrid
 
@@ -66,6 +67,49 @@ def test_paths_are_as_cheap_as_can_be_round_any_obstacles(power, free):
     else:
         assert found.cost == pytest.approx(best, rel=1e-6)
         assert free.reshape(-1)[found.cells].all()
+
+
+@settings(max_examples=15)
+@given(arrays.arrays(float, (COURSES, 5, 6), elements=st.floats(20.0, 300.0)))
+def test_the_least_over_a_cell_is_the_way_there_and_on_from_there(power):
+    costs, open_ = _grid(power, 0.8, np.zeros((5, 6))), np.ones((COURSES, 5, 6), bool)
+    steps = steps_of(costs, "energy", open_, METRES)
+    over = least_over_cells(steps, steps.cost, 30, 0, 29, limit=np.inf)
+    there = _by_hand(costs, "energy", open_, 0)
+    for cell in (3, 14, 29):
+        assert over[cell] == pytest.approx(there[cell] + _by_hand(costs, "energy", open_, cell)[29], rel=1e-6)
+    assert over.min() == pytest.approx(there[29], rel=1e-6)
+
+
+def test_no_cell_of_a_better_path_is_left_out_and_the_rest_need_not_be_asked_about():
+    """Costs vary little within a class: what is known of each bounds the rest, and only a part of the cells could be better."""
+    rng, shape = np.random.default_rng(5), (24, 30)
+    class_id = np.where(rng.random((6, 5)) < 0.4, 5, 4).astype(np.uint8).repeat(4, axis=0).repeat(6, axis=1)
+    power = np.where(class_id == 5, 150.0, 80.0) * rng.uniform(1.0, 1.02, (COURSES, *shape))
+    open_, start, goal = np.ones((COURSES, *shape), bool), 10 * 30 + 4, 14 * 30 + 25
+    whole = steps_of(_grid(power, 1.0, np.zeros(shape)), "energy", open_, METRES)
+    best = least_cost_path(whole, class_id.size, start, goal)
+    predicted = probe_cells(class_id, open_[0])
+    predicted[9:16, 3:27] = True
+    steps = steps_of(_grid(np.where(predicted, power, np.nan), 1.0, np.zeros(shape)), "energy", open_, METRES)
+    found = least_cost_path(
+        steps_of(_grid(power, 1.0, np.zeros(shape)), "energy", open_ & predicted, METRES), class_id.size, start, goal
+    )
+    over, better = could_be_better(steps, class_id, found, start, goal)
+    assert found.cost > best.cost
+    unknown = best.cells[~predicted.reshape(-1)[best.cells]]
+    assert unknown.size
+    assert better[unknown].all()
+    assert over[goal] <= best.cost
+    assert np.count_nonzero(better & ~predicted.reshape(-1)) < 0.5 * np.count_nonzero(~predicted)
+
+
+def test_probes_meet_every_class_that_can_be_driven():
+    class_id, open_ = np.full((40, 50), 4, np.uint8), np.ones((40, 50), bool)
+    class_id[20], class_id[:5, :5], open_[:5, :5] = 6, 2, False
+    probes = probe_cells(class_id, open_)
+    assert set(class_id[probes].tolist()) == {4, 6}
+    assert probes.sum() <= 2 * 6 * 9
 
 
 def test_downhill_energy_that_comes_back_does_not_mislead_the_search():
