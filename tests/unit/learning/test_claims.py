@@ -33,6 +33,19 @@ def test_the_papers_figures_hold_all_of_its_claims():
     assert len(claims) == 6
 
 
+def test_the_papers_own_ratios():
+    """By hand, from its tables III to V."""
+    said = {claim.says: claim.in_the_paper for claim in checked_claims([_run()])}
+    assert said == {
+        "height matters most": pytest.approx(52.20 / 17.38),
+        "class matters for unseen areas": pytest.approx(17.38 / 12.80),
+        "one net beats grass-only by far": pytest.approx(28.37 / 12.80),
+        "one net beats per-class nets": pytest.approx(16.96 / 12.80),
+        "T is far better than expected time": pytest.approx(13.82 / 5.04),
+        "w is as good as can be": None,
+    }
+
+
 @pytest.mark.parametrize(
     ("change", "falls"),
     [
