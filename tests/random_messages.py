@@ -85,9 +85,10 @@ def write_mcap(path, messages, *, store=ROS2, compression=CompressionType.ZSTD, 
     return path
 
 
-def write_bag(path, messages, compression=None):
+def write_bag(path, messages, compression=None, *, chunk_bytes=1 << 20):
     """Write ROS 1 messages with rosbags."""
     writer = BagWriter(path)
+    writer.chunk_threshold = chunk_bytes
     if compression:
         writer.set_compression(compression)
     with writer:

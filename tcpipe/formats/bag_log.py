@@ -37,7 +37,6 @@ from tcpipe.formats.log_part import (
     decompressed_prefix,
     gathered,
     in_order,
-    search_windows,
 )
 from tcpipe.logs.topics import Damage, normalized_type_name
 
@@ -410,26 +409,36 @@ class BagPart:
 
     def _next_chunk(self, start: int) -> int:
         """Return where the next chunk's record begins: the mark of one, inside a header that parses."""
-        for block_start, _, read_bytes in search_windows(start, self._bytes.size, _MAX_CHUNK_HEADER):
-            block = bytes(self._bytes.read(block_start, read_bytes))
+        for block_start, _, piece in self._bytes.windows(start, self._bytes.size, _MAX_CHUNK_HEADER):
+            block = bytes(piece)
             mark = block.find(_CHUNK_MARK)
             while mark >= 0:
-                first = max(block_start + mark - _MAX_CHUNK_HEADER, start)
-                before = bytes(self._bytes.read(first, block_start + mark - first))
-                high = before.find(bytes(3), 1)  # a header's length is one byte and three zeros
-                while high > 0:
-                    length, distance = before[high - 1], len(before) - high + 1
-                    if distance <= length + 4 - len(_CHUNK_MARK) and self._is_chunk(first + high - 1):
-                        return first + high - 1
-                    high = before.find(bytes(3), high + 1)
+                found = self._chunk_of_mark(block_start + mark, start)
+                if found is not None:
+                    return found
                 mark = block.find(_CHUNK_MARK, mark + 1)
         return self._bytes.size
 
-    def _is_chunk(self, position: int) -> bool:
-        length = int.from_bytes(self._bytes.peek(position, 4), "little")
-        if not 0 < length <= _MAX_CHUNK_HEADER:
-            return False
+    def _chunk_of_mark(self, mark: int, start: int) -> int | None:
+        """Return where, at ``start`` or behind, the chunk's record begins whose header has the mark at byte ``mark``."""
+        first = max(mark - _MAX_CHUNK_HEADER, start)
         try:
+            before = bytes(self._bytes.read(first, mark - first))
+        except DamageError:
+            return None
+        high = before.find(bytes(3), 1)  # a header's length is one byte and three zeros
+        while high > 0:
+            length, distance = before[high - 1], len(before) - high + 1
+            if distance <= length + 4 - len(_CHUNK_MARK) and self._is_chunk(first + high - 1):
+                return first + high - 1
+            high = before.find(bytes(3), high + 1)
+        return None
+
+    def _is_chunk(self, position: int) -> bool:
+        try:
+            length = int.from_bytes(self._bytes.peek(position, 4), "little")
+            if not 0 < length <= _MAX_CHUNK_HEADER:
+                return False
             record = self._record(position)
             return record.opcode == _OP_CHUNK and b"compression" in record.fields and record.number(b"size") > 0
         except DamageError:

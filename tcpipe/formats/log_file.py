@@ -177,12 +177,24 @@ class Log:
         return [[stat.st_size, stat.st_mtime_ns] for stat in found]
 
     def sha256(self) -> str:
-        """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name."""
+        """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name.
+
+        Raises
+        ------
+        LogError
+            The disk does not give all of it.
+        """
         digest = hashlib.sha256()
         for file in sorted(self._files, key=lambda file: file.name):
-            with file.open("rb") as stream:
-                while block := stream.read(_HASH_BYTES):
-                    digest.update(block)
+            try:
+                with file.open("rb") as stream:
+                    while block := stream.read(_HASH_BYTES):
+                        digest.update(block)
+            except OSError as error:
+                raise LogError(
+                    f"{file}: it cannot be read to its end ({error.strerror}); rescue what can be read into a copy "
+                    "(ddrescue does), and give that"
+                ) from None
         return digest.hexdigest()
 
     def definition(self, topic: str) -> tuple[str, str]:
@@ -443,9 +455,13 @@ def _magic(path: Path) -> bytes:
 
 
 def _tail(path: Path, size: int) -> bytes:
-    with path.open("rb") as file:
-        file.seek(max(path.stat().st_size - size, 0))
-        return file.read(size)
+    """Return a file's last bytes; nothing where they cannot be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - size, 0))
+            return file.read(size)
+    except OSError:
+        return b""
 
 
 def _described(path: Path, magic: bytes) -> str:

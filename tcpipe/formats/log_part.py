@@ -5,6 +5,7 @@ A `LogPart` is one file of a log. `tcpipe.formats.log_file` joins the parts of a
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 import struct
@@ -34,6 +35,8 @@ _LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 13
 _GAP_BYTES = 1 << 15
 """Pieces of a file that lie no further apart are read as one."""
+_MADV_POPULATE_READ = 22
+"""Linux 5.14 and newer: have these pages in memory now, or say that it cannot be. Python has no name for it."""
 
 Int64Array = NDArray[np.int64]
 
@@ -143,9 +146,9 @@ class ByteSource:
         """Return ``size`` bytes at ``offset``; raise `DamageError` where the file ends before."""
         if size < 0 or offset + size > self.size:
             raise DamageError(f"the file ends at byte {self.size}, inside a piece of {size} bytes")
-        data = os.pread(self._file.fileno(), size, offset)
+        data = self._some(offset, size)
         while len(data) < size:
-            more = os.pread(self._file.fileno(), size - len(data), offset + len(data))
+            more = self._some(offset + len(data), size - len(data))
             if not more:
                 raise DamageError(f"the file became shorter while it was read (byte {offset + len(data)})")
             data += more
@@ -159,8 +162,7 @@ class ByteSource:
         if len(held) < size:
             held = self._scratch.held = bytearray(size)
         view = memoryview(held)[:size]
-        found = os.preadv(self._file.fileno(), [view], offset)
-        return view if found == size else self.read(offset, size)
+        return view if self._fill(view, offset) else self.read(offset, size)
 
     def read_pieces(self, pieces: Sequence[tuple[int, memoryview]]) -> None:
         """Fill each view with the bytes at its offset; what lies between them is not read. `DamageError` as `read`."""
@@ -168,15 +170,26 @@ class ByteSource:
         for offset, view in pieces:
             os.posix_fadvise(self._file.fileno(), offset, len(view), os.POSIX_FADV_WILLNEED)
         for offset, view in pieces:
-            if os.preadv(self._file.fileno(), [view], offset) != len(view):
+            if not self._fill(view, offset):
                 view[:] = self.read(offset, len(view))
 
     def peek(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes at ``offset`` (fewer at the end); cheap for many small, mostly ascending reads."""
         at, held = self._peeked  # one assignment below: threads may lose each other's piece, never mix two
         if offset < at or offset + size > at + len(held):
-            at, held = self._peeked = offset, os.pread(self._file.fileno(), max(size, _PEEK_BYTES), offset)
+            at, held = self._peeked = offset, self._some(offset, max(size, _PEEK_BYTES))
+            if len(held) < size and offset + len(held) < self.size:  # what can be read ends here
+                return bytes(self.read(offset, min(size, self.size - offset)))
         return held[offset - at : offset - at + size]
+
+    def windows(self, start: int, end: int, overlap: int) -> Iterator[tuple[int, int, memoryview]]:
+        """Yield (start, size to search, bytes) of pieces to search one after the other; what cannot be read is left out."""
+        for piece_start, size, read_bytes in search_windows(start, end, overlap):
+            try:
+                piece = self.read(piece_start, read_bytes)
+            except DamageError:
+                continue
+            yield piece_start, size, piece
 
     def skips(self) -> None:
         """Tell the system that this file is read in pieces: what follows a piece need not be read ahead."""
@@ -186,18 +199,51 @@ class ByteSource:
         """Close the file."""
         self._file.close()
 
+    def _some(self, offset: int, size: int) -> bytes:
+        """Return up to ``size`` bytes at ``offset``, at least one unless the file ends there."""
+        try:
+            return os.pread(self._file.fileno(), size, offset)
+        except OSError as error:
+            raise _unreadable(offset, error) from None
 
-def read_only(window: mmap.mmap, starts: Int64Array, ends: Int64Array) -> None:
-    """Have the system read these pieces of a mapped file, shape (N,), rising, and nothing between them but short gaps."""
+    def _fill(self, view: memoryview, offset: int) -> bool:
+        """Read the bytes at ``offset`` into a view; return whether there were enough."""
+        try:
+            return os.preadv(self._file.fileno(), [view], offset) == len(view)
+        except OSError as error:
+            raise _unreadable(offset, error) from None
+
+
+def _unreadable(offset: int, error: OSError) -> DamageError:
+    return DamageError(f"the disk does not give what lies at byte {offset} ({error.strerror})")
+
+
+def load_only(window: mmap.mmap, starts: Int64Array, ends: Int64Array) -> None:
+    """Have the system load these pieces of a mapped file, shape (N,), by rising start, and nothing between them but short gaps.
+
+    Raises
+    ------
+    DamageError
+        The disk does not give them, or the file has become shorter. Whoever looked at them would be ended by a signal (SIGBUS).
+    """
     window.madvise(mmap.MADV_RANDOM)
     if not len(starts):
         return
+    ends = np.minimum(np.maximum.accumulate(ends), len(window))
     apart = np.flatnonzero(starts[1:] - ends[:-1] > _GAP_BYTES)
     first, last = starts[np.append(0, apart + 1)], ends[np.append(apart, len(ends) - 1)]
     first -= first % mmap.PAGESIZE
-    for start, end in zip(first.tolist(), np.minimum(last, len(window)).tolist(), strict=True):
-        if 0 <= start < end:
-            window.madvise(mmap.MADV_WILLNEED, start, end - start)
+    pieces = [
+        (start, end - start) for start, end in zip(first.tolist(), last.tolist(), strict=True) if 0 <= start < end
+    ]
+    for start, size in pieces:
+        window.madvise(mmap.MADV_WILLNEED, start, size)
+    for start, size in pieces:
+        try:
+            window.madvise(_MADV_POPULATE_READ, start, size)
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # which an older system says: it does not know this advice
+                raise _unreadable(start, error) from None
 
 
 def in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
@@ -217,6 +263,12 @@ def in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, thr
         finally:
             for waiting in ahead:
                 waiting.cancel()
+
+
+def no_room(error: Exception) -> str:
+    """Say that there is no room for a copy of a log, where that is the error; else nothing."""
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return "no room for a copy here; TMPDIR names a place that has some" if full else ""
 
 
 def is_bomb(compressed_bytes: int, size: int) -> bool:

@@ -27,7 +27,6 @@ from tcpipe.formats.log_part import (
     decompressed_prefix,
     gathered,
     in_order,
-    search_windows,
 )
 from tcpipe.formats.mcap_records import (
     CHUNK_CRC,
@@ -108,9 +107,9 @@ class McapPart:
         self._complete = False
         self._read_chunks: set[int] = set()
         self._without_crc: set[int] = set()
-        if self._bytes.peek(0, len(MAGIC)) != MAGIC:
-            self._note(0, "the file's first bytes are not those of an MCAP file", messages_lost=0)
         try:
+            if self._bytes.peek(0, len(MAGIC)) != MAGIC:
+                self._note(0, "the file's first bytes are not those of an MCAP file", messages_lost=0)
             self._contents = self._summary()
         except DamageError as error:
             if str(error):
@@ -345,7 +344,12 @@ class McapPart:
         run = _MessageRun()
         closed = False
         while position + RECORD_HEAD <= end:
-            head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
+            try:
+                head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
+            except DamageError as error:
+                run.finish(contents.chunks)
+                position = self._stepped_over(contents, position, end, error)
+                continue
             opcode, length = head[0], int.from_bytes(head[1:9], "little")
             after = position + RECORD_HEAD + length
             if opcode in (OP_FOOTER, OP_DATA_END) and length <= FOOTER:
@@ -361,12 +365,17 @@ class McapPart:
             try:
                 self._take_record(contents, opcode, position, after, end)
             except DamageError as error:
-                after = self._next_chunk(position + 1, end)
-                self._note(position, str(error), bytes_lost=after - position)
-                self._distrust_last_index(contents)
+                after = self._stepped_over(contents, position, end, error)
             position = after
         run.finish(contents.chunks)
         return closed
+
+    def _stepped_over(self, contents: _Contents, position: int, end: int, error: DamageError) -> int:
+        """Note what cannot be at ``position``; return where the next chunk begins."""
+        after = self._next_chunk(position + 1, end)
+        self._note(position, str(error), bytes_lost=after - position)
+        self._distrust_last_index(contents)
+        return after
 
     def _take_record(self, contents: _Contents, opcode: int, position: int, after: int, end: int) -> None:
         if opcode == OP_CHUNK:
@@ -408,8 +417,7 @@ class McapPart:
 
     def _next_chunk(self, start: int, end: int) -> int:
         """Return where the next plausible chunk begins: its lengths agree with one another and with the file's."""
-        for block_start, size, read_bytes in search_windows(start, end, RECORD_HEAD + CHUNK_HEAD + 4):
-            block = self._bytes.read(block_start, read_bytes)
+        for block_start, size, block in self._bytes.windows(start, end, RECORD_HEAD + CHUNK_HEAD + 4):
             for candidate in _possible_chunks(block, size):
                 length = int.from_bytes(block[candidate + 1 : candidate + RECORD_HEAD], "little")
                 try:
@@ -431,7 +439,11 @@ class McapPart:
             if chunk.index is None or not chunk.index.keys() <= contents.channels.keys():
                 self._declare_and_count(chunk)
             for channel, offset in (chunk.index or {}).items():
-                entries = self._index_entries(offset, channel)
+                try:
+                    entries = self._index_entries(offset, channel)
+                except DamageError as error:
+                    self._note(offset, str(error))
+                    continue
                 if len(entries):
                     self._tally(channel, len(entries), int(entries[:, 0].min()), int(entries[:, 0].max()))
         for channel in sorted(self._tallies.keys() - contents.channels.keys()):

@@ -5,7 +5,6 @@ The home of obstore. Credentials, region and endpoint come from the environment,
 
 from __future__ import annotations
 
-import errno
 import os
 import re
 import tempfile
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from tcpipe.errors import LogError
+from tcpipe.formats.log_part import no_room
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore
@@ -28,7 +28,6 @@ _PIECE_BYTES = 1 << 24
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
 _RETRIES: dict[str, Any] = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _UNKNOWN = ("169.254.169.254", "Account must be specified")
 """What is said where no credentials are set: a cloud machine's own are asked for, in vain."""
 _CREDENTIALS = {
@@ -124,8 +123,7 @@ def _told(url: str) -> Iterator[None]:
     except (BaseError, OSError, ValueError) as error:
         reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
         reason = reason.partition(": <?xml")[0]
-        if isinstance(error, OSError) and error.errno in _NO_ROOM:
-            reason = "no room for a copy here; TMPDIR names a place that has some"
+        reason = no_room(error) or reason
         scheme = url.partition("://")[0].lower()
         denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in reason for of in _UNKNOWN)
         if denied and scheme in _CREDENTIALS:

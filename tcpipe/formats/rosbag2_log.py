@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_part import MAX_CHUNK_BYTES, Channel, LogPart, MessageBlock, is_bomb
+from tcpipe.formats.log_part import MAX_CHUNK_BYTES, Channel, LogPart, MessageBlock, is_bomb, no_room
 from tcpipe.logs.topics import Damage
 
 METADATA = "metadata.yaml"
@@ -100,19 +101,23 @@ def decompressed_file(path: Path, directory: Path) -> Path:
     """Decompress a zstd file into ``directory`` and return its copy; of a cut one, as much as can be had."""
     copy = Path(directory, path.name.removesuffix(".zstd"))
     size, written = path.stat().st_size, 0
-    with copy.open("wb") as target:
-        try:
-            with pa.input_stream(str(path), compression="zstd") as stream:
-                while block := stream.read(_COPY_BYTES):
-                    target.write(block)
-                    written += len(block)
-                    if is_bomb(size, written):
-                        raise LogError(
-                            f"{path}: {size} bytes hold more than {written}; it is taken for a bomb, not a log"
-                        )
-        except OSError:  # cut or damaged: what follows reads what there is, and says so
-            pass
+    try:
+        with copy.open("wb") as target:
+            for block in _decompressed_blocks(path):
+                target.write(block)
+                written += len(block)
+                if is_bomb(size, written):
+                    raise LogError(f"{path}: {size} bytes hold more than {written}; it is taken for a bomb, not a log")
+    except OSError as error:
+        raise LogError(f"{path}: it cannot be decompressed into a copy ({no_room(error) or error.strerror})") from None
     return copy
+
+
+def _decompressed_blocks(path: Path) -> Iterator[bytes]:
+    """Yield what a zstd file holds; where it is cut or damaged, or the disk fails, it ends: what follows sees that."""
+    with suppress(OSError), pa.input_stream(str(path), compression="zstd") as stream:
+        while block := stream.read(_COPY_BYTES):
+            yield block
 
 
 class MessageDecompressing:
@@ -194,7 +199,7 @@ def _bag_information(path: Path) -> dict[str, Any] | None:
     try:
         document = YAML(typ="safe").load(path.read_text(errors="replace"))
         information = document["rosbag2_bagfile_information"]
-    except (YAMLError, KeyError, TypeError, ValueError, FileNotFoundError, IsADirectoryError, RecursionError):
+    except (YAMLError, KeyError, TypeError, ValueError, OSError, RecursionError):
         return None
     return information if isinstance(information, dict) else None
 

@@ -10,14 +10,14 @@ import mmap
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_part import Channel, Int64Array, MessageBlock, in_order, read_only
+from tcpipe.formats.log_part import Channel, DamageError, Int64Array, MessageBlock, in_order, load_only, no_room
 from tcpipe.formats.sqlite_pages import MAGIC, PageReader, Rows, UnusualError
 from tcpipe.logs.topics import Damage, normalized_type_name
 
@@ -28,7 +28,7 @@ _MAPPED_BYTES = 1 << 26
 _KEPT_ROWS = 1 << 18
 """Where the rows of a file lie is found once, and kept for its reading, if they are no more than these (56 bytes each)."""
 _SPILLED_BYTES = 1 << 24
-"""Messages larger than a page are copied together in pieces of about this size."""
+"""Messages larger than a page are copied together up to about this size."""
 _FILL = b"\xd5\x7e\xc3\x99"
 """Pages that a cut file lacks are filled with this: as a page it is invalid, so SQLite stops there; as the end of a long message it
 is recognised."""
@@ -61,6 +61,12 @@ class SqlitePart:
         except LogError:
             self.close()
             raise
+        except OSError as error:
+            self.close()
+            why = no_room(error) or error.strerror
+            raise LogError(
+                f"{path}: it cannot be read, or copied to be read ({why}); nothing can be had from it"
+            ) from None
         except _BROKEN as error:
             self.close()
             raise LogError(
@@ -89,15 +95,15 @@ class SqlitePart:
         read_until = _BELOW
         if self._table:
             try:
-                for rows in self._table.rows(threads=threads):
-                    yield from self._table.blocks(rows, topics)
-                    read_until = int(rows.ids[-1]) if len(rows.ids) else read_until
+                for last, found in self._table.blocks(topics, threads=threads):
+                    yield from found
+                    read_until = last
             except UnusualError:
                 self._table = None
             else:
                 return
-        for found in self._rows(topics, read_until):
-            yield from _blocks(found)
+        for rows in self._rows(topics, read_until):
+            yield from _blocks(rows)
 
     def _open(self, path: Path) -> sqlite3.Connection:
         """Open without locking; a cut file, or one with an unmerged journal, through a copy."""
@@ -200,15 +206,22 @@ class SqlitePart:
     def _reachable(self, query: str, low: int = _BELOW) -> Iterator[list[_Row]]:
         """Yield a query's rows by ascending id; past a broken page, upward to it and downward to it."""
         high = _ABOVE
-        for rows in self._until_broken(f"{query} AND id > ? AND id < ? ORDER BY id ASC", low, high):
+        between = f"{query} AND id > ? AND id < ? ORDER BY id"
+        for rows in self._until_broken(f"{between} ASC", low, high):
             low = rows[-1][0]
             yield rows
         if not self._broken:
             return
         broken, above = self._broken, []
-        for rows in self._until_broken(f"{query} AND id > ? AND id < ? ORDER BY id DESC", low, high):
-            high = rows[-1][0]
-            above.append(rows[::-1])
+        for rows in self._until_broken(
+            f"{between} ASC LIMIT 1", low, high
+        ):  # with an error sqlite3 drops the row before it
+            low = rows[-1][0]
+            yield rows
+        for limit in ("", " LIMIT 1"):
+            for rows in self._until_broken(f"{between} DESC{limit}", low, high):
+                high = rows[-1][0]
+                above.append(rows[::-1])
         start = "the beginning" if low == _BELOW else f"message {low}"
         span = f"between {start} and {'the end' if high == _ABOVE else f'message {high}'}"
         self._note(f"messages {span} cannot be read ({broken})")
@@ -259,7 +272,7 @@ class _MessageTable:
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self._map.madvise(mmap.MADV_RANDOM)
         self._data = memoryview(self._map)
-        self._pages = PageReader(self._data)
+        self._pages = PageReader(self._data, _loading(self._map))
         self._leaves = self._pages.leaves(root)
         self._columns = len(columns)
         self._kept: list[Rows] | None = None
@@ -269,7 +282,9 @@ class _MessageTable:
     def rows(self, *, threads: int = 1) -> Iterator[Rows]:
         """Yield all rows, some thousand at a time; `UnusualError` ends it."""
         if self._kept is not None:
-            yield from self._kept
+            for leaves, rows in zip(self._leaves, self._kept, strict=True):
+                self._pages.load(leaves)
+                yield rows
             return
         last, touched = _BELOW, 0
         for rows in in_order(self._rows, self._leaves, threads=threads):
@@ -284,8 +299,7 @@ class _MessageTable:
                 touched = 0
 
     def _rows(self, leaves: Int64Array) -> Rows:
-        starts = np.sort(leaves - 1) * self._pages.page_bytes  # messages larger than a page lie between the leaves
-        read_only(self._map, starts, starts + self._pages.page_bytes)
+        self._pages.load(leaves)  # and not what lies between them: messages larger than a page
         return self._pages.rows(leaves, self._columns, self._integers)
 
     def spans(self) -> dict[int, tuple[int, int, int]]:
@@ -305,7 +319,17 @@ class _MessageTable:
         self._kept = found if count_all <= _KEPT_ROWS else None
         return spans
 
-    def blocks(self, rows: Rows, topics: list[int]) -> Iterator[MessageBlock]:
+    def blocks(self, topics: list[int], *, threads: int = 1) -> Iterator[tuple[int, list[MessageBlock]]]:
+        """Yield the messages of the topics, some rows at a time, and up to which id these go; `UnusualError` ends it."""
+        for rows in self.rows(threads=threads):
+            copied = np.where((rows.overflow > 0) & np.isin(rows.integers[0], topics), rows.lengths, 0)
+            bounds = np.flatnonzero(np.diff(np.cumsum(copied) // _SPILLED_BYTES)) + 1
+            for first, end in itertools.pairwise([0, *bounds.tolist(), len(copied)]):
+                if first < end:
+                    some = rows.chosen(np.arange(first, end)) if len(bounds) else rows
+                    yield int(some.ids[-1]), list(self._blocks(some, topics))
+
+    def _blocks(self, rows: Rows, topics: list[int]) -> Iterator[MessageBlock]:
         """Yield the messages of the topics: where they lie whole in the file, from there, else copied together."""
         for topic in topics:
             of = rows.integers[0] == topic
@@ -313,9 +337,8 @@ class _MessageTable:
             if whole.any():
                 yield self._block(rows.chosen(np.flatnonzero(whole)), self._data, rows.offsets[whole])
             spilled = np.flatnonzero(of & ~whole)
-            parts = np.cumsum(rows.lengths[spilled]) // _SPILLED_BYTES
-            for part in np.unique(parts).tolist():
-                chosen = rows.chosen(spilled[parts == part])
+            if len(spilled):
+                chosen = rows.chosen(spilled)
                 yield self._block(chosen, *self._pages.blobs(chosen))
 
     def close(self) -> None:
@@ -326,6 +349,18 @@ class _MessageTable:
     def _block(rows: Rows, buffer: memoryview, offsets: Int64Array) -> MessageBlock:
         topic, log_time_ns, publish_time_ns = rows.integers
         return MessageBlock(int(topic[0]), buffer, offsets, rows.lengths, log_time_ns, publish_time_ns, rows.ids, None)
+
+
+def _loading(window: mmap.mmap) -> Callable[[Int64Array, Int64Array], None]:
+    """Return what loads pieces of a mapped file; where the disk does not give them, SQLite may say what is lost."""
+
+    def load(starts: Int64Array, ends: Int64Array) -> None:
+        try:
+            load_only(window, starts, ends)
+        except DamageError:
+            raise UnusualError from None
+
+    return load
 
 
 def _message_table(path: Path, database: sqlite3.Connection) -> _MessageTable | None:

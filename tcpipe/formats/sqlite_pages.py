@@ -8,6 +8,7 @@ leaves the file to SQLite.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,11 +56,25 @@ class Rows:
         return Rows(self.ids[which], integers, *rest)
 
 
-class PageReader:
-    """One file, as pages."""
+def _is_loaded(starts: Int64Array, ends: Int64Array) -> None:
+    """Bytes in memory need not be loaded."""
 
-    def __init__(self, data: memoryview) -> None:
+
+class PageReader:
+    """One file, as pages.
+
+    Parameters
+    ----------
+    data
+        The file.
+    load
+        Called before any of it is looked at, with where the pieces start, rising, and end in it, shape (N,); may raise `UnusualError`.
+    """
+
+    def __init__(self, data: memoryview, load: Callable[[Int64Array, Int64Array], None] = _is_loaded) -> None:
         self._data = data
+        self._load = load
+        load(np.array([0]), np.array([_HEADER_BYTES]))
         head = bytes(data[:_HEADER_BYTES])
         page_bytes = int.from_bytes(head[16:18], "big")
         self.page_bytes = 65536 if page_bytes == 1 else page_bytes
@@ -91,8 +106,10 @@ class PageReader:
             self._check(level)
             if (level == 1).any():
                 break
+            self.load(level[:1])
             if self._pages[level[0] - 1, 0] == _LEAF:  # all leaves lie equally deep
                 return [level[start : start + _LEAVES_AT_ONCE] for start in range(0, len(level), _LEAVES_AT_ONCE)]
+            self.load(level)
             counts, cells = self._cells(level, _INTERIOR, _INTERIOR_HEAD)
             children = np.empty(len(cells) + len(level), np.int64)
             last = np.cumsum(counts + 1) - 1
@@ -103,8 +120,13 @@ class PageReader:
             level = children
         raise UnusualError
 
+    def load(self, pages: Int64Array) -> None:
+        """Have pages loaded, by their numbers; `UnusualError` where one cannot be."""
+        starts = np.sort(pages - 1) * self.page_bytes
+        self._load(starts, starts + self.page_bytes)
+
     def rows(self, leaves: Int64Array, columns: int, integers: tuple[int, ...]) -> Rows:
-        """Return the rows on leaf pages.
+        """Return the rows on leaf pages, which are loaded.
 
         Parameters
         ----------
@@ -152,8 +174,12 @@ class PageReader:
         windows: NDArray[np.void] = np.ndarray((max(len(buffer) - room + 1, 0),), f"V{room}", buffer, 0, (1,))
         going = rows.overflow > 0
         pages, left, to = rows.overflow[going], (rows.lengths - rows.local)[going], (starts + rows.local)[going]
+        self._load_chains(pages, -(-left // room))
+        expected = pages
         while len(pages):
             self._check(pages)
+            if (pages != expected).any():
+                self.load(pages[pages != expected])
             full = left >= room
             windows[to[full]] = np.ascontiguousarray(self._pages[pages[full] - 1, 4 : self._usable]).view(f"V{room}")[
                 :, 0
@@ -161,12 +187,20 @@ class PageReader:
             for page, size, at in zip(pages[~full].tolist(), left[~full].tolist(), to[~full].tolist(), strict=True):
                 buffer[at : at + size] = self._pages[page - 1, 4 : 4 + size]
             going = left > room
+            expected = pages[going] + 1
             pages, left, to = (
                 _big_endian(self._data, (pages[going] - 1) * self.page_bytes),
                 left[going] - room,
                 to[going] + room,
             )
         return buffer.data, starts
+
+    def _load_chains(self, pages: Int64Array, counts: Int64Array) -> None:
+        """Have the overflow pages loaded that begin chains, and those behind them, where the rest of a chain lies as a rule."""
+        self._check(pages)
+        order = np.argsort(pages)
+        starts = (pages[order] - 1) * self.page_bytes
+        self._load(starts, starts + counts[order] * self.page_bytes)
 
     def _cells(self, pages: Int64Array, kind: int, head_bytes: int) -> tuple[Int64Array, Int64Array]:
         """Return the number of cells of each page of a kind, and the file offset of each cell."""
@@ -189,6 +223,10 @@ class PageReader:
     def _heads(self, cells: Int64Array) -> NDArray[np.uint8]:
         """Return the first bytes of each cell, shape (N, _CELL_HEAD); at the file's very end zeros follow."""
         last = len(self._octets) - _CELL_HEAD
+        following = (cells + _CELL_HEAD - 1) // self.page_bytes
+        crossing = (following > cells // self.page_bytes) & (cells <= last)
+        if crossing.any():
+            self.load(np.unique(following[crossing]) + 1)
         windows: NDArray[np.void] = np.ndarray((last + 1,), f"V{_CELL_HEAD}", self._data, 0, (1,))
         heads = windows[np.minimum(cells, last)].view(np.uint8).reshape(-1, _CELL_HEAD)
         for row in np.flatnonzero(cells > last).tolist():
