@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import isfinite, nan
 from pathlib import Path
 from typing import Literal
 
@@ -15,9 +16,9 @@ def _lonlat(context: click.Context, parameter: click.Parameter, value: str) -> t
     try:
         lon, lat = (float(part) for part in value.split(","))
     except ValueError:
-        raise click.BadParameter(
-            f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", ctx=context, param=parameter
-        ) from None
+        lon = lat = nan
+    if not (isfinite(lon) and isfinite(lat)):
+        raise click.BadParameter(f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", ctx=context, param=parameter)
     return lon, lat
 
 

@@ -71,6 +71,8 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
     assert costed["duration_s"] == pytest.approx(found["properties"]["duration_s"], rel=1e-4)
     assert costed["energy_joule"] == pytest.approx(said["plans"]["time"]["energy_joule"], rel=1e-4)
     assert "nothing to do" in _run(*plan, *outputs, cwd=place)
+    (place / "costs" / "energy.pgm").write_bytes(b"")
+    assert "energy.pgm: its sha256 is" in _run("verify", "costs", cwd=place, code=1)
 
 
 @pytest.mark.parametrize(
@@ -79,7 +81,7 @@ def test_a_plan_over_a_cost_map_costs_what_predict_path_says_of_it(place: Path):
         (("predict-path", "none", "--path", "path.geojson"), 1, "no such model"),
         (("predict-path", "model", "--path", "none.geojson"), 1, "cannot be read"),
         (("predict-path", "model", "--path", "path.geojson", "--out", "pieces.txt"), 2, "ends in .csv"),
-        (("plan-path", "model", "--from", "15.0", "--to", _TO), 2, "wanted LON,LAT"),
+        (("plan-path", "model", "--from", "15.0,nan", "--to", _TO), 2, "wanted LON,LAT"),
         (("plan-path", "model", "--from", _FROM, "--to", "200,46.9"), 1, "no lon, lat"),
         (("cost-map", "model", "--map", "other"), 1, "no map 'other'"),
         (("cost-map", "model", "--step", "0"), 2, "--step"),
