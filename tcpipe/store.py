@@ -108,6 +108,15 @@ class Store:
         found = list(self._finished(self.runs_path.glob("*/*/manifest.json")))
         return [run for run in found if robot is None or run.robot == robot]
 
+    def outdated(self) -> dict[str, str]:
+        """Return the runs that are finished in other data-model versions only, and in which."""
+        versions: dict[str, set[str]] = {}
+        for run in self._whole(self.runs_path.glob("*/*/manifest.json")):
+            versions.setdefault(run.run_id, set()).add(str(run.manifest.get("data_model_version")))
+        return {
+            run_id: ", ".join(sorted(found)) for run_id, found in versions.items() if DATA_MODEL_VERSION not in found
+        }
+
     def recipes_of(self, run_id: str) -> list[RunDirectory]:
         """Return the finished ingestions of one run."""
         return list(self._finished((self.runs_path / run_id).glob("*/manifest.json")))
@@ -117,12 +126,13 @@ class Store:
         return sorted(path.name for path in self.runs_path.glob("*") if path.is_dir())
 
     def _finished(self, manifests: Iterator[Path]) -> Iterator[RunDirectory]:
+        return (run for run in self._whole(manifests) if run.manifest.get("data_model_version") == DATA_MODEL_VERSION)
+
+    def _whole(self, manifests: Iterator[Path]) -> Iterator[RunDirectory]:
         for path in sorted(manifests):
             whole = all((path.parent / name).is_file() for name in _RUN_FILES)
             if whole and not path.parent.name.startswith(TEMPORARY_PREFIX):
-                manifest = read_json(path)
-                if manifest.get("data_model_version") == DATA_MODEL_VERSION:
-                    yield RunDirectory(path.parent.parent.name, path.parent.name, path.parent, manifest)
+                yield RunDirectory(path.parent.parent.name, path.parent.name, path.parent, read_json(path))
 
     @contextmanager
     def claimed_run(self, stem: str, sha256: str) -> Iterator[str]:
@@ -250,13 +260,23 @@ def is_store(path: Path) -> bool:
 
 
 def run_at(path: Path) -> tuple[Store, list[RunDirectory]] | None:
-    """Return the store and the finished ingestions of a run's directory, or the one of a recipe's; None for any other path."""
-    path = path.resolve()
-    for run_path in (path, path.parent):
+    """Return the store and the finished ingestions of a run's directory, or the one of a recipe's; None for any other path.
+
+    Raises
+    ------
+    StoreError
+        It is a run's, but holds no finished ingestion of this data-model version.
+    """
+    real = path.resolve()
+    for run_path in (real, real.parent):
         if run_path.parent.name == "runs" and (run_path / "run.json").is_file():
             store = Store(run_path.parent.parent)
-            runs = [run for run in store.recipes_of(run_path.name) if path in (run_path, run.path)]
-            return (store, runs) if runs else None
+            runs = [run for run in store.recipes_of(run_path.name) if real in (run_path, run.path)]
+            if not runs:
+                raise StoreError(
+                    f"{path}: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again"
+                )
+            return store, runs
     return None
 
 

@@ -165,6 +165,8 @@ def _print_store(found: Mapping[str, Any]) -> None:
         for run in found["runs"]
     ]
     _print_table(["run", "recipe", "robot", "segments", "metres", "damage"], rows)
+    for run_id, version in found["outdated"].items():
+        say(f"of another data model ({version}): {run_id}; ingest its log again")
     for run_id in found["unfinished"]:
         say(f"not finished: {run_id}; ingest its log again")
 

@@ -133,7 +133,13 @@ def choose_runs(
     store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]
 ) -> tuple[list[RunDirectory], list[str]]:
     """Return the runs to pool, those that carry all of the tags, and warnings; two robots are never pooled unasked."""
-    every = store.runs()
+    every, outdated = store.runs(), store.outdated()
+    if not every and outdated:
+        versions = ", ".join(sorted(set(outdated.values())))
+        raise DatasetError(
+            f"{store.root}: {len(outdated)} runs in the store, all of data model {versions}, wanted {DATA_MODEL_VERSION}; "
+            "ingest their logs again"
+        )
     if not every:
         raise DatasetError(f"{store.root}: no runs in the store; ingest one: tcpipe ingest LOG")
     key = ingest_key(recipe)
@@ -154,6 +160,10 @@ def choose_runs(
         {run.run_id for run in every} - {run.run_id for run in every if run.manifest["ingest_key"] == key}
     )
     warnings = [f"run {run_id}: ingested with another recipe only; left out" for run_id in left_out]
+    warnings += [
+        f"run {run_id}: of data model {version}, not {DATA_MODEL_VERSION}; left out until its log is ingested again"
+        for run_id, version in outdated.items()
+    ]
     return chosen, warnings
 
 

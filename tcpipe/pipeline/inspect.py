@@ -122,7 +122,7 @@ def _run(path: Path, store: Store, runs: list[RunDirectory]) -> dict[str, Any]:
 
 
 def _store(store: Store) -> dict[str, Any]:
-    runs = store.runs()
+    runs, outdated = store.runs(), store.outdated()
     return {
         "kind": "store",
         "path": str(store.root),
@@ -131,7 +131,8 @@ def _store(store: Store) -> dict[str, Any]:
             {**_line(run), "warnings": len(run.manifest["warnings"]), "damage": len(run.manifest["damage"])}
             for run in runs
         ],
-        "unfinished": sorted(set(store.run_ids()) - {run.run_id for run in runs}),
+        "outdated": outdated,
+        "unfinished": sorted(set(store.run_ids()) - outdated.keys() - {run.run_id for run in runs}),
     }
 
 

@@ -1,12 +1,16 @@
 """A dataset of the runs that carry given tags."""
 
+import json
+
 import numpy as np
 import pytest
 from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, StoreError
 from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.report import report
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 
@@ -42,3 +46,31 @@ def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path)
     assert "no run is tagged weather=snow" in line
     assert "driver=Eva, weather=dry, weather=wet" in line
     assert not (tmp_path / "out").exists()
+
+
+def make_outdated(store, *run_ids):
+    """Have runs look as if an earlier version of tcpipe had made them."""
+    for run_id in run_ids:
+        for path in store.root.glob(f"runs/{run_id}/*/manifest.json"):
+            path.write_text(json.dumps({**json.loads(path.read_text()), "data_model_version": "0.9"}))
+
+
+def test_runs_of_another_data_model_are_named(store, tmp_path):
+    make_outdated(store, "a")
+    assert runs(store, tmp_path) == ["b", "c"]
+    (line,) = [line for line in open_dataset(tmp_path / "out").card["warnings"] if line.startswith("run a")]
+    assert line == "run a: of data model 0.9, not 1.0; left out until its log is ingested again"
+    found = inspect(store.root, recipe=Recipe())
+    assert (found["outdated"], found["unfinished"]) == ({"a": "0.9"}, [])
+    with pytest.raises(
+        StoreError, match=r"runs/a: holds no finished ingestion of data model 1\.0; ingest its log again"
+    ):
+        report(store.root / "runs" / "a")
+
+
+def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
+    make_outdated(store, "a", "b", "c")
+    with pytest.raises(
+        DatasetError, match=r"3 runs in the store, all of data model 0\.9, wanted 1\.0; ingest their logs"
+    ):
+        runs(store, tmp_path)
