@@ -6,7 +6,7 @@ import hashlib
 import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
@@ -41,6 +41,7 @@ BATCH_BYTES = 1 << 25
 
 _WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
 _HASH_BYTES = 1 << 20
+_FILE_SYSTEMS_OWN = ("lost+found",)
 _KNOWN_MAGIC = (
     (b"PK\x03\x04", "a zip archive"),
     (b"\x1f\x8b", "a gzip file"),
@@ -94,6 +95,8 @@ def belongs_to_a_log(name: str) -> bool:
 def find_logs(path: Path) -> list[Path]:
     """Return the logs at or below a path, in a fixed order; a ROS 2 bag directory is one log, hidden files are skipped.
 
+    A directory that cannot be read stands in the list itself: whoever opens it says why.
+
     Raises
     ------
     LogError
@@ -104,10 +107,15 @@ def find_logs(path: Path) -> list[Path]:
         raise LogError(f"{path}: there is no such file or directory")
     if not path.is_dir():
         return [path]
-    found = list(_logs_below(path, set()))
+    found = logs_below(path)
     if not found:
         raise LogError(f"{path}: no log in this directory or below it; {_WANTED}")
     return found
+
+
+def logs_below(directory: Path) -> list[Path]:
+    """Return the logs in a directory as `find_logs` does; none where there is none."""
+    return list(_logs_below(directory, set()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -484,19 +492,29 @@ def _logs_below(directory: Path, seen: set[Path]) -> Iterable[Path]:
         return
     seen.add(real)
     try:
-        entries = sorted(directory.iterdir(), key=lambda entry: entry.name)
-    except OSError as error:
-        raise LogError(f"{directory}: it cannot be read ({error.strerror})") from None
-    if is_one_bag(directory):
+        entries = [(entry, _is_directory(entry)) for entry in sorted(directory.iterdir(), key=lambda entry: entry.name)]
+        one_bag = is_one_bag(directory)
+    except OSError:
         yield directory
-        entries = [entry for entry in entries if entry.is_dir() or not entry.name.endswith(STORAGE_SUFFIXES)]
-    for entry in entries:
-        if entry.name.startswith((".", "~")):
+        return
+    if one_bag:
+        yield directory
+    for entry, is_directory in entries:
+        if entry.name.startswith((".", "~")) or entry.name in _FILE_SYSTEMS_OWN:
             continue
-        if entry.is_dir():
+        if is_directory:
             yield from _logs_below(entry, seen)
-        elif entry.name.lower().endswith(LOG_SUFFIXES) and (entry.is_file() or entry.is_symlink()):
+        elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
+            continue
+        elif entry.name.lower().endswith(LOG_SUFFIXES) and (entry.is_symlink() or entry.is_file()):
             yield entry
+
+
+def _is_directory(path: Path) -> bool:
+    """Return whether a path is, or leads to, a directory that may be looked at."""
+    with suppress(OSError):
+        return path.is_dir()
+    return False
 
 
 def _listed(topics: Iterable[str]) -> str:

@@ -23,6 +23,8 @@ STORAGE_SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 _COPY_BYTES = 1 << 22
+_PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")
+"""What the names of the files of a bag end with, and differ in."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +42,12 @@ def rosbag2_files(directory: Path) -> Rosbag2Files:
     Raises
     ------
     LogError
-        The directory holds no ROS 2 bag.
+        The directory holds no ROS 2 bag, or cannot be read.
     """
-    present = storage_files(directory)
+    try:
+        present = storage_files(directory)
+    except OSError as error:
+        raise LogError(f"{directory}: it cannot be read ({error.strerror})") from None
     information = _bag_information(directory / METADATA)
     if information is None:
         kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
@@ -50,6 +55,12 @@ def rosbag2_files(directory: Path) -> Rosbag2Files:
         if len(kinds) != 1:
             found = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
             raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {what}, and {found}")
+        if len({_PART.sub("", path.name) for path in present}) > 1:
+            names = ", ".join(path.name for path in present)
+            raise LogError(
+                f"{directory}: not a ROS 2 bag: {METADATA} {what}, and its files are not named as parts of one ({names}); "
+                "give one of them"
+            )
         why = f"{METADATA} {what}; files are read in the order of their names"
         return Rosbag2Files(present, (Damage(directory.name, why, messages_lost=0),))
     named = information.get("relative_file_paths")

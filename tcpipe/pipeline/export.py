@@ -19,6 +19,7 @@ from tcpipe.formats.log_file import Log, open_log
 from tcpipe.formats.parquet import parquet_rows, storable
 from tcpipe.logs.power_sources import bare_unit
 from tcpipe.pipeline.log_sources import definitions_key
+from tcpipe.store import is_store
 from tcpipe.tables.levels import with_metadata
 
 INDEX = "export.json"
@@ -76,9 +77,11 @@ def export(
     Raises
     ------
     LogError
-        The log cannot be read, none of the topics can, one is not in it (all missing topics at once), or a file belongs to another log.
+        The log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log, or
+        ``out`` is a dataset, run, map or store.
 
     """
+    _refuse_what_is_ours(out)
     with open_log(log_path, message_definitions=message_definitions) as log:
         wanted = _wanted(log, log_path, topics)
         made_from = _identity(log, log_path, message_definitions)
@@ -126,6 +129,14 @@ def _index(out: Path) -> dict[str, Any]:
     entries = found.get("topics")
     known = entries if isinstance(entries, dict) else {}
     return {"topics": {name: of for name, of in known.items() if isinstance(of, dict) and of.keys() == _ENTRY}}
+
+
+def _refuse_what_is_ours(out: Path) -> None:
+    """Refuse to write between the files of a dataset, run, map or store: what is counted and sealed there."""
+    signs = {"dataset": "dataset.json", "run": "run.json", "run's recipe": "manifest.json", "map": "zarr.json"}
+    kind = "store" if is_store(out) else next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
+    if kind:
+        raise LogError(f"{out}: is a {kind}; give another directory for the topics")
 
 
 def _refuse_others_files(index: Mapping[str, Any], made_from: Mapping[str, Any], paths: Mapping[str, Path]) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 
 from tcpipe.errors import LogError, TcpipeError
 from tcpipe.formats.json_files import plain, read_json
-from tcpipe.formats.log_file import belongs_to_a_log, find_logs, open_log
+from tcpipe.formats.log_file import belongs_to_a_log, logs_below, open_log
 from tcpipe.formats.object_storage import copied, is_url
 from tcpipe.pipeline.log_inspection import inspect_log
 from tcpipe.recipe import Recipe
@@ -59,7 +59,9 @@ def inspect(
 
 
 def _logs_at(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
-    logs = _logs(path)
+    logs = logs_below(path) if path.is_dir() else [path]
+    if not logs:
+        raise LogError(f"{path}: is no map, dataset, run or store, and holds no log")
     if len(logs) == 1:
         return _one(logs[0], recipe, **how)
     return {"kind": "logs", "path": str(path), "logs": [_one_of(entry, recipe, **how) for entry in logs]}
@@ -73,15 +75,6 @@ def _named(found: dict[str, Any], copy: str, url: str) -> dict[str, Any]:
     if "logs" in found:
         texts["logs"] = [_named(log, copy, url) for log in found["logs"]]
     return {**found, **texts}
-
-
-def _logs(path: Path) -> list[Path]:
-    try:
-        return find_logs(path)
-    except LogError:
-        if not path.is_dir():
-            raise
-        raise LogError(f"{path}: is no map, dataset, run or store, and holds no log") from None
 
 
 def _one(

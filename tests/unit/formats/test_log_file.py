@@ -1,7 +1,10 @@
 """Logs of every container, written by other people's writers, read back column by column."""
 
+import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 
 import pyarrow as pa
 import pytest
@@ -24,6 +27,8 @@ from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from tcpipe.errors import LogError
 from tcpipe.formats.log_file import find_logs, open_log
 
+UNPRIVILEGED = [] if os.geteuid() else ["setpriv", "--bounding-set=-dac_override,-dac_read_search"]
+"""What goes before a command that shall not read everything, though it is root's."""
 MCAP_OPTIONS = {
     "zstd": {},
     "lz4": {"compression": CompressionType.LZ4},
@@ -107,6 +112,35 @@ def test_split_files_are_one_log(tmp_path):
         table = log.table("/Imu")
     assert table["log_time_ns"].to_pylist() == [m.log_time_ns for m in messages if m.topic == "/Imu"]
     assert_same(table, expected_columns(messages, "/Imu"))
+
+
+@pytest.mark.skipif(bool(UNPRIVILEGED) and not shutil.which("setpriv"), reason="root reads everything without setpriv")
+def test_a_directory_that_cannot_be_read_costs_only_itself(tmp_path):
+    log = write_mcap(tmp_path / "a.mcap", random_messages(1, count=2, types=TYPES[:1]))
+    closed = tmp_path / "closed"
+    for path in (closed, tmp_path / "lost+found"):
+        path.mkdir()
+        write_mcap(path / "b.mcap", [])
+        path.chmod(0o000)
+    seen = "from pathlib import Path; from tcpipe.formats.log_file import find_logs, open_log"
+    script = f"{seen}; logs = find_logs(Path({str(tmp_path)!r})); print(*logs, sep='|'); open_log(logs[1])"
+    done = subprocess.run([*UNPRIVILEGED, sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    for path in (closed, tmp_path / "lost+found"):
+        path.chmod(0o700)
+    assert done.stdout.strip() == f"{log}|{closed}", done.stderr
+    assert f"LogError: {closed}: it cannot be read (Permission denied)" in done.stderr
+
+
+def test_a_folder_of_several_drives_is_no_bag(tmp_path):
+    for name in ("a_0.mcap", "a_1.mcap", "b.mcap"):
+        write_mcap(tmp_path / name, random_messages(1, count=2, types=TYPES[:1]))
+    with pytest.raises(
+        LogError, match=r"not named as parts of one \(a_0\.mcap, a_1\.mcap, b\.mcap\); give one of them"
+    ):
+        open_log(tmp_path)
+    (tmp_path / "b.mcap").unlink()
+    with open_log(tmp_path) as log:
+        assert [topic.message_count for topic in log.topics.values()] == [4]
 
 
 def test_same_messages_give_identical_tables_in_every_container(tmp_path):

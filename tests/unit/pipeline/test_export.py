@@ -60,6 +60,25 @@ def test_a_bare_number_is_told_by_the_name_of_its_topic(tmp_path):
     assert units == {"/battery/voltage": {b"unit": b"V"}, "/battery/current": {b"unit": b"A"}, "/depth": None}
 
 
+@pytest.mark.parametrize(
+    ("sign", "kind"),
+    [
+        ("dataset.json", "dataset"),
+        ("sources.json", "store"),
+        ("run.json", "run"),
+        ("manifest.json", "run's recipe"),
+        ("zarr.json", "map"),
+    ],
+)
+def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, sign, kind):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / sign).write_text("{}")
+    with pytest.raises(LogError, match=f"out: is a {kind}; give another directory"):
+        export(log, out)
+    assert [path.name for path in out.iterdir()] == [sign]
+
+
 def test_a_second_call_finds_everything_done(tmp_path, log):
     out = tmp_path / "out"
     first = export(log, out)
