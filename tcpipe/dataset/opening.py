@@ -12,8 +12,7 @@ from tcpipe.dataset.pixels import StoredPixels, View
 from tcpipe.dataset.split import SampleColumns, Split
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.formats.dataset_files import open_patches, read_current_card, read_samples, rows_in_files
 
 
 class Dataset(Mapping[str, Split]):
@@ -64,11 +63,7 @@ def open_dataset(path: str | Path) -> Dataset:
 
     """
     directory = Path(path)
-    card = read_card(directory)
-    if card["data_model_version"] != DATA_MODEL_VERSION:
-        raise DatasetError(
-            f"{directory}: written by data model {card['data_model_version']}, wanted {DATA_MODEL_VERSION}; build it again"
-        )
+    card = read_current_card(directory)
     split = read_samples(directory, ["split"]).column("split").to_numpy()
     if len(split) != card["samples"]:
         raise DatasetError(

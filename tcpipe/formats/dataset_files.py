@@ -26,6 +26,7 @@ from tcpipe.formats.parquet import column_names, read_row_group, read_table, wri
 from tcpipe.formats.shards import ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
 from tcpipe.splits.assignment import SPLITS
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.classes import NODATA_ID, ClassTable
 from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, LAYERS
 
@@ -240,8 +241,10 @@ def checksums_to_json(directory: Path) -> dict[str, dict[str, int | str]]:
 
 def read_card(directory: Path) -> dict[str, Any]:
     """Return the card of the dataset in ``directory``; `DatasetError` if there is none."""
-    if not directory.is_dir():
+    if not directory.exists():
         raise DatasetError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
+    if not directory.is_dir():
+        raise DatasetError(f"{directory}: is a file, wanted the directory of a dataset")
     if not (directory / CARD).is_file():
         raise DatasetError(f"{directory}: not a dataset: it has no {CARD}")
     try:
@@ -250,6 +253,16 @@ def read_card(directory: Path) -> dict[str, Any]:
         raise DatasetError(*error.problems) from None
     if card.get("kind") != KIND:
         raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {card.get('kind')!r})")
+    return card
+
+
+def read_current_card(directory: Path) -> dict[str, Any]:
+    """Return the card of a dataset of this data model; `DatasetError` if there is none, or it is of another."""
+    card = read_card(directory)
+    if card.get("data_model_version") != DATA_MODEL_VERSION:
+        raise DatasetError(
+            f"{directory}: written by data model {card.get('data_model_version')}, wanted {DATA_MODEL_VERSION}; build it again"
+        )
     return card
 
 

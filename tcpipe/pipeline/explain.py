@@ -19,7 +19,7 @@ from tcpipe.formats.dataset_files import (
     SAMPLES,
     file_checksum,
     open_patches,
-    read_card,
+    read_current_card,
     read_samples,
     rows_in_files,
     sample_columns,
@@ -83,11 +83,11 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     Raises
     ------
     DatasetError, StoreError
-        There is no such dataset, sample or store, or the store no longer holds the sample's run.
+        There is no such dataset, sample or store, the dataset is of another data model, or the store no longer holds the sample's run.
 
     """
     directory, house = Path(dataset), open_store(store)
-    card, sample = read_card(directory), _sample(directory, sample_id)
+    card, sample = read_current_card(directory), _sample(directory, sample_id)
     recipe = parse_recipe(card["recipe"], where=str(directory / "dataset.json"))
     run = _run(house, directory, card, sample)
     read_with = read_key(recipe, run.manifest["robot_requested"])

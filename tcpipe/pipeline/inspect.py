@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import LogError, TcpipeError
-from tcpipe.formats.json_files import plain, read_json
+from tcpipe.formats.json_files import plain
 from tcpipe.formats.log_file import belongs_to_a_log, logs_below, open_log
 from tcpipe.formats.object_storage import copied, is_url
 from tcpipe.pipeline.log_inspection import inspect_log
@@ -45,7 +45,9 @@ def inspect(
     if not path.exists():
         raise LogError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
-        return {**read_json(path / "dataset.json"), "kind": "dataset", "path": str(path)}
+        from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as below
+
+        return {**read_current_card(path), "kind": "dataset", "path": str(path)}
     if is_store(path):
         return _store(Store(path))
     found = run_at(path)

@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_card, read_samples, rows_in_files
+from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_current_card, read_samples, rows_in_files
 from tcpipe.report.balance import balance_sections
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import (
@@ -45,8 +45,8 @@ _COLUMNS = (
 
 
 def dataset_report(directory: Path) -> str:
-    """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none."""
-    card, samples = read_card(directory), read_samples(directory, _COLUMNS)
+    """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model."""
+    card, samples = read_current_card(directory), read_samples(directory, _COLUMNS)
     driven = sum(card["ledger_m"].values())
     splits = {split: card["splits"][split] for split in SPLIT_COLOURS}
     return render_page(

@@ -19,6 +19,8 @@ from tcpipe.formats.seals import broken_seal, sealed_page, write_checksums, writ
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.report.overview import quick_look, write_overview
@@ -263,6 +265,32 @@ def test_an_unknown_sample_and_an_unknown_run_are_said(made, copy):
     )
     with pytest.raises(DatasetError, match="is not in this store"):
         explain(sample, dataset=made / "zarr", store=store)
+
+
+ASK = {
+    "open": open_dataset,
+    "inspect": lambda path: inspect(path, recipe=Recipe()),
+    "report": report,
+    "explain": lambda path: explain("x", dataset=path, store=path.parent),
+}
+
+
+@pytest.mark.parametrize("ask", ASK)
+@pytest.mark.parametrize(
+    ("card", "said"),
+    [
+        (
+            {"kind": "tcpipe dataset", "data_model_version": "7.0"},
+            "d: written by data model 7.0, wanted 1.0; build it again",
+        ),
+        ({"kind": "shopping list"}, "dataset.json: not the card of a tcpipe dataset"),
+    ],
+)
+def test_a_dataset_of_another_version_is_told_so_by_whoever_reads_it(tmp_path, ask, card, said):
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "dataset.json").write_text(json.dumps(card))
+    with pytest.raises(DatasetError, match=said):
+        ASK[ask](tmp_path / "d")
 
 
 def test_two_formats_hold_the_same_samples(made):
