@@ -105,12 +105,15 @@ def export(
 
 def _wanted(log: Log, log_path: Path | str, topics: Sequence[str]) -> list[str]:
     """Return the topics asked for, each once, or all; a text that is no topic's name is taken for several with commas between."""
-    split = [part.strip() for text in topics for part in ([text] if text in log.topics else text.split(","))]
+    parts = (part.strip() for text in topics for part in ([text] if text in log.topics else text.split(",")))
+    split = list(dict.fromkeys(part for part in parts if part))
     missing = [name for name in split if name not in log.topics]
+    there = ", ".join(sorted(log.topics)) or "none"
     if missing:
-        there = ", ".join(sorted(log.topics)) or "none"
         raise LogError(*(f"{log_path}: topic {name} is not in this log; there are: {there}" for name in missing))
-    return list(dict.fromkeys(split)) if topics else sorted(log.topics)
+    if topics and not split:
+        raise LogError(f"{log_path}: no topic is named; there are: {there}")
+    return split or sorted(log.topics)
 
 
 def _identity(log: Log, log_path: Path | str, message_definitions: Path | None) -> dict[str, Any]:

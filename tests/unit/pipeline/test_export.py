@@ -79,6 +79,12 @@ def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, sign, 
     assert [path.name for path in out.iterdir()] == [sign]
 
 
+def test_commas_alone_name_no_topic(tmp_path, log):
+    with pytest.raises(LogError, match="no topic is named; there are: /BatteryState, /Imu, /Path"):
+        export(log, tmp_path / "out", topics=[", "])
+    assert [of.topic for of in export(log, tmp_path / "out", topics=["/Imu, ,/Imu,"]).topics] == ["/Imu"]
+
+
 def test_a_second_call_finds_everything_done(tmp_path, log):
     out = tmp_path / "out"
     first = export(log, out)
