@@ -11,6 +11,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import quote
 
@@ -92,15 +93,17 @@ class SqlitePart:
         topics = sorted(wanted & self.channels.keys())
         if not topics:
             return
-        read_until = _BELOW
+        read_until, lost = _BELOW, 0
         if self._table:
             try:
-                for last, found in self._table.blocks(topics, threads=threads):
+                for last, found, broken in self._table.blocks(topics, threads=threads):
                     yield from found
-                    read_until = last
+                    read_until, lost = last, lost + broken
             except UnusualError:
                 self._table = None
-            else:
+            if lost:
+                self._note("messages go on on pages that are broken", messages_lost=lost)
+            if self._table:
                 return
         for rows in self._rows(topics, read_until):
             yield from _blocks(rows)
@@ -319,27 +322,45 @@ class _MessageTable:
         self._kept = found if count_all <= _KEPT_ROWS else None
         return spans
 
-    def blocks(self, topics: list[int], *, threads: int = 1) -> Iterator[tuple[int, list[MessageBlock]]]:
-        """Yield the messages of the topics, some rows at a time, and up to which id these go; `UnusualError` ends it."""
+    def blocks(self, topics: list[int], *, threads: int = 1) -> Iterator[tuple[int, list[MessageBlock], int]]:
+        """Yield the messages of the topics, some rows at a time, up to which id these go, and how many of them are broken.
+
+        `UnusualError` ends it.
+        """
         for rows in self.rows(threads=threads):
             copied = np.where((rows.overflow > 0) & np.isin(rows.integers[0], topics), rows.lengths, 0)
             bounds = np.flatnonzero(np.diff(np.cumsum(copied) // _SPILLED_BYTES)) + 1
             for first, end in itertools.pairwise([0, *bounds.tolist(), len(copied)]):
                 if first < end:
                     some = rows.chosen(np.arange(first, end)) if len(bounds) else rows
-                    yield int(some.ids[-1]), list(self._blocks(some, topics))
+                    yield int(some.ids[-1]), *self._blocks(some, topics)
 
-    def _blocks(self, rows: Rows, topics: list[int]) -> Iterator[MessageBlock]:
-        """Yield the messages of the topics: where they lie whole in the file, from there, else copied together."""
+    def _blocks(self, rows: Rows, topics: list[int]) -> tuple[list[MessageBlock], int]:
+        """Return the messages of the topics, where they lie whole in the file, from there, else copied together; and the lost."""
+        found, lost = [], 0
         for topic in topics:
             of = rows.integers[0] == topic
             whole = of & (rows.overflow == 0)
             if whole.any():
-                yield self._block(rows.chosen(np.flatnonzero(whole)), self._data, rows.offsets[whole])
-            spilled = np.flatnonzero(of & ~whole)
-            if len(spilled):
-                chosen = rows.chosen(spilled)
-                yield self._block(chosen, *self._pages.blobs(chosen))
+                found.append(self._block(rows.chosen(np.flatnonzero(whole)), self._data, rows.offsets[whole]))
+            spilled = rows.chosen(np.flatnonzero(of & ~whole))
+            intact, buffer, offsets = self._copied(spilled)
+            lost += len(spilled.ids) - len(intact.ids)
+            if len(intact.ids):
+                found.append(self._block(intact, buffer, offsets))
+        return found, lost
+
+    def _copied(self, rows: Rows) -> tuple[Rows, memoryview, Int64Array]:
+        """Return the rows whose messages can be had, and what `PageReader.blobs` gives of these; where one cannot, each is tried."""
+        with suppress(UnusualError):
+            return rows, *self._pages.blobs(rows)
+        intact = []
+        for number in range(len(rows.ids)):
+            with suppress(UnusualError):
+                self._pages.blobs(rows.chosen(np.array([number])))
+                intact.append(number)
+        rows = rows.chosen(np.array(intact, np.int64))
+        return rows, *self._pages.blobs(rows)
 
     def close(self) -> None:
         """Leave the file; views that are still held keep it mapped."""

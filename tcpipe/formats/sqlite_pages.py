@@ -155,6 +155,7 @@ class PageReader:
             positions.append(positions[-1] + _column_bytes(kind))
         blobs = positions[-2]
         _expect((cells + ends[-1] == positions[0]) & (positions[-1] == payloads + sizes) & (blobs <= local_ends))
+        _expect(sizes <= len(self._octets))
         _expect((kinds[-1] >= _FIRST_BLOB) & (kinds[-1] % 2 == 0))
         _expect(ids[1:] > ids[:-1])
         overflow = np.zeros(len(cells), np.int64)
