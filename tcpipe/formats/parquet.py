@@ -92,7 +92,12 @@ def row_count(path: Path) -> int:
 
 def column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file from its footer."""
+    return list(read_schema(path).names)
+
+
+def read_schema(path: Path) -> pa.Schema:
+    """Return the schema of a Parquet file, with its metadata, from its footer; `StoreError` names a file that cannot be read."""
     try:
-        return list(pq.read_schema(path).names)
+        return pq.read_schema(path)
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -13,14 +13,14 @@ from typing import Any, Literal
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.errors import LogError
+from tcpipe.errors import LogError, StoreError
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.log_file import Log, open_log
-from tcpipe.formats.parquet import parquet_rows, storable
+from tcpipe.formats.parquet import parquet_rows, read_schema, storable
 from tcpipe.logs.power_sources import bare_unit
 from tcpipe.pipeline.log_sources import definitions_key
 from tcpipe.store import is_store
-from tcpipe.tables.levels import with_metadata
+from tcpipe.tables.levels import metadata_of, with_metadata
 
 INDEX = "export.json"
 """What a directory of exported topics holds, and of which log: a second call finds it done."""
@@ -77,8 +77,8 @@ def export(
     Raises
     ------
     LogError
-        The log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log, or
-        ``out`` is a dataset, run, map or store.
+        The log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log
+        or is none of an export, or ``out`` is a dataset, run, map or store.
 
     """
     _refuse_what_is_ours(out)
@@ -152,6 +152,19 @@ def _refuse_others_files(index: Mapping[str, Any], made_from: Mapping[str, Any],
     if taken:
         out = next(iter(paths.values())).parent
         raise LogError(f"{out}: holds the same topics of {', '.join(taken)}; give another directory")
+    known = {entry["file"] for entry in index["topics"].values()}
+    strange = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
+    if strange:
+        raise LogError(
+            *(f"{path}: is there, and no topic that was exported; give another directory" for path in strange)
+        )
+
+
+def _is_a_topics(path: Path) -> bool:
+    """Return whether a file is one of `export`, which may have been interrupted before it wrote its index."""
+    with suppress(StoreError):
+        return "topic" in metadata_of(read_schema(path).empty_table())
+    return False
 
 
 def _is_there(entry: Mapping[str, Any] | None, made_from: Mapping[str, Any], out: Path) -> bool:

@@ -2,6 +2,7 @@
 
 import json
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from mcap.writer import Writer
@@ -129,6 +130,23 @@ def test_files_of_another_log_are_not_overwritten(tmp_path, log):
     export(other, tmp_path / "out", topics=["/Path"])
     with pytest.raises(LogError, match=r"holds the same topics of .*a\.mcap; give another directory"):
         export(other, tmp_path / "out")
+
+
+def test_files_that_are_none_of_an_export_are_not_overwritten(tmp_path, log):
+    out = tmp_path / "out"
+    out.mkdir()
+    pq.write_table(pa.table({"mine": [1]}), out / "Imu.parquet")
+    (out / "Path.parquet").write_text("notes")
+    with pytest.raises(LogError) as refused:
+        export(log, out)
+    assert [line.split(": ")[0] for line in refused.value.problems] == [
+        str(out / "Imu.parquet"),
+        str(out / "Path.parquet"),
+    ]
+    assert pq.read_table(out / "Imu.parquet").column_names == ["mine"]
+    export(log, tmp_path / "other")
+    (tmp_path / "other" / "export.json").unlink()  # as a call that was interrupted leaves it
+    assert export(log, tmp_path / "other").status == "done"
 
 
 def test_what_is_damaged_is_said_again_by_the_second_call(tmp_path):
