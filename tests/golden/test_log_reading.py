@@ -193,7 +193,7 @@ def clean_messages():
         ("damaged/husky_test1.bag.active", 16_806, None),
         ("damaged/husky_test1_truncated60.bag", 8_788, None),
         ("damaged/husky_test1_byteflip.bag", 15_043, 1_763),
-        ("husky_test1_ros2_truncdb3", 10_057, 6_749),
+        ("husky_test1_ros2_truncdb3", 10_058, 6_748),
         ("husky_test1_ros2_nometadata", 16_806, None),
     ],
 )
