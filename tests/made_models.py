@@ -12,7 +12,7 @@ from tcpipe.learning.network import Architecture, resnet18
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 CARD = ModelCard(
-    architecture=Architecture(patch_px=40, depth=3, outputs=2, width=4),
+    architecture=Architecture(patch_px=40, depth=3, outputs=2, width=16),
     channels=("ortho", "terrain", "height"),
     outputs=("power_watt", "velocity_mps"),
     scale=(400.0, 1.0),

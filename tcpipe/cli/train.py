@@ -31,8 +31,8 @@ from tcpipe.cli.options import json_option, quiet_option
     "--width",
     default=64,
     show_default=True,
-    type=click.IntRange(1, 512),
-    help="Filters of the first stage; 64 is ResNet-18.",
+    type=click.IntRange(16, 512),
+    help="Filters of the first stage, a multiple of 16; 64 is ResNet-18.",
 )
 @click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of weights, shuffles and mirrors.")
 @click.option("--fresh", is_flag=True, help="Do not go on from where an earlier training was stopped.")

@@ -46,7 +46,7 @@ class FitConfig:
     weights: bool = False
     """Weigh each label by its inverse variance."""
     width: int = 64
-    """Filters of the first stage."""
+    """Filters of the first stage, a multiple of 16."""
 
 
 @dataclass(frozen=True, slots=True)

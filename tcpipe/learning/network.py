@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.errors import ModelError
 from tcpipe.learning.keras_backend import load_keras
-
 
 @dataclass(frozen=True, slots=True)
 class Architecture:
@@ -25,7 +25,12 @@ class Architecture:
     """Channels of a patch."""
     outputs: int = 2
     width: int = 64
-    """Filters of the first stage; 64 is ResNet-18, less is a narrower copy for quick runs."""
+    """Filters of the first stage, a multiple of `BLOCK`; 64 is ResNet-18, less is a narrower copy for quick runs."""
+
+
+BLOCK = 16
+"""Channels that CPU convolutions hold together. With 4 or 8 filters, an odd number of samples and two threads those of torch 2.13.0
+write beyond their memory in a training step; with multiples of 16 they do not."""
 
 
 def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> Any:
@@ -40,7 +45,14 @@ def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> Any:
     start
         What it predicts on average before training: the head's biases.
 
+    Raises
+    ------
+    ModelError
+        The width is no multiple of `BLOCK`.
+
     """
+    if shape.width % BLOCK:
+        raise ModelError(f"a network of width {shape.width}: wanted a multiple of {BLOCK}, from {BLOCK} to 512")
     keras = load_keras()
     keras.utils.set_random_seed(seed)
     layers = keras.layers

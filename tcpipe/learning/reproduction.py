@@ -47,7 +47,7 @@ FULL = Plan("paper", FitConfig(epochs=60, patience=10), EvaluateConfig(draws=5))
 """The paper's size: fits 90 minutes on two cores."""
 
 QUICK = Plan(
-    "paper_quick", FitConfig(epochs=12, patience=12, batch=32, learning_rate=1e-3, width=8), EvaluateConfig(draws=2)
+    "paper_quick", FitConfig(epochs=12, patience=12, batch=32, learning_rate=1e-3, width=16), EvaluateConfig(draws=2)
 )
 """Three minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
 

@@ -225,7 +225,8 @@ SCENARIOS: Mapping[str, Callable[[], Scenario]] = {
     "manoeuvres": _manoeuvres,
 }
 """Scenarios by name: demo (two drives of four minutes), hills12 (twelve minutes, all faults), paper (eleven drives of 0.5 km to 1.5 km
-over a site of the paper's size), paper_quick (three short ones of the same robot), tiny (half a minute), manoeuvres (one of each, no faults)."""
+over a site of the paper's size), paper_quick (three short ones of the same robot), tiny (half a minute), manoeuvres (one of each, no
+faults)."""
 
 
 def scenario(name: str) -> Scenario:

@@ -28,7 +28,7 @@ CONFIG = EvaluateConfig(draws=2, baselines=False)
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    training = {"config": {"epochs": 1, "width": 4}, "samples": {"fitted": 100, "held out": 20}}
+    training = {"config": {"epochs": 1, "width": 16}, "samples": {"fitted": 100, "held out": 20}}
     return made_model(tmp_path_factory.mktemp("made") / "model", training=training)
 
 

@@ -20,7 +20,7 @@ from tcpipe.terrain.layers import HEIGHT_NODATA
 pytest.importorskip("torch")
 pytest.importorskip("keras")
 
-CONFIG = FitConfig(width=4, epochs=3, patience=3, learning_rate=1e-3)
+CONFIG = FitConfig(width=16, epochs=3, patience=3, learning_rate=1e-3)
 
 
 def _weights(place):
