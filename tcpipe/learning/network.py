@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import ModelError
 from tcpipe.learning.keras_backend import load_keras
 
+
 @dataclass(frozen=True, slots=True)
 class Architecture:
     """What decides the shape of every weight."""
@@ -29,8 +30,8 @@ class Architecture:
 
 
 BLOCK = 16
-"""Channels that CPU convolutions hold together. With 4 or 8 filters, an odd number of samples and two threads those of torch 2.13.0
-write beyond their memory in a training step; with multiples of 16 they do not."""
+"""Channels that CPU convolutions hold together: of fewer, oneDNN, by which PyTorch convolves there, writes beyond its memory in the
+gradient of a 1 × 1 convolution with a stride (its issue 6035); seen to crash with 4 and 8 filters."""
 
 
 def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> Any:
