@@ -93,9 +93,9 @@ def main() -> None:
         code = cli.main(prog_name="tcpipe", standalone_mode=False)
         sys.stdout.flush()
     except (click.exceptions.Abort, KeyboardInterrupt):
-        _fail(["interrupted; nothing is half-written, the same command goes on from here"], 128 + signal.SIGINT)
+        _fail(["interrupted; nothing is half-written; run the same command again"], 128 + signal.SIGINT)
     except Ended as ended:
-        _fail([f"{ended}; nothing is half-written, the same command goes on from here"], ended.exit_code)
+        _fail([f"{ended}; nothing is half-written; run the same command again"], ended.exit_code)
     except click.UsageError as error:
         if not sys.argv[1:]:
             error.show()
