@@ -96,7 +96,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
     key
         Of dataset and options, kept in the checkpoint.
     checkpoint
-        Written after every epoch, and gone on from where it is.
+        Written before the first and after every epoch, and gone on from where it is.
 
     """
     keras = load_keras()
@@ -113,6 +113,8 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         _restore(network, parts, checkpoint)
         best = parts["best"]
         logger.info("%s: goes on after epoch %d", name, progress.epoch)
+    else:  # a place that cannot be written is found now, not after an epoch
+        write_checkpoint(checkpoint, progress, _state(network, best))
     spent = Spent()
     while progress.epoch < config.epochs and progress.epoch - progress.best_epoch < config.patience:
         loss = _epoch(network, task, config, scale=np.array(scale, np.float32), number=progress.epoch, spent=spent)
@@ -121,8 +123,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         progress.history.append((progress.epoch, loss, held))
         if held < progress.best_loss:
             progress.best_loss, progress.best_epoch, best = held, progress.epoch, named_weights(network)
-        parts = {"now": named_weights(network), "best": best, "optimizer": _optimizer_arrays(network)}
-        write_checkpoint(checkpoint, progress, parts)
+        write_checkpoint(checkpoint, progress, _state(network, best))
         _say(name, progress, config, spent)
     network.set_weights(list(best.values()))
     return Fitted(network, scale, progress, spent)
@@ -184,6 +185,11 @@ def _optimizer_arrays(network: Any) -> Arrays:
     return {
         f"{number:04d}": np.array(to_numpy(value.value)) for number, value in enumerate(network.optimizer.variables)
     }
+
+
+def _state(network: Any, best: Arrays) -> dict[str, Arrays]:
+    """Return all arrays of a checkpoint."""
+    return {"now": named_weights(network), "best": best, "optimizer": _optimizer_arrays(network)}
 
 
 def _restore(network: Any, parts: dict[str, Arrays], checkpoint: Path) -> None:

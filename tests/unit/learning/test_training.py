@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.errors import DatasetError, ModelError
+from tcpipe.errors import DatasetError, ModelError, StoreError
 from tcpipe.formats.weights import read_arrays
 from tcpipe.learning import fitting
 from tcpipe.learning.fitting import FitConfig
@@ -88,7 +88,7 @@ def test_a_stopped_training_goes_on_as_if_nothing_had_happened(trained, dataset,
     assert not (tmp_path / "model").exists()
     monkeypatch.setattr(fitting, "write_checkpoint", real)
     train(dataset, tmp_path / "model", config=CONFIG)
-    assert epochs == [1, 2]
+    assert epochs == [0, 1, 2]
     assert _same(_weights(whole), _weights(tmp_path / "model"))
     assert (whole / HISTORY).read_bytes() == (tmp_path / "model" / HISTORY).read_bytes()
 
@@ -105,6 +105,13 @@ def test_a_stopped_training_goes_on_as_if_nothing_had_happened(trained, dataset,
     ) as told:
         train(dataset, tmp_path / "other", config=CONFIG)
     assert len(told.value.problems) == 1
+
+
+def test_a_place_that_cannot_be_written_is_found_before_the_first_epoch(dataset, tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(fitting, "_epoch", lambda *_, **__: pytest.fail("an epoch was trained"))
+    with pytest.raises(StoreError, match=r"model.checkpoint: cannot be written"):
+        train(dataset, tmp_path / "file" / "model", config=CONFIG)
 
 
 def test_another_seed_is_another_model(trained, dataset, tmp_path):
