@@ -11,11 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import kernel
+from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA
 
 Floats = NDArray[np.float32]
-
-HEIGHT_NODATA = np.uint16(65535)
-"""A stored height without data (`tcpipe.terrain.layers.HEIGHT_NODATA`)."""
 
 
 @kernel

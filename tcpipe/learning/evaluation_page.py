@@ -31,9 +31,10 @@ def evaluation_page(
         lead=lead,
         numbers=[
             Number(
-                _figure(part["errors"][quantity][ALL], "mape_percent", quantity) + " %", f"MAPE of {quantity}, {name}"
+                _figure(values["splits"][name]["errors"][quantity][ALL], "mape_percent", quantity) + " %",
+                f"MAPE of {quantity}, {name}",
             )
-            for name, part in sorted(values["splits"].items())
+            for name in _splits(values)
             for quantity in ("E", "T")
         ],
         warnings=[*warnings, *values["warnings"]],
@@ -131,7 +132,7 @@ _TEXT = {
 
 def _ablation(values: Mapping[str, Any]) -> Section:
     """Return table III."""
-    splits = [split for split in SPLITS if split in values["splits"]]
+    splits = _splits(values)
     rows = []
     for row in values["ablation"]:
         key = tuple(row["layers"])
@@ -154,6 +155,11 @@ def _ablation(values: Mapping[str, Any]) -> Section:
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
 
 
+def _splits(values: Mapping[str, Any]) -> list[str]:
+    """Return the splits that were evaluated, in the paper's order."""
+    return [split for split in SPLITS if split in values["splits"]]
+
+
 def _floors(values: Mapping[str, Any], split: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
     """Yield what errors on a split can hardly be less than: its name, and errors by quantity and class."""
     part = values["splits"][split]
@@ -164,7 +170,7 @@ def _compared(title: str, text: str, values: Mapping[str, Any], table: tuple[str
     """Return table IV or V: ``table`` is its key among the values, the paper's figures, its quantity."""
     key, told, quantity = table
     found = values[key]
-    splits = [split for split in SPLITS if split in found[OURS]]
+    splits = _splits(values)
     rows = []
     for what, by_split in ((what, found[what]) for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED) if what in found):
         cells = [_figure(by_split[split], measure, quantity) for split in splits for measure in MEASURES]

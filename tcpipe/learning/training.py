@@ -23,7 +23,7 @@ from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.learning.network import Architecture
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
-from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M
+from tcpipe.terrain.relief import relief_m
 
 logger = logging.getLogger("tcpipe")
 
@@ -172,9 +172,9 @@ def what_was_seen(split: Split) -> Seen:
         layers = split.layers(np.arange(first, min(first + _READ_TOGETHER, len(split))))
         if "terrain" in layers:
             pixel_classes |= set(np.flatnonzero(np.bincount(layers["terrain"].ravel())).tolist()) - {NODATA_ID}
-        if "height" in layers:  # above the patch's lowest pixel
-            highest = np.where(layers["height"] == HEIGHT_NODATA, 0, layers["height"]).max(axis=(1, 2)) * HEIGHT_STEP_M
-            reliefs_m += [float(highest.min()), float(highest.max())]
+        if "height" in layers:
+            found_m = relief_m(layers["height"])
+            reliefs_m += [float(found_m.min()), float(found_m.max())]
     ranges = {name: _range(split.column(name)) for name in ("slope_rad", "cross_slope_rad")}
     if reliefs_m:
         ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))

@@ -1,4 +1,4 @@
-"""One pass over the pixels of patches: relief, classes that training has not met, obstacles in the robot's lane."""
+"""One pass over the pixels of patches: classes that training has not met, obstacles in the robot's lane."""
 
 from __future__ import annotations
 
@@ -6,19 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import kernel
-from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA
-
-
-@kernel
-def relief_steps(height: NDArray[np.uint16], out: NDArray[np.uint16]) -> None:
-    """Write the largest stored height of each patch, shape (N, px, px), to ``out``, (N,); 65535 is no data."""
-    flat = height.reshape(height.shape[0], -1)
-    for n in range(flat.shape[0]):
-        most = np.uint16(0)
-        for k in range(flat.shape[1]):
-            value = flat[n, k] if flat[n, k] != HEIGHT_NODATA else np.uint16(0)
-            most = max(most, value)
-        out[n] = most
 
 
 @kernel

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.ground_kernel import class_facts, relief_steps
+from tcpipe.planning.ground_kernel import class_facts
 from tcpipe.tables.bits import name_of
 from tcpipe.terrain.classes import NODATA_ID
-from tcpipe.terrain.layers import HEIGHT_STEP_M
+from tcpipe.terrain.relief import relief_m
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.tiles import MapReader
 
@@ -95,13 +95,6 @@ def reasons_of(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, so
     bits[~on_map] = Reason.OUTSIDE_MAP
     bits[bits & Reason.NODATA != 0] = Reason.NODATA
     return bits
-
-
-def relief_m(height: NDArray[np.uint16]) -> NDArray[np.float64]:
-    """Return the largest difference of the stored heights of patches, shape (N, px, px), without data left out [m], shape (N,)."""
-    steps = np.empty(len(height), np.uint16)
-    relief_steps(height, steps)
-    return steps.astype(np.float64) * HEIGHT_STEP_M
 
 
 def _class_reasons(patches: Patches, terrain: NDArray[np.uint8], model: CostModel, source: MapReader) -> Bits:

@@ -19,6 +19,7 @@ RUN_PX = 16
 """Pixels copied at once; windows are a multiple of it wide."""
 
 HEIGHT_NODATA = np.uint16(65535)
+"""A stored height without data (`tcpipe.terrain.layers.HEIGHT_NODATA`), as kernels compare it."""
 
 
 @kernel
