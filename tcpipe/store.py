@@ -26,10 +26,9 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, exclusive
-from tcpipe.formats.dataset_files import checksums_to_json
 from tcpipe.formats.json_files import read_json
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.seals import write_checksums, write_sealed
+from tcpipe.formats.seals import checksums_to_json, write_checksums, write_sealed
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     Findings,

@@ -10,7 +10,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -219,24 +218,6 @@ def _list_column(layer: Layer, patches: NDArray[Any]) -> tuple[pa.Field, pa.Arra
     dtype = pa.list_(values.type, px * px)  # plain: a tensor extension type makes other readers fail
     column = pa.FixedSizeListArray.from_arrays(values, px * px)
     return pa.field(layer.name, dtype, nullable=False, metadata=metadata), column
-
-
-def file_checksum(path: Path) -> tuple[int, str]:
-    """Return size [byte] and sha256 (hex) of a file."""
-    with path.open("rb") as stream:
-        return path.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
-
-
-def file_checksums(directory: Path) -> dict[str, tuple[int, str]]:
-    """Return size [byte] and sha256 (hex) of every file below ``directory``, by its path inside it."""
-    files = sorted(entry for entry in directory.rglob("*") if entry.is_file())
-    return {path.relative_to(directory).as_posix(): file_checksum(path) for path in files}
-
-
-def checksums_to_json(directory: Path) -> dict[str, dict[str, int | str]]:
-    """Return `file_checksums` as JSON values: ``size_bytes`` and ``sha256`` by path."""
-    found = file_checksums(directory)
-    return {path: {"size_bytes": size_bytes, "sha256": sha256} for path, (size_bytes, sha256) in found.items()}
 
 
 def read_card(directory: Path) -> dict[str, Any]:

@@ -14,6 +14,9 @@ from typing import Any
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_text
 
+MOST_BYTES = 32 << 20
+"""A document is at most so large [byte], written and read: the card of ten thousand runs."""
+
 
 def plain(value: Any) -> Any:
     """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
@@ -39,15 +42,37 @@ def to_json(value: Any) -> str:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write ``value`` as canonical JSON, whole or not at all."""
-    write_text(path, to_json(value))
+    """Write ``value`` as canonical JSON, whole or not at all; `StoreError` where it is too large to be read again."""
+    text = to_json(value)
+    if len(text) > MOST_BYTES // 4 and len(text.encode()) > MOST_BYTES:
+        raise StoreError(f"{path}: would be more than {MOST_BYTES >> 20} MB, which no command reads again")
+    write_text(path, text)
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read one JSON object; `StoreError` names a file that cannot be read."""
+    return parse_json(read_document(path), path)
+
+
+def read_document(path: Path) -> bytes:
+    """Return the bytes of a JSON file; `StoreError` where it cannot be read, is no file, or larger than `MOST_BYTES`."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+        if path.exists() and not path.is_file():
+            raise StoreError(f"{path}: is no file; remove it and run the command again")
+        with path.open("rb") as stream:
+            data = stream.read(MOST_BYTES + 1)
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read ({error.strerror}); run the command again that writes it") from None
+    if len(data) > MOST_BYTES:
+        raise StoreError(f"{path}: is larger than {MOST_BYTES >> 20} MB, which no such file is; remove it")
+    return data
+
+
+def parse_json(data: bytes, path: Path) -> dict[str, Any]:
+    """Return the object in the bytes of a file; `StoreError` if it holds none."""
+    try:
+        found = json.loads(data.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not a readable JSON file ({error}); remove it and run the command again") from None
     if not isinstance(found, dict):
         raise StoreError(

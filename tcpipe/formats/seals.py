@@ -7,20 +7,23 @@ a sealed document lists, by path, size and sha256, is proved by it in turn.
 from __future__ import annotations
 
 import hashlib
-import json
+import re
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from tcpipe.formats.dataset_files import checksums_to_json, file_checksum
-from tcpipe.formats.json_files import digest, plain, to_json, write_json
+from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import digest, parse_json, plain, read_document, write_json
 
 SEAL = "document_sha256"
 """Key of a sealed document that holds the sha256 (hex) of its canonical JSON without this key."""
 
 CHECKSUMS = "checksums.json"
 """In a directory whose files cannot be listed elsewhere: a sealed document with the key ``checksums``."""
+
+_SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MULTILINE)
+"""The seal in canonical JSON: the text without this line is what it is the hash of."""
 
 _PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -30,6 +33,30 @@ def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON object with a seal, whole or not at all."""
     bare = {key: item for key, item in plain(value).items() if key != SEAL}
     write_json(path, {**bare, SEAL: digest(bare)})
+
+
+def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
+    """Read a JSON object that `write_sealed` wrote, and prove it.
+
+    Parameters
+    ----------
+    path
+        The document.
+    ours
+        Tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
+        refuse.
+
+    Raises
+    ------
+    StoreError
+        It cannot be read, or is not as it was written.
+
+    """
+    data = read_document(path)
+    found = parse_json(data, path)
+    if ours(found) and not _document_is_whole(data):
+        raise StoreError(f"{broken(path)}; 'tcpipe verify {path.parent}' tells what else is not")
+    return found
 
 
 def write_checksums(directory: Path) -> None:
@@ -43,6 +70,11 @@ def sealed_page(html: str) -> str:
     return text + _PAGE_SEAL.format(hashlib.sha256(text.encode()).hexdigest())
 
 
+def broken(path: Path) -> str:
+    """Return the line about a file that is not what its seal or its checksum says."""
+    return f"{path}: is not as it was written: its checksum does not agree"
+
+
 def broken_seal(path: Path) -> str | None:
     """Return in one line why a sealed file (``.json``, ``.html``) or a ``.png`` is not as it was written, None if it is."""
     try:
@@ -50,7 +82,7 @@ def broken_seal(path: Path) -> str | None:
     except OSError as error:
         return f"{path}: cannot be read ({error.strerror})"
     whole = {".html": _page_is_whole, ".png": _png_is_whole}.get(path.suffix, _document_is_whole)
-    return None if whole(data) else f"{path}: is not as it was written: its checksum does not agree"
+    return None if whole(data) else broken(path)
 
 
 def broken_checksums(directory: Path, checksums: Mapping[str, Any]) -> Iterator[str]:
@@ -60,25 +92,47 @@ def broken_checksums(directory: Path, checksums: Mapping[str, Any]) -> Iterator[
         if not path.is_file():
             yield f"{path}: is gone"
             continue
+        wanted_bytes, wanted = (
+            entry.get(key) if isinstance(entry, Mapping) else None for key in ("size_bytes", "sha256")
+        )
         try:
             size_bytes, sha256 = file_checksum(path)
         except OSError as error:
             yield f"{path}: cannot be read ({error.strerror})"
             continue
-        if (size_bytes, sha256) != (entry["size_bytes"], entry["sha256"]):
-            size = "" if size_bytes == entry["size_bytes"] else f" ({size_bytes} bytes, wanted {entry['size_bytes']})"
-            yield f"{path}: its sha256 is {sha256[:12]}…, wanted {entry['sha256'][:12]}…{size}"
+        if (size_bytes, sha256) != (wanted_bytes, wanted):
+            size = "" if size_bytes == wanted_bytes else f" ({size_bytes} bytes, wanted {wanted_bytes})"
+            yield f"{path}: its sha256 is {sha256[:12]}…, wanted {str(wanted)[:12]}…{size}"
+
+
+def file_checksum(path: Path) -> tuple[int, str]:
+    """Return size [byte] and sha256 (hex) of a file."""
+    with path.open("rb") as stream:
+        return path.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def file_checksums(directory: Path) -> dict[str, tuple[int, str]]:
+    """Return size [byte] and sha256 (hex) of every file below ``directory``, by its path inside it."""
+    files = sorted(entry for entry in directory.rglob("*") if entry.is_file())
+    return {path.relative_to(directory).as_posix(): file_checksum(path) for path in files}
+
+
+def checksums_to_json(directory: Path) -> dict[str, dict[str, int | str]]:
+    """Return `file_checksums` as JSON values: ``size_bytes`` and ``sha256`` by path."""
+    found = file_checksums(directory)
+    return {path: {"size_bytes": size_bytes, "sha256": sha256} for path, (size_bytes, sha256) in found.items()}
 
 
 def _document_is_whole(data: bytes) -> bool:
-    try:
-        value = json.loads(data)
-    except ValueError:
+    seal = _SEAL_LINE.search(data)
+    if seal is None:
         return False
-    if not isinstance(value, dict) or SEAL not in value:
-        return False
-    bare = {key: item for key, item in value.items() if key != SEAL}
-    return to_json({**bare, SEAL: digest(bare)}).encode() == data
+    before, after = data[: seal.start()], data[seal.end() :]
+    if not seal[2]:  # the last key: without it the one before has no comma
+        if not before.endswith(b",\n"):
+            return False
+        before = before[:-2] + b"\n"
+    return hashlib.sha256(before + after).hexdigest().encode() == seal[1]
 
 
 def _page_is_whole(data: bytes) -> bool:

@@ -23,10 +23,9 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError, StoreError
 from tcpipe.formats.atomic import atomic_directory, write_text
-from tcpipe.formats.dataset_files import checksums_to_json, file_checksum
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.seals import write_sealed
+from tcpipe.formats.seals import checksums_to_json, file_checksum, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.model_card import ModelCard, card_from_json, card_to_json
 from tcpipe.learning.network import named_weights, resnet18

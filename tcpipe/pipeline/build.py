@@ -24,8 +24,6 @@ from tcpipe.formats.dataset_files import (
     SHARDS,
     FileFormat,
     Pixels,
-    file_checksum,
-    file_checksums,
     read_card,
     read_samples,
     write_patches_parquet,
@@ -35,7 +33,7 @@ from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import plain, write_json
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
-from tcpipe.formats.seals import sealed_page, write_sealed
+from tcpipe.formats.seals import file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.dataset_balance import BALANCE_COLUMNS, DRIVE_NEXT, measure_balance
 from tcpipe.pipeline.dataset_card import (

@@ -17,15 +17,13 @@ from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.dataset_files import (
     FileFormat,
-    file_checksum,
-    file_checksums,
     read_card,
     read_samples,
     sample_columns,
 )
 from tcpipe.formats.json_files import digest, plain, read_json
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.seals import CHECKSUMS, broken_seal
+from tcpipe.formats.seals import CHECKSUMS, broken_seal, file_checksum, file_checksums
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store

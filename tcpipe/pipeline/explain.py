@@ -17,7 +17,6 @@ from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, TcpipeError
 from tcpipe.formats.dataset_files import (
     SAMPLES,
-    file_checksum,
     open_patches,
     read_current_card,
     read_samples,
@@ -28,6 +27,7 @@ from tcpipe.formats.json_files import plain
 from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
 from tcpipe.formats.recipe_toml import parse_recipe, read_key
+from tcpipe.formats.seals import file_checksum
 from tcpipe.pipeline.ingest import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import sample_segments

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import MapError, StoreError
-from tcpipe.formats.dataset_files import file_checksum
 from tcpipe.formats.geotiff import raster_files
 from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.formats.map_text import map_text
+from tcpipe.formats.seals import file_checksum
 from tcpipe.formats.terrain_polygons import SUFFIXES
 from tcpipe.report.overview import quick_look, write_overview
 from tcpipe.store import Store, open_store

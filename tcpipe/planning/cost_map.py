@@ -26,12 +26,11 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, UsageError
 from tcpipe.formats.atomic import atomic_directory, exclusive
-from tcpipe.formats.dataset_files import checksums_to_json
 from tcpipe.formats.geotiff import read_bands, write_cog
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.map_files import MapFile
 from tcpipe.formats.nav2_map import HIGHEST, LETHAL, write_nav2_map
-from tcpipe.formats.seals import broken_checksums, broken_seal, write_sealed
+from tcpipe.formats.seals import broken_checksums, broken_seal, checksums_to_json, write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES

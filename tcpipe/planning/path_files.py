@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import StoreError, UsageError
-from tcpipe.formats.dataset_files import file_checksum
 from tcpipe.formats.geojson_lines import read_line
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.map_files import MapFile
-from tcpipe.formats.seals import write_sealed
+from tcpipe.formats.seals import file_checksum, write_sealed
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.intervals import COVERAGE
 from tcpipe.planning.path_cost import cost_of_path
