@@ -14,6 +14,7 @@ import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError
@@ -47,14 +48,32 @@ def atomic_file(path: Path) -> Iterator[Path]:
         _sync_directory(place.parent)
 
 
+@dataclass(frozen=True, slots=True)
+class PlaceState:
+    """What lies at a place: enough to tell whether another process has put something else there."""
+
+    inode_and_time: tuple[int, int] | None
+
+
+def place_state(path: Path) -> PlaceState:
+    """Return what lies at ``path`` now."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return PlaceState(None)
+    return PlaceState((found.st_ino, found.st_mtime_ns))
+
+
 @contextmanager
-def atomic_directory(path: Path) -> Iterator[Path]:
+def atomic_directory(path: Path, *, instead_of: PlaceState | None = None) -> Iterator[Path]:
     """Yield a temporary directory; on success it takes the place of ``path`` (an old one goes), on failure it is removed.
+
+    With ``instead_of`` it takes the place of that alone: what another process has put there since stays.
 
     Raises
     ------
     StoreError
-        The place cannot be written.
+        The place cannot be written, or holds something else by now.
     """
     with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
         temporary = holder / place.name
@@ -64,7 +83,10 @@ def atomic_directory(path: Path) -> Iterator[Path]:
             for name in files:
                 with (Path(directory) / name).open("rb") as stream:
                     os.fsync(stream.fileno())
-        _take_place(temporary, place)
+        with exclusive(place.parent):
+            if instead_of not in {None, place_state(place)}:
+                raise StoreError(f"{path}: another process has written it meanwhile, and it stays; look at it first")
+            _take_place(temporary, place)
         _sync_directory(place.parent)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from tcpipe.errors import MapError
-from tcpipe.formats.atomic import atomic_directory
+from tcpipe.formats.atomic import PlaceState, atomic_directory
 from tcpipe.formats.class_table import read_class_scheme
 from tcpipe.formats.geotiff import Raster, open_raster
-from tcpipe.formats.map_files import SHARD_PX, MapWriter
+from tcpipe.formats.map_files import SHARD_PX, MapFile, MapWriter, open_map
 from tcpipe.formats.map_layers import Layer, RasterLayer, shards_of
 from tcpipe.formats.seals import write_checksums
 from tcpipe.formats.terrain_polygons import SUFFIXES, place_polygons
@@ -55,6 +55,8 @@ def build_map(
     crs: str | None = None,
     pitch_m: float | None = None,
     inputs: Mapping[str, Any] | None = None,
+    instead_of: PlaceState | None = None,
+    look: Callable[[MapFile, Path], None] | None = None,
 ) -> MapSummary:
     """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
 
@@ -77,11 +79,17 @@ def build_map(
         Side of a map pixel [m]; None takes the finest raster's.
     inputs
         What the caller wants to know the map by later; kept in its facts.
+    instead_of
+        What it may replace; None: whatever is there.
+    look
+        Is given the finished map, and where it lies, before it appears at its place.
 
     Raises
     ------
     MapError
         A raster cannot be placed or read, or holds nothing here; the class table is not the store's: one line each.
+    StoreError
+        The map cannot be written, or another process has put something else there.
     """
     paths = {
         role: path for role, path in (("height", height), ("ortho", ortho), ("terrain", terrain)) if path is not None
@@ -101,13 +109,15 @@ def build_map(
         }
         if drawn is not None:
             layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
-        with atomic_directory(out_path) as half:
+        with atomic_directory(out_path, instead_of=instead_of) as half:
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=tuple(layers))
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
             summary = _summary(out_path, name, grid, scheme.table, layers)
             writer.finish({**_facts(summary, layers), "classes_from": origin, "inputs": dict(inputs or {})})
             write_checksums(half)
+            if look is not None:
+                look(open_map(half), half)
     return summary
 
 

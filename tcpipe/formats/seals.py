@@ -123,6 +123,21 @@ def checksums_to_json(directory: Path) -> dict[str, dict[str, int | str]]:
     return {path: {"size_bytes": size_bytes, "sha256": sha256} for path, (size_bytes, sha256) in found.items()}
 
 
+def seal_of(directory: Path) -> str:
+    """Return what tells the content of a directory with a ``checksums.json`` from any other; `StoreError` if that cannot be read."""
+    return str(read_sealed(directory / CHECKSUMS).get(SEAL))
+
+
+def picture_text(path: Path, key: str) -> str | None:
+    """Return a text that a PNG carries under a key (RFC 2083, section 4.2.3), None if it has none."""
+    try:
+        chunks = list(_png_chunks(path.read_bytes()))
+    except OSError:
+        return None
+    texts = (data.partition(b"\0") for kind, data, _ in chunks if kind == b"tEXt")
+    return next((text.decode("latin-1") for name, _, text in texts if name == key.encode("latin-1")), None)
+
+
 def _document_is_whole(data: bytes) -> bool:
     seal = _SEAL_LINE.search(data)
     if seal is None:
@@ -141,12 +156,19 @@ def _page_is_whole(data: bytes) -> bool:
 
 
 def _png_is_whole(data: bytes) -> bool:
-    """Walk the chunks (RFC 2083, section 3.2): length, type, data, CRC of type and data; the last is IEND."""
+    """Tell whether every chunk is as its CRC says, and the last is IEND."""
+    kind, end = b"", 0
+    for kind, content, end in _png_chunks(data):
+        if zlib.crc32(kind + content) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+    return kind == b"IEND" and end == len(data)
+
+
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, bytes, int]]:
+    """Yield type, data and end of every chunk of a PNG (RFC 2083, section 3.2: length, type, data, CRC of type and data)."""
     at, kind = len(_PNG_START), b""
     while data.startswith(_PNG_START) and kind != b"IEND" and at + 12 <= len(data):
-        size, kind = int.from_bytes(data[at : at + 4], "big"), data[at + 4 : at + 8]
-        end = at + 8 + size
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            return False
-        at = end + 4
-    return kind == b"IEND" and at == len(data)
+        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
+        kind = data[at + 4 : at + 8]
+        yield kind, data[at + 8 : end - 4], end
+        at = end

@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import MapError, StoreError
+from tcpipe.formats.atomic import place_state
 from tcpipe.formats.geotiff import raster_files
 from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.formats.map_text import map_text
-from tcpipe.formats.seals import file_checksum
+from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.formats.terrain_polygons import SUFFIXES
-from tcpipe.report.overview import quick_look, write_overview
+from tcpipe.report.overview import quick_look, shows_map, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.terrain.classes import ClassScheme
 
@@ -83,9 +84,11 @@ def add_map(
     given = {"height": height, "ortho": ortho, "terrain": terrain, "classes": classes}
     files = {role: Path(file) for role, file in given.items() if file is not None}
     inputs = _inputs(files, crs)
+    before = place_state(path)
     if path.exists() and not force:
-        found = _same(name, path, inputs)
-        return AddedMap(path, "unchanged", found.summary(), _picture(found, path, again=False))
+        return _unchanged(name, path, inputs)
+    picture = path.with_suffix(".png")
+    looks: list[tuple[Any, str]] = []
     try:
         build_map(
             path,
@@ -97,19 +100,25 @@ def add_map(
             agreed=_agreed(house, name),
             crs=crs,
             inputs=inputs,
+            instead_of=before,
+            look=lambda finished, half: looks.append((quick_look(finished), seal_of(half))),
         )
-        found = open_map(path)
-        return AddedMap(path, "done", found.summary(), _picture(found, path, again=True))
+        write_quick_look(picture, *looks[0])
+        return AddedMap(path, "done", open_map(path).summary(), picture)
     except OSError as error:
         raise StoreError(f"{path}: the map cannot be written ({error.strerror or error})") from None
+    except StoreError:
+        if force or place_state(path) == before:
+            raise
+        return _unchanged(name, path, inputs)  # another process was faster
 
 
-def _picture(found: MapFile, path: Path, *, again: bool) -> Path:
-    """Draw the quick look beside the map, if it is not there or is to be drawn again."""
-    picture = path.with_suffix(".png")
-    if again or not picture.exists():
-        write_overview(picture, quick_look(found))
-    return picture
+def _unchanged(name: str, path: Path, inputs: Mapping[str, Any]) -> AddedMap:
+    """Return the map that is there, its quick look drawn if there is none of it; `MapError` if it is made from something else."""
+    found, picture = _same(name, path, inputs), path.with_suffix(".png")
+    if not shows_map(picture, path):
+        write_quick_look(picture, quick_look(found), seal_of(path))
+    return AddedMap(path, "unchanged", found.summary(), picture)
 
 
 def _inputs(files: Mapping[str, Path], crs: str | None) -> dict[str, Any]:

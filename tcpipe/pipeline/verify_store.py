@@ -18,6 +18,7 @@ from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import ingest_key, parse_recipe, recipe_id
 from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal
 from tcpipe.pipeline.dataset_segments import KEPT
+from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, STREAMS
@@ -37,7 +38,7 @@ def verify_store(store: Store) -> Iterator[Finding]:
         if path.suffix == ".zarr":
             yield from _isolated(verify_map(path))
         elif path.suffix == ".png" and path.with_suffix(".zarr").is_dir():
-            yield broken_seal(path) or ("files", 1)
+            yield from _isolated(_quick_look(path))
         else:
             yield from _stranger(path)
     for path in _entries(store.runs_path):
@@ -76,6 +77,13 @@ def verify_map(path: Path) -> Iterator[Finding]:
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:
             yield from _layer(path, level, layer, None if factor > 1 else source.facts["covered"][layer])
+
+
+def _quick_look(path: Path) -> Iterator[Finding]:
+    yield broken_seal(path) or ("files", 1)
+    map_path = path.with_suffix(".zarr")
+    if broken_seal(map_path / CHECKSUMS) is None and not shows_map(path, map_path):
+        yield f"{path}: does not show {path.stem}.zarr as it is; the add-map that made the map draws it anew"
 
 
 def _entries(directory: Path) -> list[Path]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from pyproj import Transformer
 
 from tcpipe.formats.atomic import atomic_file
 from tcpipe.formats.map_files import MapFile
+from tcpipe.formats.seals import picture_text, seal_of
 from tcpipe.report.figures import CLASS_COLOURS
 
 _SIDE_PX = 900
@@ -104,10 +105,25 @@ def _shaded(height_m: NDArray[Any], pitch_m: float) -> NDArray[np.uint8]:
 _PLAIN_PNG: dict[str, Any] = {"Software": None}
 
 
-def write_overview(path: Path, picture: NDArray[np.uint8]) -> None:
-    """Write a picture, grey (R, C) or colour (R, C, 3), as PNG; the same picture gives the same bytes."""
+def write_overview(path: Path, picture: NDArray[np.uint8], *, texts: Mapping[str, str] | None = None) -> None:
+    """Write a picture, grey (R, C) or colour (R, C, 3), as PNG with texts by key; the same picture gives the same bytes."""
     with atomic_file(path) as temporary:
-        matplotlib.image.imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=_PLAIN_PNG)
+        metadata = {**_PLAIN_PNG, **(texts or {})}
+        matplotlib.image.imsave(temporary, picture, format="png", cmap="gray", vmin=0, vmax=255, metadata=metadata)
+
+
+_SHOWS = "tcpipe map"
+"""Key of the text in a quick look that tells which map it shows: the seal of the map's checksums."""
+
+
+def write_quick_look(picture: Path, look: NDArray[np.uint8], seal: str) -> None:
+    """Write the `quick_look` of a map; the picture carries which map it shows, by `tcpipe.formats.seals.seal_of`."""
+    write_overview(picture, look, texts={_SHOWS: seal})
+
+
+def shows_map(picture: Path, map_path: Path) -> bool:
+    """Return whether a picture is the quick look of the map at ``map_path``; `StoreError` if that cannot be read."""
+    return picture_text(picture, _SHOWS) == seal_of(map_path)
 
 
 def read_overview(path: Path) -> NDArray[np.uint8]:

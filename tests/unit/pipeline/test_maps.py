@@ -13,7 +13,9 @@ from rasterio import Affine
 from tcpipe.cli import cli
 from tcpipe.errors import MapError, StoreError
 from tcpipe.formats.map_files import open_map
+from tcpipe.pipeline import maps
 from tcpipe.pipeline.maps import add_map
+from tcpipe.pipeline.verify import verify
 
 WORLD = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=12.0)
 CLASSES = "value,id,name,traversable\n4,1,meadow,yes\n5,2,bog,yes\n6,3,gravel,yes\n7,3,gravel,yes\n"
@@ -194,3 +196,59 @@ def test_a_quick_look_without_photo_is_a_relief_lit_from_the_north_west_and_smal
     assert (picture[:49] == 1.0).all()
     assert picture[150, 50] == pytest.approx(np.sqrt(0.5), abs=0.005)
     assert picture[400, 50] == pytest.approx((0.5 + np.sqrt(0.5)) / np.sqrt(2.0), abs=0.005)
+
+
+def other_height(directory):
+    return write_tif(
+        directory / "h2.tif", np.ones((1, 60, 60), np.float32), WORLD.crs, Affine(0.2, 0, 560_000, 0, -0.2, 5_215_000)
+    )
+
+
+def test_a_picture_of_the_map_before_is_told_and_drawn_anew(site, store, tmp_path, monkeypatch):
+    """Killed between map and picture: what lies there then is the new map and the old picture."""
+    add(store, "m", **site)
+    old = (store / "maps/m.png").read_bytes()
+    other = other_height(tmp_path)
+    with monkeypatch.context() as killed:
+        killed.setattr(maps, "write_quick_look", lambda *_: pytest.fail("killed"))
+        with pytest.raises(pytest.fail.Exception):
+            add(store, "m", height=other, force=True)
+    assert open_map(store / "maps/m.zarr").layers == ("height",)
+    assert (store / "maps/m.png").read_bytes() == old
+    assert verify(store).problems == (
+        f"{store / 'maps/m.png'}: does not show m.zarr as it is; the add-map that made the map draws it anew",
+    )
+    assert add(store, "m", height=other).status == "unchanged"
+    assert verify(store).problems == ()
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_map_that_another_process_adds_meanwhile_stays(site, store, tmp_path, monkeypatch, force):
+    """The other one begins later and is done sooner."""
+    if force:
+        add(store, "m", height=site["height"])
+    build, other = maps.build_map, other_height(tmp_path)
+
+    def slow(*args, **options):
+        monkeypatch.setattr(maps, "build_map", build)
+        add(store, "m", height=other, force=force)
+        build(*args, **options)
+
+    monkeypatch.setattr(maps, "build_map", slow)
+    wanted = "another process has written it meanwhile" if force else r"made from something else.*--force"
+    with pytest.raises(StoreError if force else MapError, match=wanted):
+        add(store, "m", **site, force=force)
+    assert open_map(store / "maps/m.zarr").facts["sources"] == {"height": "h2.tif"}
+    assert verify(store).problems == ()
+
+
+def test_the_same_map_added_twice_at_one_time_is_there_once(site, store, monkeypatch):
+    build = maps.build_map
+
+    def slow(*args, **options):
+        monkeypatch.setattr(maps, "build_map", build)
+        assert add(store, "m", **site).status == "done"
+        build(*args, **options)
+
+    monkeypatch.setattr(maps, "build_map", slow)
+    assert add(store, "m", **site).status == "unchanged"

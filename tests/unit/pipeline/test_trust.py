@@ -14,7 +14,7 @@ from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import open_map
 from tcpipe.formats.parquet import write_table
-from tcpipe.formats.seals import broken_seal, file_checksum, sealed_page, write_checksums, write_sealed
+from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_checksums, write_sealed
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
@@ -22,7 +22,7 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
-from tcpipe.report.overview import quick_look, write_overview
+from tcpipe.report.overview import quick_look, write_quick_look
 from tcpipe.store import Store
 from tcpipe.tables.levels import STREAMS
 
@@ -70,7 +70,8 @@ def test_a_store_its_runs_and_its_map_verify(made):
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
     store.remember_source("/logs/north.mcap", {"sha256": "north"})
-    write_overview(store.root / "maps" / "site.png", quick_look(open_map(store.map_path("site"))))
+    path = store.map_path("site")
+    write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
     for run in store.runs():
         (run.path / "report.html").write_text(sealed_page("<p>\nwhat was driven\n</p>"))
         streams = run.path.parent / "streams"
