@@ -37,6 +37,7 @@ from tcpipe.formats.log_part import (
     decompressed_prefix,
     gathered,
     in_order,
+    listed,
 )
 from tcpipe.logs.topics import Damage, normalized_type_name
 
@@ -152,13 +153,12 @@ class BagPart:
         if any(chunk.counts is not None and wanted.isdisjoint(chunk.counts) for chunk in self._chunks):
             self._bytes.skips()
 
-        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[tuple[_Chunk, DamageError]]]:
-            lost: list[tuple[_Chunk, DamageError]] = []
-            return list(self._run_blocks(run, wanted, lost)), lost
+        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[Damage]]:
+            noted: list[Damage] = []
+            return list(self._run_blocks(run, wanted, noted)), noted
 
-        for blocks, lost in in_order(read, self._runs(wanted), threads=threads):
-            for chunk, error in lost:
-                self._note_lost(chunk, str(error))
+        for blocks, noted in in_order(read, self._runs(wanted), threads=threads):
+            self.damage.update(dict.fromkeys(noted))
             yield from blocks
 
     def _runs(self, wanted: frozenset[int]) -> Iterator[_ChunkRun]:
@@ -166,8 +166,8 @@ class BagPart:
         chunks = [
             _PlacedChunk(chunk, index * MAX_CHUNK_BYTES, record, size)
             for index, chunk in enumerate(self._chunks)
-            if chunk.counts is None or not wanted.isdisjoint(chunk.counts)
             for record, size in [self._chunk_record(chunk)]
+            if chunk.counts is None or not wanted.isdisjoint(chunk.counts) or self._is_doubtful(chunk, record)
         ]
         for group in groups(chunk.size for chunk in chunks):
             members = chunks[group.start : group.stop]
@@ -175,6 +175,14 @@ class BagPart:
             entries, sound = self._entries(members, sizes)
             for run in runs(entries, sizes, sound, sorted(wanted)):
                 yield _ChunkRun(run, members)
+
+    def _is_doubtful(self, chunk: _Chunk, record: _Record | None) -> bool:
+        """Return whether the index behind a chunk that should hold nothing wanted is another than the summary says."""
+        try:
+            self._index_of(_PlacedChunk(chunk, 0, record, 0))
+        except DamageError:
+            return True
+        return False
 
     def _chunk_record(self, chunk: _Chunk) -> tuple[_Record | None, int]:
         """Return a chunk's record and how many bytes its records take; None and 0 where it is broken."""
@@ -184,10 +192,8 @@ class BagPart:
         except DamageError:
             return None, 0
 
-    def _run_blocks(
-        self, run: _ChunkRun, wanted: frozenset[int], lost: list[tuple[_Chunk, DamageError]]
-    ) -> Iterator[MessageBlock]:
-        """Yield the wanted messages of a run; a chunk that is lost is added to ``lost``."""
+    def _run_blocks(self, run: _ChunkRun, wanted: frozenset[int], noted: list[Damage]) -> Iterator[MessageBlock]:
+        """Yield the wanted messages of a run; what is lost or contradicts itself is added to ``noted``."""
         doubtful = list(run.plan.chunks)
         if run.plan.entries is not None:
             found = excerpt(
@@ -196,7 +202,7 @@ class BagPart:
                 load=lambda number: self._load(run.members[number].chunk, run.members[number].record),
                 copy=lambda number, places, to: self._copy(run.members[number], places, to),
             )
-            lost += [(run.members[number].chunk, error) for number, error in found.lost]
+            noted += [self._lost(run.members[number].chunk, str(error)) for number, error in found.lost]
             true = _borne_out(found.data, found.offset, found.entries)
             doubtful = np.unique(found.entries.chunk[~true]).tolist()
             if doubtful:
@@ -208,12 +214,44 @@ class BagPart:
             try:
                 data = self._load(member.chunk, member.record)
             except DamageError as error:
-                lost.append((member.chunk, error))
+                noted.append(self._lost(member.chunk, str(error)))
             else:
                 walked = _walk_chunk(data)
                 by_connection = {number: walked.messages(number) for number in wanted & walked.offsets.keys()}
                 connections, offsets, stamps = _joined(by_connection)
+                noted += self._contradictions(member.chunk, walked, len(data))
+                if run.plan.entries is not None:
+                    noted += self._disagreement(
+                        member.chunk, (offsets, connections, stamps), run.plan.entries.of_chunk(number)
+                    )
                 yield from _blocks(data, connections, offsets, stamps, member.base + offsets)
+
+    def _contradictions(self, chunk: _Chunk, walked: _ChunkRecords, size: int) -> list[Damage]:
+        """Return what is wrong with a chunk of ``size`` bytes of which each record was looked at."""
+        found, where = [], f"{self.name}, byte {chunk.offset}"
+        if walked.end < size and not chunk.cut:
+            found.append(Damage(where, "the records of a chunk end before it does", bytes_lost=size - walked.end))
+        if unknown := sorted(walked.offsets.keys() - self._connections.keys()):
+            lost = sum(len(walked.offsets[number]) for number in unknown)
+            what = f"messages of {listed('connection', unknown)}, which nothing declares"
+            found.append(Damage(where, what, messages_lost=lost))
+        counts = {number: len(offsets) for number, offsets in walked.offsets.items()}
+        if chunk.counts is not None and counts != chunk.counts:
+            lost = max(sum(chunk.counts.values()) - sum(counts.values()), 0)
+            what = "the bag's index counts other messages than a chunk holds, which are read"
+            found.append(Damage(where, what, messages_lost=lost or None))
+        return found
+
+    def _disagreement(self, chunk: _Chunk, messages: _Messages, entries: Entries) -> list[Damage]:
+        """Return what to say where the index behind a chunk names other messages than its records: neither has a checksum."""
+        offsets, connections, stamps = messages
+        order = np.argsort(offsets)
+        mine = np.stack([offsets[order], connections[order], stamps[order]])
+        if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+            return []
+        what = "the index of a chunk names other messages than the chunk holds, which are read"
+        lost = max(len(entries.offset) - len(offsets), 0) or None
+        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=lost)]
 
     def _entries(self, members: list[_PlacedChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of several chunks by the index records behind them, and of which chunks these are sound."""
@@ -336,6 +374,8 @@ class BagPart:
     def _take_chunk_info(self, record: _Record) -> None:
         data = self._bytes.read(record.data_offset, record.data_bytes)
         counts = dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8]))
+        if len(data) != 8 * len(counts) or len(counts) != record.number(b"count"):
+            raise DamageError("the bag's index contradicts itself")
         chunk = _Chunk(
             record.number(b"chunk_pos"),
             _stamp(record.fields, b"start_time"),
@@ -393,19 +433,16 @@ class BagPart:
         try:
             data = self._load(chunk)
         except DamageError as error:
-            self._note_lost(chunk, str(error))
+            self.damage[self._lost(chunk, str(error))] = None
             return
         found = _walk_chunk(data)
         for connection in found.connections:
             self._take_connection(connection, data[connection.data_offset : connection.end])
         self._chunks.append(chunk)
-        for number in found.offsets:
-            if number in self._connections:
-                _, stamps = found.messages(number)
-                self._tally(number, len(stamps), int(stamps.min()), int(stamps.max()))
-            else:
-                lost = len(found.offsets[number])
-                self._note(position, f"messages of connection {number}, which nothing declares", messages_lost=lost)
+        self.damage.update(dict.fromkeys(self._contradictions(chunk, found, len(data))))
+        for number in found.offsets.keys() & self._connections.keys():
+            _, stamps = found.messages(number)
+            self._tally(number, len(stamps), int(stamps.min()), int(stamps.max()))
 
     def _next_chunk(self, start: int) -> int:
         """Return where the next chunk's record begins: the mark of one, inside a header that parses."""
@@ -466,25 +503,24 @@ class BagPart:
         where = f"{self.name}, byte {offset}"
         self.damage[Damage(where, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
 
-    def _note_lost(self, chunk: _Chunk, what: str) -> None:
-        self.damage[
-            Damage(
-                f"{self.name}, byte {chunk.offset}",
-                f"a chunk is lost: {what}",
-                messages_lost=sum(chunk.counts.values()) if chunk.counts else None,
-                start_ns=chunk.start_ns or None,
-                end_ns=chunk.end_ns or None,
-            )
-        ] = None
+    def _lost(self, chunk: _Chunk, what: str) -> Damage:
+        return Damage(
+            f"{self.name}, byte {chunk.offset}",
+            f"a chunk is lost: {what}",
+            messages_lost=sum(chunk.counts.values()) if chunk.counts else None,
+            start_ns=chunk.start_ns or None,
+            end_ns=chunk.end_ns or None,
+        )
 
 
 @dataclass(slots=True)
 class _ChunkRecords:
-    """What a walk through a chunk met: connections, and each connection's messages."""
+    """What a walk through a chunk met: connections, each connection's messages, and where the records end."""
 
     connections: list[_Record] = field(default_factory=list)
     offsets: dict[int, list[int]] = field(default_factory=dict)
     stamps: dict[int, list[int]] = field(default_factory=dict)
+    end: int = 0
 
     def messages(self, connection: int) -> tuple[Int64Array, Int64Array]:
         """Return a connection's message offsets and log times."""
@@ -525,7 +561,7 @@ def _walk_chunk(data: memoryview) -> _ChunkRecords:
             seconds, nanoseconds = _TIME.unpack_from(header, time_at)
             found.offsets.setdefault(connection, []).append(position)
             found.stamps.setdefault(connection, []).append(seconds * _NS + nanoseconds)
-        position = end
+        found.end = position = end
     return found
 
 

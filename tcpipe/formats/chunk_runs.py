@@ -41,6 +41,10 @@ class Entries:
         of = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
         return Entries(*(values[chosen] for values in of))
 
+    def of_chunk(self, number: int) -> Entries:
+        """Return those of one chunk."""
+        return self.at(self.chunk == number)
+
 
 @dataclass(frozen=True, slots=True)
 class Run:

@@ -7,7 +7,7 @@ import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -41,6 +41,7 @@ BATCH_BYTES = 1 << 25
 
 _WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
 _HASH_BYTES = 1 << 20
+_LISTED = 5
 _FILE_SYSTEMS_OWN = ("lost+found",)
 _KNOWN_MAGIC = (
     (b"PK\x03\x04", "a zip archive"),
@@ -120,13 +121,14 @@ def logs_below(directory: Path) -> list[Path]:
 
 @dataclass(frozen=True, slots=True)
 class _OpenFiles:
-    """The files of a log, open; ``message_count`` is what metadata.yaml says they hold."""
+    """The files of a log, open; ``message_count`` is what metadata.yaml says they hold, ``topic_counts`` what of each topic."""
 
     container: str
     files: tuple[Path, ...]
     parts: tuple[LogPart, ...]
     damage: tuple[Damage, ...] = ()
     message_count: int | None = None
+    topic_counts: Mapping[str, int] = field(default_factory=dict)
 
 
 class Log:
@@ -140,10 +142,21 @@ class Log:
         self._damage: dict[Damage, None] = dict.fromkeys(opened.damage)
         self.topics = self._merged_topics()
         """Every topic by name, as the index tells."""
-        held = sum(topic.message_count or 0 for topic in self.topics.values())
-        if opened.message_count is not None and held < opened.message_count:
-            what = f"metadata.yaml counts {opened.message_count} messages, the files hold {held}"
-            self._damage[Damage(path.name, what, messages_lost=opened.message_count - held)] = None
+        self._compare_counts(opened)
+
+    def _compare_counts(self, opened: _OpenFiles) -> None:
+        """Note where metadata.yaml counts more messages than the files hold, in all or of a topic."""
+        held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
+        short = {
+            name: (count, held.get(name, 0)) for name, count in opened.topic_counts.items() if held.get(name, 0) < count
+        }
+        found = sum(held.values())
+        every = opened.message_count if opened.message_count is not None else found
+        lost = max(every - found, sum(count - there for count, there in short.values()))
+        if lost > 0:
+            of = ", ".join(f"{name} {there} of {count}" for name, (count, there) in list(short.items())[:_LISTED])
+            what = f"metadata.yaml counts {every} messages, the files hold {found}{f': of {of}' if of else ''}"
+            self._damage[Damage(self.path.name, what, messages_lost=lost)] = None
 
     def __enter__(self) -> Self:
         """Return the log, which is open already."""
@@ -424,7 +437,7 @@ def _open_directory(directory: Path, stack: ExitStack) -> _OpenFiles:
             damage.append(Damage(f"{directory.name}/{file.name}", f"a file of the bag is lost: {error}"))
     if not parts:
         raise LogError(*(problem for error in errors for problem in error.problems))
-    return _OpenFiles("rosbag2", found.paths, tuple(parts), tuple(damage), found.message_count)
+    return _OpenFiles("rosbag2", found.paths, tuple(parts), tuple(damage), found.message_count, found.topic_counts)
 
 
 def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:

@@ -33,6 +33,7 @@ _LZ4_HEAD = struct.Struct("<4sBBQ")
 """An LZ4 frame's first fields: magic, flags, block size, size of the content."""
 _LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
 _PEEK_BYTES = 1 << 13
+_LISTED = 5
 _GAP_BYTES = 1 << 15
 """Pieces of a file that lie no further apart are read as one."""
 _MADV_POPULATE_READ = 22
@@ -263,6 +264,14 @@ def in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, thr
         finally:
             for waiting in ahead:
                 waiting.cancel()
+
+
+def listed(what: str, numbers: Sequence[int]) -> str:
+    """Return a short list of numbered things: ``topic 3``, ``2 topics (3, 7)``."""
+    if len(numbers) == 1:
+        return f"{what} {numbers[0]}"
+    shown = ", ".join(map(str, numbers[:_LISTED]))
+    return f"{len(numbers)} {what}s ({shown}{', …' if len(numbers) > _LISTED else ''})"
 
 
 def no_room(error: Exception) -> str:

@@ -27,6 +27,7 @@ from tcpipe.formats.log_part import (
     decompressed_prefix,
     gathered,
     in_order,
+    listed,
 )
 from tcpipe.formats.mcap_records import (
     CHUNK_CRC,
@@ -140,14 +141,14 @@ class McapPart:
         if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
             self._bytes.skips()
 
-        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[tuple[Chunk, DamageError]]]:
-            lost: list[tuple[Chunk, DamageError]] = []
-            return list(self._run_blocks(run, wanted, lost)), lost
+        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[Damage]]:
+            noted: list[Damage] = []
+            return list(self._run_blocks(run, wanted, noted)), noted
 
-        for blocks, lost in in_order(read, self._runs(wanted), threads=threads):
-            for chunk, error in lost:
-                self._note_lost(chunk, str(error))
+        for blocks, noted in in_order(read, self._runs(wanted), threads=threads):
+            self.damage.update(dict.fromkeys(noted))
             yield from blocks
+        self._note_odd_ones_without_crc()
 
     def _wanted_chunks(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
         """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
@@ -169,10 +170,8 @@ class McapPart:
             for run in runs(entries, sizes, sound, sorted(wanted)):
                 yield _ChunkRun(run, members, bases)
 
-    def _run_blocks(
-        self, run: _ChunkRun, wanted: frozenset[int], lost: list[tuple[Chunk, DamageError]]
-    ) -> Iterator[MessageBlock]:
-        """Yield the wanted messages of a run; a chunk that is lost is added to ``lost``."""
+    def _run_blocks(self, run: _ChunkRun, wanted: frozenset[int], noted: list[Damage]) -> Iterator[MessageBlock]:
+        """Yield the wanted messages of a run; what is lost or contradicts itself is added to ``noted``."""
         doubtful = list(run.plan.chunks)
         if run.plan.entries is not None:
             found = excerpt(
@@ -181,7 +180,7 @@ class McapPart:
                 load=lambda number: self._load(run.members[number][1]),
                 copy=lambda number, places, to: self._copy(run.members[number][1], places, to),
             )
-            lost += [(run.members[number][1], error) for number, error in found.lost]
+            noted += [self._lost(run.members[number][1], str(error)) for number, error in found.lost]
             heads = message_heads(found.data, found.offset)
             true = borne_out(heads, found.entries)
             doubtful = np.unique(found.entries.chunk[~true]).tolist()
@@ -189,16 +188,62 @@ class McapPart:
                 found = found.without(doubtful)
                 heads = message_heads(found.data, found.offset)
             ordinals = run.bases[found.entries.chunk] + found.entries.offset
-            yield from message_blocks(found.data, found.offset, heads, ordinals)
+            yield from self._in_time(found.data, found.offset, heads, ordinals, noted)
         for number in doubtful:
             base, chunk = run.members[number]
             try:
                 data = self._load(chunk)
             except DamageError as error:
-                lost.append((chunk, error))
+                noted.append(self._lost(chunk, str(error)))
             else:
-                offsets = _wanted_messages(data, wanted)
-                yield from message_blocks(data, offsets, message_heads(data, offsets), offsets + base)
+                offsets = self._walked_messages(chunk, data, noted)
+                heads = message_heads(data, offsets)
+                chosen = np.isin(heads["channel"], sorted(wanted))
+                offsets, heads = offsets[chosen], heads[chosen]
+                if run.plan.entries is not None:
+                    noted += self._disagreement(chunk, offsets, heads, run.plan.entries.of_chunk(number))
+                yield from self._in_time(data, offsets, heads, offsets + base, noted)
+
+    def _walked_messages(self, chunk: Chunk, data: memoryview, noted: list[Damage]) -> Int64Array:
+        """Return where the messages of a chunk begin, by its records; where these end too early, or are none, that is noted."""
+        records, end = record_offsets(data)
+        messages = message_offsets(data, records)
+        lost = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) - len(messages) if len(records) else 0
+        channels = message_heads(data, messages)["channel"]
+        where = f"{self.name}, byte {chunk.offset}"
+        if lost:
+            noted.append(Damage(where, "messages of a chunk have no times", messages_lost=lost))
+        if end < len(data) and not chunk.cut:
+            noted.append(Damage(where, "the records of a chunk end before it does", bytes_lost=len(data) - end))
+        unknown = [number for number in np.unique(channels).tolist() if number not in self._contents.channels]
+        counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
+        if unknown and not counted:
+            what = f"messages of {listed('channel', unknown)}, which nothing declares"
+            noted.append(Damage(where, what, messages_lost=int(np.isin(channels, unknown).sum())))
+        return messages
+
+    def _disagreement(
+        self, chunk: Chunk, offsets: Int64Array, heads: NDArray[np.void], entries: Entries
+    ) -> list[Damage]:
+        """Return what to say where a chunk's index names other messages than its records; with a CRC the records are right."""
+        mine = np.stack([offsets, heads["channel"].astype(np.int64), heads["log_time_ns"]])
+        theirs = np.stack([entries.offset, entries.channel, entries.log_time_ns])
+        if np.array_equal(mine, theirs):
+            return []
+        what = "the index of a chunk names other messages than the chunk holds, which are read"
+        lost = 0 if self._crc(chunk) else max(len(entries.offset) - len(offsets), 0) or None
+        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=lost)]
+
+    def _in_time(
+        self, data: memoryview, offsets: Int64Array, heads: NDArray[np.void], ordinals: Int64Array, noted: list[Damage]
+    ) -> list[MessageBlock]:
+        """Return messages as blocks, without those whose time is past what 63 bits hold."""
+        times = (heads["log_time_ns"] >= 0) & (heads["publish_time_ns"] >= 0)
+        if not times.all():
+            what = "messages of times after the year 2262"
+            noted.append(Damage(self.name, what, messages_lost=int((~times).sum())))
+            offsets, heads, ordinals = offsets[times], heads[times], ordinals[times]
+        return message_blocks(data, offsets, heads, ordinals)
 
     def _copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
         """Copy pieces (start, stop, place) of a chunk; what need not be read as a whole, to check or decompress it, is not."""
@@ -213,6 +258,14 @@ class McapPart:
         if chunk.headless:
             return 0
         return int.from_bytes(self._bytes.read(chunk.offset + CHUNK_CRC, 4), "little")
+
+    def _note_odd_ones_without_crc(self) -> None:
+        """Note the chunks that were read without a CRC where others of the file have one: it may have been overwritten."""
+        odd = [chunk for chunk in self._contents.chunks if chunk.offset in self._without_crc and not chunk.headless]
+        others = (chunk for chunk in self._contents.chunks if chunk.offset not in self._without_crc)
+        if odd and any(self._crc(chunk) for chunk in others):
+            for chunk in odd:
+                self._note(chunk.offset, "a chunk has no CRC, others of the file have one; it is read unchecked")
 
     def _note_read(self, chunk: Chunk, *, checked: bool) -> None:
         self._read_chunks.add(chunk.offset)
@@ -324,6 +377,8 @@ class McapPart:
             raise DamageError
         if contents.statistics is None or contents.statistics.chunks != len(contents.chunks):
             raise DamageError
+        if contents.statistics.messages != sum(counted.values()):  # a writer need not count them by channel
+            raise DamageError
         if any(chunk.end > self._bytes.size or chunk.offset < len(MAGIC) for chunk in contents.chunks):
             raise DamageError("the summary points outside the file")
 
@@ -337,6 +392,18 @@ class McapPart:
             self._contents.chunks.append(chunk)
             position = chunk.end + chunk.index_bytes
         self._walk(self._contents, position, self._bytes.size)
+        self._note_undeclared()
+
+    def _check_data_section(self, contents: _Contents, end: int) -> None:
+        """Compare the CRC of all data, where there is one, if messages lie outside chunks: nothing else covers these."""
+        crc = int.from_bytes(self._bytes.peek(end + RECORD_HEAD, 4), "little")
+        if not crc or not any(chunk.headless for chunk in contents.chunks):
+            return
+        found = 0
+        for start in range(0, end, _RUN_BYTES):
+            found = crc32(self._bytes.read_once(start, min(_RUN_BYTES, end - start)), found)
+        if found != crc:
+            self._note(end, "the CRC of the data does not match; messages outside chunks may be wrong or missing")
 
     def _walk(self, contents: _Contents, start: int, end: int) -> bool:
         """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
@@ -368,6 +435,8 @@ class McapPart:
                 after = self._stepped_over(contents, position, end, error)
             position = after
         run.finish(contents.chunks)
+        if closed and opcode == OP_DATA_END:
+            self._check_data_section(contents, position)
         return closed
 
     def _stepped_over(self, contents: _Contents, position: int, end: int, error: DamageError) -> int:
@@ -446,17 +515,20 @@ class McapPart:
                     continue
                 if len(entries):
                     self._tally(channel, len(entries), int(entries[:, 0].min()), int(entries[:, 0].max()))
-        for channel in sorted(self._tallies.keys() - contents.channels.keys()):
-            lost = self._tallies[channel].count
-            self._note(0, f"messages of channel {channel}, which nothing declares", messages_lost=lost)
+        self._note_undeclared()
+
+    def _note_undeclared(self) -> None:
+        if unknown := sorted(self._tallies.keys() - self._contents.channels.keys()):
+            lost = sum(self._tallies[channel].count for channel in unknown)
+            self._note(0, f"messages of {listed('channel', unknown)}, which nothing declares", messages_lost=lost)
 
     def _declare_and_count(self, chunk: Chunk) -> None:
         try:
             data = self._load(chunk)
         except DamageError as error:
-            self._note_lost(chunk, str(error))
+            self.damage[self._lost(chunk, str(error))] = None
             return
-        records = record_offsets(data)
+        records, _ = record_offsets(data)
         self._declare(chunk, data, records)
         if chunk.index is None:
             self._tally_messages(data, message_offsets(data, records))
@@ -519,22 +591,20 @@ class McapPart:
         where = f"{self.name}, byte {offset}"
         self.damage[Damage(where, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
 
-    def _note_lost(self, chunk: Chunk, what: str) -> None:
-        """Note a chunk that is lost as a whole, counted by the message index beside it."""
+    def _lost(self, chunk: Chunk, what: str) -> Damage:
+        """Return what to say of a chunk that is lost as a whole, counted by the message index beside it."""
         try:
             lost = sum(len(self._index_entries(at, channel)) for channel, at in (chunk.index or {}).items())
         except DamageError:
             lost = 0
-        self.damage[
-            Damage(
-                f"{self.name}, byte {chunk.offset}",
-                f"a chunk is lost: {what}",
-                messages_lost=lost or None,
-                bytes_lost=chunk.uncompressed_bytes,
-                start_ns=chunk.start_ns,
-                end_ns=chunk.end_ns,
-            )
-        ] = None
+        return Damage(
+            f"{self.name}, byte {chunk.offset}",
+            f"a chunk is lost: {what}",
+            messages_lost=lost or None,
+            bytes_lost=chunk.uncompressed_bytes,
+            start_ns=chunk.start_ns,
+            end_ns=chunk.end_ns,
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -569,16 +639,9 @@ class _MessageRun:
         self._start = self._end = 0
 
 
-def _wanted_messages(data: memoryview, wanted: frozenset[int]) -> Int64Array:
-    """Return where the wanted messages begin, by walking the records."""
-    offsets = message_offsets(data, record_offsets(data))
-    channels = gathered(data, offsets + RECORD_HEAD, "u2") if len(offsets) else offsets
-    return offsets[np.isin(channels, sorted(wanted))]
-
-
 def _parse_summary(section: memoryview) -> _Contents:
     contents = _Contents()
-    for offset in record_offsets(section).tolist():
+    for offset in record_offsets(section)[0].tolist():
         length = int.from_bytes(section[offset + 1 : offset + RECORD_HEAD], "little")
         content = section[offset + RECORD_HEAD : offset + RECORD_HEAD + length]
         if section[offset] == OP_CHUNK_INDEX:

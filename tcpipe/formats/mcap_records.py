@@ -96,6 +96,7 @@ class Chunk:
 class Statistics:
     """Counts of the whole file."""
 
+    messages: int
     chunks: int
     start_ns: int
     end_ns: int
@@ -185,8 +186,8 @@ def parse_chunk_index(content: bytes | memoryview) -> Chunk:
 def parse_statistics(content: bytes | memoryview) -> Statistics:
     """Return the counts of the file."""
     fields = Fields(content)
-    _, _, _, _, _, chunks, start_ns, end_ns, map_bytes = fields.take("QHIIIIQQI")
-    return Statistics(chunks, start_ns, end_ns, fields.pairs(map_bytes))
+    messages, _, _, _, _, chunks, start_ns, end_ns, map_bytes = fields.take("QHIIIIQQI")
+    return Statistics(messages, chunks, start_ns, end_ns, fields.pairs(map_bytes))
 
 
 def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:
@@ -280,8 +281,8 @@ def message_blocks(
     )
 
 
-def record_offsets(data: bytes | memoryview) -> Int64Array:
-    """Walk the records in ``data`` and return where each begins; a record that does not fit ends the walk."""
+def record_offsets(data: bytes | memoryview) -> tuple[Int64Array, int]:
+    """Walk the records in ``data`` and return where each begins, and where they end: one that does not fit ends the walk."""
     size, position, found = len(data), 0, []
     length_at = struct.Struct("<Q").unpack_from
     while position + RECORD_HEAD <= size:
@@ -290,7 +291,7 @@ def record_offsets(data: bytes | memoryview) -> Int64Array:
             break
         found.append(position)
         position = end
-    return np.array(found, np.int64)
+    return np.array(found, np.int64), position
 
 
 def message_offsets(data: memoryview, records: Int64Array) -> Int64Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,11 +29,12 @@ _PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")
 
 @dataclass(frozen=True, slots=True)
 class Rosbag2Files:
-    """The storage files of a bag in order, what is wrong with their list, and how many messages metadata.yaml counts."""
+    """The storage files of a bag in order, what is wrong with their list, and how many messages metadata.yaml counts, also by topic."""
 
     paths: tuple[Path, ...]
     damage: tuple[Damage, ...]
     message_count: int | None = None
+    topic_counts: Mapping[str, int] = field(default_factory=dict)
 
 
 def rosbag2_files(directory: Path) -> Rosbag2Files:
@@ -87,7 +88,19 @@ def rosbag2_files(directory: Path) -> Rosbag2Files:
             f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({', '.join(listed) or 'none'})"
         )
     count = information.get("message_count")
-    return Rosbag2Files(tuple(paths), tuple(damage), count if isinstance(count, int) else None)
+    count = count if isinstance(count, int) else None
+    return Rosbag2Files(tuple(paths), tuple(damage), count, _topic_counts(information))
+
+
+def _topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
+    """Return how many messages metadata.yaml counts of each topic; nothing where it is not as the recorder writes it."""
+    counts: dict[str, int] = {}
+    with suppress(KeyError, TypeError):
+        for entry in information["topics_with_message_count"]:
+            name, count = entry["topic_metadata"]["name"], entry["message_count"]
+            if isinstance(name, str) and isinstance(count, int):
+                counts[name] = counts.get(name, 0) + count
+    return counts
 
 
 def storage_files(directory: Path) -> tuple[Path, ...]:

@@ -1,6 +1,7 @@
 """The .db3 files of ROS 2: SQLite tables of topics and messages, all schema versions; a cut file gives what can still be had.
 
-SQLite has no checksums: a byte flipped inside a message is not noticed here.
+SQLite has no checksums: a byte flipped inside a message is not noticed here. But every row of the table of messages either becomes a
+message or is counted as damage, and a file whose pages contradict one another is said to be broken.
 """
 
 from __future__ import annotations
@@ -13,13 +14,14 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_part import Channel, DamageError, Int64Array, MessageBlock, in_order, load_only, no_room
-from tcpipe.formats.sqlite_pages import MAGIC, PageReader, Rows, UnusualError
+from tcpipe.formats.log_part import Channel, DamageError, Int64Array, MessageBlock, in_order, listed, load_only, no_room
+from tcpipe.formats.sqlite_pages import MAGIC, MAX_COLUMNS, Leaves, PageReader, Rows, UnusualError
 from tcpipe.logs.topics import Damage, normalized_type_name
 
 __all__ = ["MAGIC", "SqlitePart"]
@@ -36,7 +38,14 @@ is recognised."""
 _FILLED_BYTES, _MAX_BYTES = 1 << 28, 1 << 42
 """Behind so many such bytes a cut file is made as long as it says it was by a hole; one that says more than the second is refused."""
 _BELOW, _ABOVE = -(2**63), 2**63 - 1
-_ROW_TYPES = [int, int, int, int, bytes]
+_BEFORE_ALL, _BEHIND_ALL = -1e19, 1e19
+"""Row ids lie between these: numbers of 64 bits do."""
+MAX_TOPICS = 1 << 16
+"""More topics than this are refused, as MCAP cannot number more; a robot has some hundred."""
+_LONGEST_BYTES, _ROW_BYTES = 1 << 30, 1 << 10
+"""A row that claims to be longer, or longer than its file, is not read: a chain of pages may lead back to itself."""
+_TABLES = ("topics", "messages", "message_definitions")
+_NOTHING = "rows that are no messages: a number, a time or the data is missing or of another kind"
 _BROKEN = (sqlite3.Error, UnicodeDecodeError)
 """What a broken database raises; the second where even the name in its complaint is broken."""
 _Row = tuple[int, int, int, int, bytes]
@@ -56,9 +65,10 @@ class SqlitePart:
         try:
             self._database = self._open(path)
             self._database.text_factory = lambda text: text.decode(errors="backslashreplace")
-            self._refuse_views(path)
+            self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(path.stat().st_size + _ROW_BYTES, _LONGEST_BYTES))
+            self._refuse_odd_tables(path)
             self._table = None if self._scratch else _message_table(path, self._database)
-            self.channels = self._channels()
+            self.channels = self._channels(path)
         except LogError:
             self.close()
             raise
@@ -93,7 +103,8 @@ class SqlitePart:
         topics = sorted(wanted & self.channels.keys())
         if not topics:
             return
-        read_until, lost = _BELOW, 0
+        read_until: int | None = None
+        lost = 0
         if self._table:
             try:
                 for last, found, broken in self._table.blocks(topics, threads=threads):
@@ -135,23 +146,30 @@ class SqlitePart:
                 file.truncate(wanted)
         return sqlite3.connect(copy)
 
-    def _refuse_views(self, path: Path) -> None:
+    def _refuse_odd_tables(self, path: Path) -> None:
         """Refuse a file whose topics or messages are no plain tables: what else there is may compute without end."""
-        query = "SELECT name, type, rootpage FROM sqlite_schema WHERE lower(name) IN ('topics', 'messages', 'message_definitions')"
-        for name, kind, root in self._database.execute(query):
-            if kind != "table" or not root:
+        query = "SELECT lower(name), type, rootpage FROM sqlite_schema WHERE lower(name) IN (?, ?, ?)"
+        for name, kind, root in self._database.execute(query, _TABLES):
+            computed = any(hidden for *_, hidden in self._database.execute(f"PRAGMA table_xinfo({name})"))
+            if kind != "table" or not root or computed:
                 raise LogError(f"{path}: its {name!r} is no plain table; nothing can be had from it")
 
-    def _channels(self) -> dict[int, Channel]:
+    def _channels(self, path: Path) -> dict[int, Channel]:
+        rows = self._database.execute(
+            "SELECT id, name, type, serialization_format FROM topics ORDER BY id LIMIT ?", (MAX_TOPICS + 1,)
+        ).fetchall()
+        if len(rows) > MAX_TOPICS:
+            raise LogError(f"{path}: it names more than {MAX_TOPICS} topics; no more are read of one file")
         definitions = self._definitions()
         spans = self._spans()
         channels = {}
-        for number, topic, type_name, encoding in self._database.execute(
-            "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
-        ):
+        for number, topic, type_name, encoding in rows:
+            if not isinstance(number, int):
+                self._note(f"topic {topic} has no number")
+                continue
             schema_encoding, definition = definitions.get(type_name, ("", ""))
             count, start_ns, end_ns = spans.get(number, (0, None, None))
-            channels[int(number)] = Channel(
+            channels[number] = Channel(
                 str(topic),
                 normalized_type_name(str(type_name)),
                 str(encoding),
@@ -161,8 +179,9 @@ class SqlitePart:
                 start_ns,
                 end_ns,
             )
-        for number in sorted(spans.keys() - channels.keys()):
-            self._note(f"messages of topic {number}, which nothing declares", messages_lost=spans[number][0])
+        if unknown := sorted(spans.keys() - channels.keys()):
+            lost = sum(spans[number][0] for number in unknown)
+            self._note(f"messages of {listed('topic', unknown)}, which nothing declares", messages_lost=lost)
         return channels
 
     def _definitions(self) -> dict[str, tuple[str, str]]:
@@ -176,39 +195,63 @@ class SqlitePart:
             return {}
 
     def _spans(self) -> dict[int, tuple[int, int, int]]:
-        """Return count, first and last log time by topic; in a broken file, of the messages that can be reached."""
+        """Return count, first and last log time by topic, and count the rows that are no messages; in a broken file, of what is reached."""
         if self._table:
             try:
-                return self._table.spans()
+                spans, lost = self._table.spans()
             except UnusualError:
                 self._table = None
-        query = (
-            "SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages "
-            "WHERE typeof(topic_id) = 'integer' AND typeof(timestamp) = 'integer' GROUP BY topic_id"
-        )
+            else:
+                self._note_lost_rows(lost)
+                return spans
+        self._note_contradictions()
+        is_message = " AND ".join(f"typeof({column}) = '{kind}'" for column, kind in self._kinds().items())
+        query = f"SELECT topic_id, COUNT(*), MIN(timestamp), MAX(timestamp) FROM messages WHERE {is_message} GROUP BY topic_id"  # noqa: S608
         try:
-            return {topic: (count, start, end) for topic, count, start, end in self._database.execute(query)}
+            spans = {topic: (count, start, end) for topic, count, start, end in self._database.execute(query)}
+            every = self._database.execute("SELECT COUNT(*) FROM messages NOT INDEXED").fetchone()[0]
         except _BROKEN:
-            spans: dict[int, tuple[int, int, int]] = {}
-            for rows in self._reachable("SELECT id, topic_id, timestamp, timestamp, x'' FROM messages WHERE TRUE"):
-                for _, topic, stamp, _, _ in rows:
+            return self._reachable_spans(is_message)
+        self._note_lost_rows(every - sum(count for count, _, _ in spans.values()))
+        return spans
+
+    def _reachable_spans(self, is_message: str) -> dict[int, tuple[int, int, int]]:
+        spans: dict[int, tuple[int, int, int]] = {}
+        lost = 0
+        for rows in self._reachable(f"SELECT id, topic_id, timestamp, {is_message} FROM messages WHERE TRUE"):  # noqa: S608
+            for _, topic, stamp, right in rows:
+                lost += not right
+                if right:
                     count, start, end = spans.get(topic, (0, stamp, stamp))
                     spans[topic] = (count + 1, min(start, stamp), max(end, stamp))
-            return spans
+        self._note_lost_rows(lost)
+        return spans
 
-    def _rows(self, topics: list[int], above: int) -> Iterator[list[_Row]]:
-        """Yield the topics' messages in the order they were written, those with ids above ``above``."""
+    def _kinds(self) -> dict[str, str]:
+        """Return SQLite's kind of value in each column of a message: row id, topic, log time, publish time, data."""
         columns = {row[1] for row in self._database.execute("PRAGMA table_info(messages)")}
         publish = "send_timestamp" if "send_timestamp" in columns else "timestamp"
-        wanted = ",".join(map(str, topics))
-        return self._reachable(
-            f"SELECT id, topic_id, timestamp, {publish}, data FROM messages WHERE topic_id IN ({wanted})",  # noqa: S608
-            above,
-        )
+        return {"id": "integer", "topic_id": "integer", "timestamp": "integer", publish: "integer", "data": "blob"}
 
-    def _reachable(self, query: str, low: int = _BELOW) -> Iterator[list[_Row]]:
-        """Yield a query's rows by ascending id; past a broken page, upward to it and downward to it."""
-        high = _ABOVE
+    def _rows(self, topics: list[int], above: int | None) -> Iterator[list[_Row]]:
+        """Yield the topics' messages in the order they were written, those with ids above ``above``."""
+        kinds = self._kinds()
+        publish = "send_timestamp" if "send_timestamp" in kinds else "timestamp"
+        is_message = " AND ".join(f"typeof({column}) = '{kind}'" for column, kind in kinds.items())
+        of_topics = f"{is_message} AND topic_id IN ({','.join(map(str, topics))})"
+        query = f"SELECT id, topic_id, timestamp, {publish}, data FROM messages WHERE {of_topics}"  # noqa: S608
+        lost = 0
+        for rows in self._reachable(query, _BEFORE_ALL if above is None else above):
+            whole = [row for row in rows if _FILL not in row[4][-7:]] if self._cut else rows
+            lost += len(rows) - len(whole)
+            if whole:
+                yield whole
+        if lost:
+            self._note("messages whose end is lost", messages_lost=lost)
+
+    def _reachable(self, query: str, low: float = _BEFORE_ALL) -> Iterator[list[Any]]:
+        """Yield a query's rows by ascending id, their first column; past a broken page, upward to it and downward to it."""
+        high = _BEHIND_ALL
         between = f"{query} AND id > ? AND id < ? ORDER BY id"
         for rows in self._until_broken(f"{between} ASC", low, high):
             low = rows[-1][0]
@@ -225,43 +268,45 @@ class SqlitePart:
             for rows in self._until_broken(f"{between} DESC{limit}", low, high):
                 high = rows[-1][0]
                 above.append(rows[::-1])
-        start = "the beginning" if low == _BELOW else f"message {low}"
-        span = f"between {start} and {'the end' if high == _ABOVE else f'message {high}'}"
+        start = "the beginning" if low == _BEFORE_ALL else f"message {low}"
+        span = f"between {start} and {'the end' if high == _BEHIND_ALL else f'message {high}'}"
         self._note(f"messages {span} cannot be read ({broken})")
         yield from above[::-1]
 
-    def _until_broken(self, query: str, low: int, high: int) -> Iterator[list[_Row]]:
+    def _until_broken(self, query: str, low: float, high: float) -> Iterator[list[Any]]:
         """Yield a query's rows in blocks until its end, or until the database breaks (then ``_broken`` says how)."""
-        self._broken, unsound = "", 0
+        self._broken = ""
         try:
             cursor = self._database.execute(query, (low, high))
         except _BROKEN as error:
             self._broken = str(error)
             return
         while not self._broken:
-            rows: list[_Row] = []
+            rows: list[Any] = []
             try:
                 rows.extend(itertools.islice(cursor, _ROWS))  # what came before an error stays
             except _BROKEN as error:
                 self._broken = str(error)
-            sound = self._sound(rows)
-            unsound += len(rows) - len(sound)
-            if sound:
-                yield sound
+            if rows:
+                yield rows
             if len(rows) < _ROWS:
                 break
-        if unsound:
-            self._note("rows that are no messages, or whose end is lost", messages_lost=unsound)
 
-    def _sound(self, rows: list[_Row]) -> list[_Row]:
-        """Return the rows that are messages; in a cut file, those whose last bytes are the file's own."""
-        if rows and not self._cut:
-            kinds = [set(map(type, column)) for column in zip(*rows, strict=True)]
-            if kinds[:4] == [{int}] * 4 and kinds[4] == {bytes}:
-                return rows
-        return [
-            row for row in rows if [type(v) for v in row] == _ROW_TYPES and not (self._cut and _FILL in row[4][-7:])
-        ]
+    def _note_contradictions(self) -> None:
+        """Note where the pages of a file contradict one another: SQLite reads on over much of that, and says nothing."""
+        if self._cut:  # which is noted already
+            return
+        try:
+            self._database.execute("PRAGMA ignore_check_constraints = ON")
+            found = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
+        except _BROKEN as error:
+            found = str(error)
+        if found != "ok" and " value in " not in found:  # a value that is none is the row's own trouble, and counted
+            self._note(f"its pages contradict one another ({found.splitlines()[-1]}); rows may be missing or wrong")
+
+    def _note_lost_rows(self, lost: int) -> None:
+        if lost:
+            self._note(_NOTHING, messages_lost=lost)
 
     def _note(self, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
         self.damage[Damage(self.name, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
@@ -286,7 +331,7 @@ class _MessageTable:
         """Yield all rows, some thousand at a time; `UnusualError` ends it."""
         if self._kept is not None:
             for leaves, rows in zip(self._leaves, self._kept, strict=True):
-                self._pages.load(leaves)
+                self._pages.load(leaves.pages)
                 yield rows
             return
         last, touched = _BELOW, 0
@@ -301,16 +346,17 @@ class _MessageTable:
                 self._map.madvise(mmap.MADV_DONTNEED)
                 touched = 0
 
-    def _rows(self, leaves: Int64Array) -> Rows:
-        self._pages.load(leaves)  # and not what lies between them: messages larger than a page
+    def _rows(self, leaves: Leaves) -> Rows:
+        self._pages.load(leaves.pages)  # and not what lies between them: messages larger than a page
         return self._pages.rows(leaves, self._columns, self._integers)
 
-    def spans(self) -> dict[int, tuple[int, int, int]]:
-        """Return count, first and last log time by topic."""
+    def spans(self) -> tuple[dict[int, tuple[int, int, int]], int]:
+        """Return count, first and last log time by topic, and how many rows are no messages."""
         spans: dict[int, tuple[int, int, int]] = {}
         found: list[Rows] = []
-        count_all = 0
+        count_all = lost = 0
         for rows in self.rows():
+            lost += rows.lost
             count_all += len(rows.ids)
             if count_all <= _KEPT_ROWS:
                 found.append(rows)
@@ -320,7 +366,7 @@ class _MessageTable:
                 count, start, end = spans.get(number, (0, _ABOVE, _BELOW))
                 spans[number] = count + len(stamps), min(start, int(stamps.min())), max(end, int(stamps.max()))
         self._kept = found if count_all <= _KEPT_ROWS else None
-        return spans
+        return spans, lost
 
     def blocks(self, topics: list[int], *, threads: int = 1) -> Iterator[tuple[int, list[MessageBlock], int]]:
         """Yield the messages of the topics, some rows at a time, up to which id these go, and how many of them are broken.
@@ -395,7 +441,7 @@ def _message_table(path: Path, database: sqlite3.Connection) -> _MessageTable | 
     names = [str(name) for _, name, *_ in columns]
     keys = [(name, str(kind).upper()) for _, name, kind, _, _, key, _ in columns if key]
     plain = all(not hidden for *_, hidden in columns) and {"topic_id", "timestamp", "data"} <= set(names)
-    if not plain or keys != [("id", "INTEGER")] or (names[0], names[-1]) != ("id", "data"):
+    if not plain or len(names) > MAX_COLUMNS or keys != [("id", "INTEGER")] or (names[0], names[-1]) != ("id", "data"):
         return None
     try:
         return _MessageTable(path, int(found[0][0]), names)

@@ -2,14 +2,15 @@
 
 A table is a B-tree of pages; its leaves hold rows as cells: payload size and row id (varints), then the payload: a header of varints that
 give each column's type, then the columns. What does not fit in a page goes on in a chain of overflow pages. All cells of many leaves are
-parsed at once here, so that a message costs no step of its own. Whatever is out of the ordinary raises `UnusualError`; the caller then
-leaves the file to SQLite.
+parsed at once here, so that a message costs no step of its own. A page that contradicts itself or the tree above it (its cells do not
+fill it, ids that the page above does not allow) raises `UnusualError`, and the caller leaves the file to SQLite; a row that contradicts
+itself is counted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +26,13 @@ _MAX_DEPTH = 20
 _LEAVES_AT_ONCE = 4096
 _SMALL_BYTES = np.array([0, 1, 2, 3, 4, 6, 8, 8, 0, 0], np.int64)
 """Bytes of a column by its serial type: NULL, integers, a float, and the constants 0 and 1."""
-_FIRST_BLOB = 12
+_FLOAT, _LAST_INTEGER, _FIRST_BLOB = 7, 9, 12
 _CELL_HEAD = 32
-"""Bytes of a cell that hold all its varints, of a table of few columns."""
+"""Bytes of a cell that hold all its varints, of a table of no more than `MAX_COLUMNS`."""
+MAX_COLUMNS = 6
+"""Payload size and row id take 9 bytes at most, header and data 5, what other columns there are 2 each: 32 bytes."""
+_VARINT_BYTES = 9
+_NO_BOUND = 2**63 - 1
 
 
 class UnusualError(Exception):
@@ -36,7 +41,7 @@ class UnusualError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """Rows of a table: row id and integer columns, and where the blob lies.
+    """Rows of a table that are messages: row id and integer columns, and where the blob lies; ``lost`` counts those that are none.
 
     ``offsets`` is where the blob begins in the file, ``lengths`` its size, ``local`` how many bytes of it lie there; the rest is in the
     overflow chain that begins at page ``overflow`` (0 where there is none). All of shape (N,).
@@ -48,12 +53,22 @@ class Rows:
     lengths: Int64Array
     local: Int64Array
     overflow: Int64Array
+    lost: int = 0
 
-    def chosen(self, which: Int64Array) -> Rows:
+    def chosen(self, which: Int64Array | NDArray[np.bool_]) -> Rows:
         """Return the rows of these numbers."""
         integers = tuple(values[which] for values in self.integers)
-        rest = (of[which] for of in (self.offsets, self.lengths, self.local, self.overflow))
-        return Rows(self.ids[which], integers, *rest)
+        where = self.offsets[which], self.lengths[which], self.local[which], self.overflow[which]
+        return Rows(self.ids[which], integers, *where)
+
+
+@dataclass(frozen=True, slots=True)
+class Leaves:
+    """Leaf pages by number, and between which row ids (above the first, up to the second) theirs lie, shape (N,) each."""
+
+    pages: Int64Array
+    above: Int64Array
+    until: Int64Array
 
 
 def _is_loaded(starts: Int64Array, ends: Int64Array) -> None:
@@ -93,47 +108,56 @@ class PageReader:
         self._octets: NDArray[np.uint8] = np.frombuffer(data, np.uint8)
         self._pages = self._octets.reshape(pages, self.page_bytes)
 
-    def leaves(self, root: int) -> list[Int64Array]:
-        """Return the numbers of a table's leaf pages, given its root's, by rising row id, in groups of some thousand.
+    def leaves(self, root: int) -> list[Leaves]:
+        """Return a table's leaf pages, given its root's number, by rising row id, in groups of some thousand.
 
         Raises
         ------
         UnusualError
             Something does not look as a plain table does.
         """
-        level = np.array([root], np.int64)
+        level, until = np.array([root], np.int64), np.array([_NO_BOUND], np.int64)
         for _ in range(_MAX_DEPTH):
             self._check(level)
             if (level == 1).any():
                 break
             self.load(level[:1])
             if self._pages[level[0] - 1, 0] == _LEAF:  # all leaves lie equally deep
-                return [level[start : start + _LEAVES_AT_ONCE] for start in range(0, len(level), _LEAVES_AT_ONCE)]
+                above = np.append(-_NO_BOUND - 1, until[:-1])
+                cuts = [slice(start, start + _LEAVES_AT_ONCE) for start in range(0, len(level), _LEAVES_AT_ONCE)]
+                return [Leaves(level[cut], above[cut], until[cut]) for cut in cuts]
             self.load(level)
-            counts, cells = self._cells(level, _INTERIOR, _INTERIOR_HEAD)
-            children = np.empty(len(cells) + len(level), np.int64)
-            last = np.cumsum(counts + 1) - 1
-            left = np.ones(len(children), np.bool_)
-            left[last] = False
-            children[left] = _big_endian(self._data, cells)
-            children[last] = _big_endian(self._data, (level - 1) * self.page_bytes + 8)
-            level = children
+            level, until = self._children(level, until)
         raise UnusualError
+
+    def _children(self, level: Int64Array, until: Int64Array) -> tuple[Int64Array, Int64Array]:
+        """Return the pages below interior ones, and up to which row id each goes."""
+        counts, cells = self._cells(level, _INTERIOR, _INTERIOR_HEAD)
+        keys, ends = _varints(self._heads(cells + 4), 1)
+        self._expect_filled(level, counts, cells, 4 + ends[0])
+        children, bounds = np.empty((2, len(cells) + len(level)), np.int64)
+        last = np.cumsum(counts + 1) - 1
+        left = np.ones(len(children), np.bool_)
+        left[last] = False
+        children[left], bounds[left] = _big_endian(self._data, cells), keys[0]
+        children[last], bounds[last] = _big_endian(self._data, (level - 1) * self.page_bytes + 8), until
+        _expect(bounds[1:] > bounds[:-1])
+        return children, bounds
 
     def load(self, pages: Int64Array) -> None:
         """Have pages loaded, by their numbers; `UnusualError` where one cannot be."""
         starts = np.sort(pages - 1) * self.page_bytes
         self._load(starts, starts + self.page_bytes)
 
-    def rows(self, leaves: Int64Array, columns: int, integers: tuple[int, ...]) -> Rows:
+    def rows(self, leaves: Leaves, columns: int, integers: tuple[int, ...]) -> Rows:
         """Return the rows on leaf pages, which are loaded.
 
         Parameters
         ----------
         leaves
-            Numbers of the pages.
+            The pages.
         columns
-            How many columns a row has: the first is the row id, the last the blob.
+            How many columns a row has, at most `MAX_COLUMNS`: the first is the row id, the last the blob.
         integers
             Columns that are integers.
 
@@ -142,28 +166,31 @@ class PageReader:
         UnusualError
             Something does not look as in a plain table.
         """
-        _, cells = self._cells(leaves, _LEAF, _LEAF_HEAD)
-        page_ends = cells // self.page_bytes * self.page_bytes + self._usable
+        counts, cells = self._cells(leaves.pages, _LEAF, _LEAF_HEAD)
         numbers, ends = _varints(self._heads(cells), 3 + columns)
         sizes, ids, header_bytes, *kinds = numbers
         payloads = cells + ends[1]
+        _expect((ends[1] > 0) & (sizes >= 0) & (sizes <= len(self._octets)))
         local_ends = payloads + self._local_bytes(sizes)
         spilled = local_ends < payloads + sizes
-        _expect(local_ends + 4 * spilled <= page_ends)
+        self._expect_filled(leaves.pages, counts, cells, np.maximum(local_ends + 4 * spilled - cells, 4))
+        _expect(ids[1:] > ids[:-1])
+        _expect((ids > np.repeat(leaves.above, counts)) & (ids <= np.repeat(leaves.until, counts)))
         positions = [payloads + header_bytes]
         for kind in kinds:
             positions.append(positions[-1] + _column_bytes(kind))
         blobs = positions[-2]
-        _expect((cells + ends[-1] == positions[0]) & (positions[-1] == payloads + sizes) & (blobs <= local_ends))
-        _expect(sizes <= len(self._octets))
-        _expect((kinds[-1] >= _FIRST_BLOB) & (kinds[-1] % 2 == 0))
-        _expect(ids[1:] > ids[:-1])
+        right = (cells + ends[-1] == positions[0]) & (positions[-1] == payloads + sizes) & (blobs <= local_ends)
+        right &= (kinds[-1] >= _FIRST_BLOB) & (kinds[-1] % 2 == 0) & (np.array(kinds) >= 0).all(axis=0)
+        for column in integers:
+            right &= (kinds[column] >= 1) & (kinds[column] <= _LAST_INTEGER) & (kinds[column] != _FLOAT)
         overflow = np.zeros(len(cells), np.int64)
         if spilled.any():
             overflow[spilled] = _big_endian(self._data, local_ends[spilled])
-        found = {column: self._integers(positions[column + 1], kinds[column]) for column in set(integers)}
+        found = {column: self._integers(positions[column + 1], kinds[column], right) for column in set(integers)}
         values = tuple(found[column] for column in integers)
-        return Rows(ids, values, blobs, payloads + sizes - blobs, local_ends - blobs, overflow)
+        every = Rows(ids, values, blobs, payloads + sizes - blobs, local_ends - blobs, overflow)
+        return every if right.all() else replace(every.chosen(right), lost=int((~right).sum()))
 
     def blobs(self, rows: Rows) -> tuple[memoryview, Int64Array]:
         """Return the blobs of rows, overflow and all, in one buffer, and where each begins there."""
@@ -215,6 +242,40 @@ class PageReader:
         _expect((pointers >= head_bytes) & (pointers <= self._usable - 4))
         return counts, owners + pointers
 
+    def _expect_filled(self, pages: Int64Array, counts: Int64Array, cells: Int64Array, sizes: Int64Array) -> None:
+        """Expect cells of ``sizes`` bytes to lie apart, and to fill their pages but for the room that these call free.
+
+        A cell that is missing from its page's list is seen here.
+        """
+        starts = (pages - 1) * self.page_bytes
+        owners = np.repeat(np.arange(len(pages)), counts)
+        _expect(cells + sizes <= starts[owners] + self._usable)
+        order = np.lexsort((cells, owners))
+        together = owners[1:] == owners[:-1]
+        _expect(((cells + sizes)[order][:-1] <= cells[order][1:]) | ~together)
+        content = _swapped(gathered(self._data, starts + 5, "u2"))
+        content[content == 0] = 1 << 16
+        free = self._octets[starts + 7].astype(np.int64)
+        blocks = _swapped(gathered(self._data, starts + 1, "u2"))
+        for page in np.flatnonzero(blocks).tolist():
+            free[page] += self._free_bytes(int(starts[page]), int(blocks[page]))
+        filled = np.bincount(owners, sizes, len(pages)).astype(np.int64)
+        _expect(filled + free == self._usable - content)
+
+    def _free_bytes(self, start: int, block: int) -> int:
+        """Return the size of a page's chain of free blocks (section 1.6 of the format)."""
+        free = 0
+        while block:
+            if block > self._usable - 4:
+                raise UnusualError
+            following, size = (
+                int.from_bytes(self._data[start + block + at : start + block + at + 2], "big") for at in (0, 2)
+            )
+            if size < 4 or block + size > self._usable or 0 < following < block + size:
+                raise UnusualError
+            free, block = free + size, following
+        return free
+
     def _local_bytes(self, sizes: Int64Array) -> Int64Array:
         """Return how many bytes of each payload lie in the leaf (section 1.6 of the format)."""
         most, least = self._usable - 35, (self._usable - 12) * 32 // 255 - 23
@@ -236,10 +297,10 @@ class PageReader:
             heads[row, : len(short)] = short
         return heads
 
-    def _integers(self, ends: Int64Array, kinds: Int64Array) -> Int64Array:
-        """Return integer columns that end at ``ends``: big-endian two's complement of 1 to 8 bytes, or a constant."""
+    def _integers(self, ends: Int64Array, kinds: Int64Array, right: NDArray[np.bool_]) -> Int64Array:
+        """Return integer columns that end at ``ends``: big-endian two's complement of 1 to 8 bytes, or a constant; 0 where not right."""
+        ends, kinds = np.where(right, ends, 8), np.where(right, kinds, 8)
         constant = (kinds == 8) | (kinds == 9)
-        _expect(((kinds >= 1) & (kinds <= 6)) | constant)
         unused_bits = 64 - 8 * _SMALL_BYTES[np.minimum(kinds, 6)]
         values = gathered(self._data, ends - 8, "i8").byteswap() << unused_bits >> unused_bits
         return np.where(constant, kinds - 8, values) if constant.any() else values
@@ -251,27 +312,30 @@ class PageReader:
 def _varints(heads: NDArray[np.uint8], count: int) -> tuple[Int64Array, Int64Array]:
     """Return the first ``count`` varints of each row of ``heads``, and where each ends, shapes (count, N).
 
-    Rows whose varints are equally long go together, so that a byte of all of them is one column.
+    Those that do not end within their row are -1, and end at 0. Rows whose varints are equally long go together, so that a byte of all of
+    them is one column.
     """
     numbers, ends = np.zeros((2, count, len(heads)), np.int64)
-    alike: list[tuple[slice | Int64Array, int, int]] = [(slice(None), 0, 0)] if len(heads) else []
+    alike: list[tuple[slice | Int64Array, int, int, int]] = [(slice(None), 0, 0, 0)] if len(heads) else []
     while alike:
-        rows, number, at = alike.pop()
+        rows, number, start, at = alike.pop()
         if number == count:
             continue
         if at == heads.shape[1]:
-            raise UnusualError
+            numbers[number:, rows], ends[number:, rows] = -1, 0
+            continue
         octets = heads[rows, at]
-        numbers[number, rows] = numbers[number, rows] << 7 | octets & 0x7F
+        last = at - start == _VARINT_BYTES - 1  # of nine bytes, the last has eight bits
+        numbers[number, rows] = numbers[number, rows] << (8 if last else 7) | octets & (0xFF if last else 0x7F)
         ends[number, rows] = at + 1
         going = octets >= 0x80
-        if going.all():
-            alike.append((rows, number, at + 1))
-        elif not going.any():
-            alike.append((rows, number + 1, at + 1))
+        if last or not going.any():
+            alike.append((rows, number + 1, at + 1, at + 1))
+        elif going.all():
+            alike.append((rows, number, start, at + 1))
         else:
             every = np.arange(len(heads))[rows]
-            alike += [(every[going], number, at + 1), (every[~going], number + 1, at + 1)]
+            alike += [(every[going], number, start, at + 1), (every[~going], number + 1, at + 1, at + 1)]
     return numbers, ends
 
 
@@ -291,6 +355,6 @@ def _big_endian(data: memoryview, offsets: Int64Array) -> Int64Array:
 
 
 def _column_bytes(kinds: Int64Array) -> Int64Array:
-    """Return the size of columns by their serial types; 10 and 11 are not used in files."""
-    _expect((kinds < 10) | (kinds >= _FIRST_BLOB))
-    return np.where(kinds < _FIRST_BLOB, _SMALL_BYTES[np.minimum(kinds, 9)], (kinds - _FIRST_BLOB) // 2)
+    """Return the size of columns by their serial types; 10 and 11 are not used in files, and fit nowhere, as negative ones."""
+    small = np.where((kinds < 0) | (kinds > _LAST_INTEGER), 1 << 40, _SMALL_BYTES[np.clip(kinds, 0, 9)])
+    return np.where(kinds < _FIRST_BLOB, small, np.minimum(kinds - _FIRST_BLOB, 1 << 41) // 2)

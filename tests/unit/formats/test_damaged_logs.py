@@ -24,13 +24,14 @@ from tcpipe.formats.log_file import open_log
 from tcpipe.formats.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
 
 TYPES = ("sensor_msgs/msg/Imu", "std_msgs/msg/ColorRGBA")
+NO_MESSAGES = "rows that are no messages: a number, a time or the data is missing or of another kind"
 COMPRESSIONS = (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE)
 
 
 def chunks_of(path):
     """Byte range of every chunk of an intact .mcap."""
     data = path.read_bytes()
-    offsets = record_offsets(data[8:]) + 8
+    offsets = record_offsets(data[8:])[0] + 8
     lengths = [struct.unpack_from("<Q", data, offset + 1)[0] for offset in offsets.tolist()]
     return [
         (offset, offset + RECORD_HEAD + length)
@@ -85,7 +86,7 @@ def test_a_flip_in_a_message_index_costs_nothing(tmp_path, messages):
     clean, _ = read(path)
     flip(path, chunks_of(path)[1][1] + RECORD_HEAD + 6 + 8)  # the first offset of the first index behind the chunk
     tables, damage = read(path)
-    assert damage == []
+    assert [(finding.what[:31], finding.is_loss) for finding in damage] == [("the index of a chunk names othe", False)]
     assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
 
 
@@ -283,10 +284,121 @@ def test_rows_that_are_no_messages_cost_only_themselves(tmp_path):
         database.execute("UPDATE messages SET topic_id = 99 WHERE id IN (7, 8)")
     database.close()
     with open_log(path) as log:
-        assert log.topics["/ColorRGBA"].message_count == 17
+        assert log.topics["/ColorRGBA"].message_count == 16
         assert log.table("/ColorRGBA").num_rows == 16
         said = {finding.what: finding.messages_lost for finding in log.damage}
-    assert said == {
-        "messages of topic 99, which nothing declares": 2,
-        "rows that are no messages, or whose end is lost": 2,
-    }
+    assert said == {"messages of topic 99, which nothing declares": 2, NO_MESSAGES: 2}
+
+
+WRONG_VALUES = ("NULL", "'text'", "x'00'", "2.5", "NULL, topic_id = 'x'", "NULL, data = NULL")
+
+
+@pytest.mark.parametrize("column", ["topic_id", "timestamp", "data"])
+@pytest.mark.parametrize("value", WRONG_VALUES)
+@pytest.mark.parametrize("journal", [False, True])
+def test_every_row_of_a_db3_is_a_message_or_counted_as_lost(tmp_path, column, value, journal):
+    """However a row is wrong, and whether pages are read here or by SQLite: what is read and what is lost is what was there."""
+    if (column, value) == ("data", "x'00'"):
+        pytest.skip("such a row is a message")
+    path = tmp_path / "a.db3"
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
+        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)")
+        database.execute("INSERT INTO topics VALUES (1, '/ColorRGBA', 'std_msgs/msg/ColorRGBA', 'cdr')")
+        for number, message in enumerate(random_messages(5, count=20, types=TYPES[1:])):
+            row = (number, message.log_time_ns, message.payload)
+            database.execute("INSERT INTO messages VALUES (?, 1, ?, ?)", row)
+        database.execute(f"UPDATE messages SET {column} = {value} WHERE id IN (7, 12, 19)")  # noqa: S608
+    if journal:
+        path.with_name("a.db3-wal").write_bytes(b"not a journal")
+    for wanted in (["/ColorRGBA"], []):
+        with open_log(path) as log:
+            assert [table.num_rows for table in log.tables(wanted).values()] == [17] * len(wanted)
+            assert {finding.what: finding.messages_lost for finding in log.damage} == {NO_MESSAGES: 3}
+
+
+@pytest.mark.parametrize(
+    "kinds", [b"\0\1\6\x81\x80\x80\x80\x80\x80\x80\x80\0", b"\0\1\6\x0b", b"\0\1\5\x2c", b"\0\1\6\xff"]
+)
+def test_a_row_whose_head_contradicts_itself_is_counted(tmp_path, kinds):
+    messages = random_messages(5, count=20, types=TYPES[1:])
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    data = path.read_bytes()
+    at = (
+        data.index(bytes([0, 9, 6, 12 + 2 * 20]))
+        if bytes([0, 9, 6, 12 + 2 * 20]) in data
+        else data.index(bytes([0, 1, 6, 52]))
+    )
+    path.write_bytes(data[:at] + kinds + data[at + len(kinds) :])
+    with open_log(path) as log:
+        rows = log.table("/ColorRGBA").num_rows
+        lost = sum(finding.messages_lost or 0 for finding in log.damage)
+    assert (rows, lost) == (19, 1)
+
+
+def test_a_row_that_is_missing_from_its_pages_list_is_damage(tmp_path):
+    messages = random_messages(5, count=20, types=TYPES[1:])
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    with closing(sqlite3.connect(path)) as database:
+        root = database.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'messages'").fetchone()[0]
+    data = bytearray(path.read_bytes())
+    data[(root - 1) * 4096 + 4] -= 1
+    path.write_bytes(data)
+    with open_log(path) as log:
+        assert log.table("/ColorRGBA").num_rows == 19
+        assert [finding.what[:34] for finding in log.damage if finding.is_loss] == [
+            "its pages contradict one another ("
+        ]
+
+
+def test_a_message_that_moves_to_another_topic_is_missed_by_metadata(tmp_path, messages):
+    bag = write_rosbag2(tmp_path / "run", messages)
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
+        database.execute("UPDATE messages SET topic_id = 3 - topic_id WHERE id IN (7, 8, 9)")
+        moved = database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall()
+    assert {count for _, count in moved} != {200}
+    _, damage = read(bag)
+    assert "metadata.yaml counts 400 messages, the files hold 400" in [
+        finding.what.split(": ")[0] for finding in damage
+    ]
+
+
+def test_messages_of_times_that_no_clock_shows_are_counted(tmp_path, messages):
+    late = [replace(message, log_time_ns=1 << 63) for message in messages[:3]]
+    with open_log(write_mcap(tmp_path / "a.mcap", [*messages, *late])) as log:
+        assert sum(table.num_rows for table in log.tables(log.topics).values()) == len(messages)
+        assert [(finding.what, finding.messages_lost) for finding in log.damage if finding.is_loss] == [
+            ("messages of times after the year 2262", 3)
+        ]
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_messages_of_channels_that_nothing_declares_are_counted(tmp_path, messages, closed):
+    path = write_mcap(tmp_path / "a.mcap", messages, compression=CompressionType.NONE, enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    start, _ = chunks_of(path)[1]
+    at = data.index(b"\x05", start + RECORD_HEAD + 40)  # the chunk's first message, of which the channel becomes 77
+    struct.pack_into("<H", data, at + RECORD_HEAD, 77)
+    path.write_bytes(data if closed else data[:-8])
+    with open_log(path) as log:
+        assert sum(table.num_rows for table in log.tables(log.topics).values()) == len(messages) - 1
+        said = [finding for finding in log.damage if finding.what == "messages of channel 77, which nothing declares"]
+        assert [finding.messages_lost for finding in said] == [1]
+
+
+@pytest.mark.parametrize("number", [0, 1, 77])
+@pytest.mark.parametrize("wanted", [("/Imu",), ("/ColorRGBA",), ("/Imu", "/ColorRGBA")])
+def test_a_bag_whose_index_contradicts_it_says_so(tmp_path, number, wanted):
+    """The summary says that a chunk's messages are another connection's: none is lost, whatever is read."""
+    messages = random_messages(1, count=30, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "a.bag", messages, chunk_bytes=2000)
+    clean, _ = read(path)
+    data = bytearray(path.read_bytes())
+    info = data.rindex(b"op=\x06")
+    entries = data.index(struct.pack("<I", 16), info) + 4
+    struct.pack_into("<I", data, entries, number)
+    path.write_bytes(data)
+    with open_log(path) as log:
+        tables = log.tables(wanted)
+        assert all(stamps(tables, topic) == stamps(clean, topic) for topic in wanted)
+        assert number == 0 or any(finding.is_loss for finding in log.damage)
