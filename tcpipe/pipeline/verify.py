@@ -9,8 +9,7 @@ from typing import Any
 
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats.dataset_files import CARD
-from tcpipe.formats.json_files import read_json
-from tcpipe.formats.seals import broken_checksums, broken_seal
+from tcpipe.formats.seals import broken_checksums, read_sealed
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
 from tcpipe.store import Store, is_store
@@ -95,11 +94,7 @@ def _what(path: Path) -> tuple[str, Iterator[Finding]]:
 
 def _sealed_directory(directory: Path, card: str) -> Iterator[Finding]:
     """Compare every file with what the card has of it; name those that it does not know."""
-    problem = broken_seal(directory / card)
-    if problem:
-        yield problem
-        return
-    checksums: Mapping[str, Any] = read_json(directory / card)["checksums"]
+    checksums: Mapping[str, Any] = read_sealed(directory / card, {"checksums": dict})["checksums"]
     yield from broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
