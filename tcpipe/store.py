@@ -25,7 +25,7 @@ from typing import Any
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, exclusive
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
 from tcpipe.formats.json_files import read_json
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.seals import CHECKSUMS, checksums_to_json, prove_files, read_sealed, write_checksums, write_sealed
@@ -117,6 +117,13 @@ class Store:
     """A store on the local file system."""
 
     root: Path
+
+    def clear(self) -> None:
+        """Put in order what killed commands left anywhere in the store."""
+        for directory in (self.root, self.root / "maps", self.runs_path):
+            clear(directory)
+        for run_id in self.run_ids():
+            clear(self.runs_path / run_id)
 
     @property
     def runs_path(self) -> Path:
@@ -361,4 +368,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
             raise StoreError(
                 f"{path}: the store cannot be written ({error.strerror}); name another with --store"
             ) from None
-    return Store(path)
+    store = Store(path)
+    if create:
+        store.clear()
+    return store

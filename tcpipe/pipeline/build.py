@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, RecipeError
-from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -156,6 +156,7 @@ def build_dataset(
     """
     ruling = _ruling(recipe, holdout=holdout, seed=seed)
     place, house = Path(out), open_store(store)
+    clear_beside(place)
     known, proved = _card_in_place(place)
     regions = None if split is None else read_regions(Path(split))
     region = None if split is None else Path(split).read_bytes()

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import TcpipeError, UsageError
+from tcpipe.formats.atomic import left_beside
 from tcpipe.formats.dataset_files import CARD
 from tcpipe.formats.seals import broken_checksums, read_sealed
 from tcpipe.pipeline.verify_dataset import verify_dataset
@@ -70,6 +71,9 @@ def verify(path: Path) -> Verified:
                 read[finding[0]] = read.get(finding[0], 0) + finding[1]
     except TcpipeError as error:
         problems += error.problems
+    if kind != "store":
+        again = "the next command that writes it removes it"
+        problems += [f"{left}: was left behind by a command that was killed; {again}" for left in left_beside(path)]
     return Verified(path, kind, read, tuple(dict.fromkeys(problems)))
 
 

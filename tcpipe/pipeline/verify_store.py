@@ -94,7 +94,7 @@ def _stranger(path: Path) -> Iterator[str]:
     if not path.name.startswith(TEMPORARY_PREFIX):
         yield f"{path}: is no file of this store"
     elif is_abandoned(path):
-        yield f"{path}: was left behind by a command that was killed; remove it"
+        yield f"{path}: was left behind by a command that was killed; the next tcpipe ingest or add-map removes it"
 
 
 def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:

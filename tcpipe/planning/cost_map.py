@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, UsageError
-from tcpipe.formats.atomic import atomic_directory, exclusive
+from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive
 from tcpipe.formats.geotiff import read_bands, write_cog
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.map_files import MapFile
@@ -117,6 +117,7 @@ def make_cost_map(
 
     """
     check_model(model, source)
+    clear_beside(out)
     grid, key = grid_over(source, step_m), cost_map_key(model, source, step_m)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import read_line
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.map_files import MapFile
@@ -85,6 +86,7 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
     """
     if out is not None:
         check_ending(out)
+        clear_beside(out)
         if out.resolve() == path.resolve():
             raise UsageError(f"{out}: is the path itself; give the table another name")
     lonlat_deg = read_line(path)
