@@ -185,7 +185,8 @@ def read_model_card(place: Path) -> dict[str, Any]:
     try:
         return read_sealed(place / CARD, {"checksums": dict}, ours=is_current)
     except StoreError as error:
-        raise ModelError(f"{error.problems[0]}; train the model again") from None
+        reason = error.problems[0].removesuffix("; remove it and run the command again")
+        raise ModelError(f"{reason}; remove the folder and train the model again") from None
 
 
 def set_weights(network: Any, arrays: Mapping[str, NDArray[Any]], where: str) -> None:
