@@ -72,8 +72,6 @@ def labelled(track: Track, motion: Streams, power: Streams, recipe: Recipe) -> L
         gated,
         streams,
         recipe.label,
-        flag_arc_to_chord=recipe.segment.flag_arc_to_chord,
-        max_position_std_m=recipe.sample.max_position_std_m,
         voltage_range_volt=None,
     )
 

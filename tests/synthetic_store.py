@@ -103,7 +103,7 @@ def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None):
             "data_model_version": DATA_MODEL_VERSION,
             "tcpipe_version": __version__,
             "ingest_key": ingest_key(recipe),
-            "recipe": asdict(recipe),
+            "recipe": asdict(recipe.ingest),
             "recipe_id": identity,
             "run_id": run_id,
             "robot": robot,

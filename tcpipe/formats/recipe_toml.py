@@ -5,19 +5,17 @@ from __future__ import annotations
 import os
 import tomllib
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from pydantic import TypeAdapter, ValidationError
-
 from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import digest
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import IngestSections, Recipe
+from tcpipe.recipe.checking import as_toml, from_values, kinds_of, range_of
 
 FILE_NAME = "tcpipe.toml"
-_INGEST_SECTIONS = ("read", "fuse", "gate", "segment", "label")
-_ADAPTER = TypeAdapter(Recipe)
 
 
 def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
@@ -47,95 +45,32 @@ def load_recipe(path: Path | None) -> Recipe:
 
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     """Check recipe values; `RecipeError` carries one line for every wrong key."""
-    try:
-        return _ADAPTER.validate_python(values)
-    except ValidationError as error:
-        raise RecipeError(*(_problem(where, item) for item in error.errors(include_url=False))) from None
+    return from_values(Recipe, values, where=where)
 
 
-def _problem(where: str, item: Mapping[str, Any]) -> str:
-    *above, last = item["loc"]
-    if last == "[key]":
-        key = ".".join(map(str, above))
-        return f"{where}: unknown key {key}; known here: {_choices(item)}"
-    key = ".".join(map(str, item["loc"]))
-    if item["type"] == "unexpected_keyword_argument":
-        known = ", ".join(_keys_beside(item["loc"]))
-        return f"{where}: unknown key {key}; known here: {known}"
-    if item["type"] == "missing":
-        return f"{where}: {'.'.join(map(str, above))} is {_plain_value(item['input'])}; wanted more values, the one at {last} is missing"
-    return f"{where}: {key} is {_plain_value(item['input'])}; wanted {_wanted(item)}"
+def ingest_key(recipe: Recipe | Mapping[str, Any]) -> str:
+    """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
+    if isinstance(recipe, Recipe):
+        return digest(recipe.ingest)
+    return digest({section.name: recipe.get(section.name) for section in fields(IngestSections)})
 
 
-def _plain_value(value: Any) -> str:
-    """Return a value as TOML writes it, where it can."""
-    return repr(value) if value is None else _toml(value)
+def read_key(recipe: Recipe, robot: str | None, *, definitions: str) -> str:
+    """Return the hash (hex) of what rules the streams beside the log: the read section, the robot asked for, the definitions given."""
+    return digest({"read": recipe.read, "robot": robot, "definitions": definitions})
 
 
-_WANTED = {
-    "string_type": "text in quotes",
-    "float_type": "a number",
-    "float_parsing": "a number",
-    "finite_number": "a finite number",
-    "int_type": "a whole number",
-    "int_parsing": "a whole number",
-    "int_from_float": "a whole number",
-    "bool_type": "true or false",
-    "bool_parsing": "true or false",
-    "list_type": 'a list, for example ["/topic"]',
-    "tuple_type": "a list of numbers, for example [0.0, 0.0, 0.0]",
-    "dict_type": "a table of keys",
-    "dataclass_type": "a table of keys",
-    "greater_than": "more than {gt:g}",
-    "greater_than_equal": "{ge:g} or more",
-    "less_than": "less than {lt:g}",
-    "less_than_equal": "{le:g} or less",
-    "too_short": "{min_length} values or more, got {actual_length}",
-    "too_long": "{max_length} values, got {actual_length}",
-}
-"""What the checker's findings want, by their type, in our words."""
-
-
-def _wanted(item: Mapping[str, Any]) -> str:
-    if item["type"] == "literal_error":
-        return f"one of {_choices(item)}"
-    words = _WANTED.get(item["type"], "another value (docs/reference/recipe.md)")
-    return words.format(**item.get("ctx", {}))
-
-
-def _choices(item: Mapping[str, Any]) -> str:
-    return str(item["ctx"]["expected"]).replace("'", "").replace(" or ", ", ")
-
-
-def _keys_beside(location: tuple[Any, ...]) -> list[str]:
-    schema = recipe_schema()
-    here: Mapping[str, Any] = schema
-    for part in location[:-1]:
-        here = here.get("properties", {}).get(str(part)) or here.get("additionalProperties", {})
-        if "$ref" in here:
-            here = schema["$defs"][here["$ref"].rsplit("/", 1)[-1]]
-    return list(here.get("properties", ()))
-
-
-def ingest_key(recipe: Recipe) -> str:
-    """Return the hash (hex) of the recipe's sections that rule a run's files; the dataset's own sections are left out."""
-    values = asdict(recipe)
-    return digest({name: values[name] for name in _INGEST_SECTIONS})
-
-
-def read_key(recipe: Recipe, robot: str | None) -> str:
-    """Return the hash (hex) of what rules the streams: the read section and the robot asked for."""
-    return digest({"read": asdict(recipe)["read"], "robot": robot})
-
-
-def recipe_id(recipe: Recipe, robot: str) -> str:
+def recipe_id(recipe: Recipe | Mapping[str, Any], robot: str) -> str:
     """Return the name of a run's recipe directory: first 8 hex of the hash of the ingest sections and the robot."""
     return digest({"ingest": ingest_key(recipe), "robot": robot})[:8]
 
 
+@cache
 def recipe_schema() -> dict[str, Any]:
     """Return the recipe's JSON Schema."""
-    return _ADAPTER.json_schema()
+    from pydantic import TypeAdapter  # noqa: PLC0415  to describe a recipe; `tcpipe.recipe.checking` checks it
+
+    return TypeAdapter(Recipe).json_schema()
 
 
 def commented_toml(recipe: Recipe | None = None) -> str:
@@ -157,30 +92,16 @@ def _toml_lines(recipe: Recipe, schema: Mapping[str, Any]) -> Iterator[str]:
         yield ""
         yield f"# {definition['description']}"
         yield f"[{section.name}]"
-        for key in fields(here):
-            value, usual = getattr(here, key.name), getattr(getattr(default, section.name), key.name)
-            yield from _key_lines(definition["properties"][key.name], key.name, value, usual)
+        for name, kind in kinds_of(type(here)).items():
+            value, usual = getattr(here, name), getattr(getattr(default, section.name), name)
+            yield from _key_lines(definition["properties"][name], name, value, usual, range_of(kind))
 
 
-def _key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any) -> Iterator[str]:
+def _key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any, bounds: str = "") -> Iterator[str]:
     yield f"# {schema.get('description', '')}"
     choices = schema.get("enum") or next((c["enum"] for c in schema.get("anyOf", ()) if "enum" in c), None)
-    note = f"  # one of {', '.join(map(str, choices))}" if choices else ""
+    note = f"  # one of {', '.join(map(str, choices))}" if choices else f"  # {bounds}" if bounds else ""
     if value is None:
-        yield f"# {name} ="
+        yield f"# {name} ={note}"
     else:
-        yield f"{'# ' if value == usual else ''}{name} = {_toml(value)}{note}"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_toml(str(key))} = {_toml(item)}" for key, item in value.items()) + "}"
-    if is_dataclass(value) and not isinstance(value, type):
-        return _toml(asdict(value))
-    return repr(value)
+        yield f"{'# ' if value == usual else ''}{name} = {as_toml(value)}{note}"

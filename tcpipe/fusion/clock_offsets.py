@@ -118,7 +118,7 @@ def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) ->
     if span is None:
         return ClockOffsets((), "", {})
     told: dict[tuple[str, str, str], list[tuple[float, Floats]]] = {}
-    for at_ns in windows_ns(*span, _WINDOW_NS):
+    for at_ns in windows_ns(measurements, _WINDOW_NS):
         first_ns, last_ns = int(at_ns[0]) - _MARGIN_NS, int(at_ns[-1]) + _MARGIN_NS
         middle_s = ((int(at_ns[0]) + int(at_ns[-1])) / 2 - span[0]) * 1e-9
         for late, against, by, target, regressors in _signals(

@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import chdtri
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import error_state_kernel as kernel
-from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD, process_noise, turn_scale_std, turn_sources
 from tcpipe.fusion.signals import median_period_ns
@@ -116,7 +116,7 @@ def _levelled(
 ) -> InitialState:
     """Return the start with the attitude that its first minute, smoothed, says it had: without an IMU it starts level, on any slope."""
     output_ns = output_ns[output_ns < output_ns[0] + _LEVELLING_NS]
-    first = part(measurements, 0, int(output_ns[-1]))
+    first = part(measurements, np.iinfo(np.int64).min, int(output_ns[-1]))
     timeline = build_timeline(first, standing_intervals(first), output_ns)
     outputs = _Run(timeline, first, gate_probability, lags=_lags(output_ns)).smoothed(initial)
     if not np.isfinite(outputs[0]).all():
@@ -224,7 +224,7 @@ class _Run:
         self.displacement_variance_m2 = np.full((timeline.output.max() + 1, len(DISPLACEMENT_LAGS_S)), np.nan)
         self.gates = np.full(8, np.inf)
         for kind in (*_ROLES, kernel.STANDING, kernel.STANDING_RATE):
-            self.gates[kind] = chi_square_gate(_DOF[kind], gate_probability)
+            self.gates[kind] = chdtri(_DOF[kind], 1 - gate_probability)
         self._levers = np.zeros((8, 3))
         for kind, source in (
             (kernel.GNSS_POSITION, measurements.gnss),

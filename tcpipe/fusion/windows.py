@@ -22,12 +22,17 @@ _PLACES_NS = 10 * _SECOND_NS
 _Source = TypeVar("_Source", Positions, BodyVelocities, InertialMeasurements)
 
 
-def windows_ns(first_ns: int, last_ns: int, length_ns: int) -> Iterator[Ints]:
-    """Yield grids [ns] of about ``length_ns`` that follow each other over all of the time between."""
-    count = max(1, round((last_ns - first_ns) / length_ns))
-    edges = np.linspace(first_ns, last_ns, count + 1).astype(np.int64)
-    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        yield grid_ns(begin, end)
+def windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
+    """Yield grids [ns] of about ``length_ns`` that follow each other over the time of a set, wherever it has measurements."""
+    span = span_ns(m)
+    if span is None:
+        return
+    count = max(1, round((span[1] - span[0]) / length_ns))
+    edges = np.linspace(*span, count + 1).astype(np.int64)
+    stamps = [source.stamp_ns for source in (m.gnss, m.imu, m.wheels, m.visual) if source is not None]
+    heard = np.unique(np.concatenate([np.searchsorted(edges, stamp, side="right") - 1 for stamp in stamps]))
+    for window in np.unique(np.clip(np.concatenate((heard - 1, heard, heard + 1)), 0, count - 1)):
+        yield grid_ns(int(edges[window]), int(edges[window + 1]))
 
 
 def span_ns(m: Measurements) -> tuple[int, int] | None:

@@ -90,8 +90,9 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     card, sample = read_current_card(directory), _sample(directory, sample_id)
     recipe = parse_recipe(card["recipe"], where=str(directory / "dataset.json"))
     run = _run(house, directory, card, sample)
-    read_with = read_key(recipe, run.manifest["robot_requested"])
-    streams = house.read_streams(run.run_id, key=f"{read_with}-{run.manifest['tcpipe_version']}")
+    told = run.manifest
+    read_with = read_key(recipe, told["robot_requested"], definitions=told.get("message_definitions", ""))
+    streams = house.read_streams(run.run_id, key=f"{read_with}-{told['tcpipe_version']}")
     source = open_map(house.map_path(sample["map"]))
     window = sample["start_ns"], sample["end_ns"]
     made = _made_again(sample, run, streams, source, recipe)
@@ -261,7 +262,7 @@ def _made_again(
         segments = run.segments()
     else:
         try:
-            segments = run_stages(streams, recipe, run_id=run.run_id, name=run.run_id)[2].table
+            segments = run_stages(streams, recipe.ingest, run_id=run.run_id, name=run.run_id)[2].table
         except TcpipeError as error:
             return "; ".join(error.problems)
     row = pc.index(segments.column("segment_id"), sample["sample_id"]).as_py()

@@ -20,7 +20,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, read_key, recipe_id
 from tcpipe.logs.profiles import ROBOTS, Robot
 from tcpipe.pipeline.log_sources import LogSource, definitions_key, find_sources, in_turns, on_this_machine, with_hashes
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import IngestSections, Recipe
 from tcpipe.store import RunDirectory, Store, open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GatedTrack, LabelledSegments, Streams, Track
 
@@ -224,7 +224,7 @@ def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, Any]:
 def _fuse_and_label(
     store: Store, run_id: str, streams: Streams, known: Mapping[str, Any], task: IngestTask
 ) -> RunDirectory:
-    track, gated, labelled = run_stages(streams, task.recipe, run_id=run_id, name=task.source.name)
+    track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id, name=task.source.name)
     identity = recipe_id(task.recipe, streams.robot)
     names = {"run_id": run_id, "recipe_id": identity, "tags": known["tags"], "damage": known["damage"]}
     manifest = {**_manifest(task, streams, track, labelled), **names}
@@ -254,9 +254,12 @@ def _twin(store: Store, run_id: str, source: LogSource) -> str | None:
 
 
 def run_stages(
-    streams: Streams, recipe: Recipe, *, run_id: str, name: str
+    streams: Streams, sections: IngestSections, *, run_id: str, name: str
 ) -> tuple[Track, GatedTrack, LabelledSegments]:
-    """Run fuse, gate, segment and label over the streams of one run (``name`` is for progress only)."""
+    """Run fuse, gate, segment and label over the streams of one run (``name`` is for progress only).
+
+    A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash of is in reach.
+    """
     from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only when there is work
     from tcpipe.stages.gate import gate_track  # noqa: PLC0415
     from tcpipe.stages.label import label_segments  # noqa: PLC0415
@@ -264,19 +267,13 @@ def run_stages(
 
     profile: Robot = ROBOTS[streams.robot]
     logger.info("%s: fusing", name)
-    track = fuse_run(streams, recipe.fuse, run_id=run_id)
+    track = fuse_run(streams, sections.fuse, run_id=run_id)
     logger.info("%s: cutting and labelling", name)
-    gated = gate_track(track, recipe.gate, max_velocity_mps=profile.max_velocity_mps, chord_m=recipe.segment.chord_m)
-    segments = segment_track(gated, recipe.segment)
-    labelled = label_segments(
-        segments,
-        gated,
-        streams,
-        recipe.label,
-        flag_arc_to_chord=recipe.segment.flag_arc_to_chord,
-        max_position_std_m=recipe.sample.max_position_std_m,
-        voltage_range_volt=profile.voltage_range_volt,
+    gated = gate_track(
+        track, sections.gate, max_velocity_mps=profile.max_velocity_mps, chord_m=sections.segment.chord_m
     )
+    segments = segment_track(gated, sections.segment)
+    labelled = label_segments(segments, gated, streams, sections.label, voltage_range_volt=profile.voltage_range_volt)
     return track, gated, labelled
 
 
@@ -284,9 +281,10 @@ def _streams(store: Store, run_id: str, log: Any, task: IngestTask) -> tuple[Str
     """Return L1, from the store when it was made with the same read settings, the log's damage, and remarks on it."""
     from tcpipe.stages.read import read_run  # noqa: PLC0415
 
-    key = f"{read_key(task.recipe, task.robot)}-{__version__}"
+    definitions = definitions_key(task.message_definitions)
+    key = f"{read_key(task.recipe, task.robot, definitions=definitions)}-{__version__}"
     known = store.run_json(run_id)
-    same = known is not None and known.get("message_definitions", "") == definitions_key(task.message_definitions)
+    same = known is not None and known.get("message_definitions", "") == definitions
     cached = store.read_streams(run_id, key=key) if same and not task.force else None
     if cached is not None and known is not None:
         return cached, list(known["damage"]), list(known.get("remarks", ()))
@@ -333,7 +331,7 @@ def _manifest(task: IngestTask, streams: Streams, track: Track, labelled: Labell
         "data_model_version": DATA_MODEL_VERSION,
         "tcpipe_version": __version__,
         "ingest_key": ingest_key(task.recipe),
-        "recipe": plain(asdict(task.recipe)),
+        "recipe": plain(task.recipe.ingest),
         "robot": streams.robot,
         "robot_requested": task.robot,
         "message_definitions": definitions_key(task.message_definitions),

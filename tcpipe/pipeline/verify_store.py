@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.errors import StoreError, TcpipeError
+from tcpipe.errors import TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
+from tcpipe.formats.json_files import read_json
 from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.recipe_toml import ingest_key, parse_recipe, recipe_id
-from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal, read_sealed
+from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal
 from tcpipe.pipeline.dataset_segments import KEPT
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
@@ -71,7 +72,7 @@ def verify_map(path: Path) -> Iterator[Finding]:
     checksums = yield from _listed(path)
     if checksums is None:
         return
-    source = open_map(path, proved=False)
+    source = open_map(path)
     for factor in source.factors:
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:
@@ -94,7 +95,7 @@ def _stranger(path: Path) -> Iterator[str]:
     if not path.name.startswith(TEMPORARY_PREFIX):
         yield f"{path}: is no file of this store"
     elif is_abandoned(path):
-        yield f"{path}: was left behind by a command that was killed; the next tcpipe ingest or add-map removes it"
+        yield f"{path}: was left behind by a command that was killed; remove it"
 
 
 def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
@@ -107,11 +108,11 @@ def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
 
 def _listed(directory: Path) -> Any:
     """Compare every file below a directory with its ``checksums.json``; return what that lists, or None if it cannot be trusted."""
-    try:
-        checksums: Mapping[str, Any] = read_sealed(directory / CHECKSUMS, {"checksums": dict})["checksums"]
-    except StoreError as error:
-        yield from error.problems
+    problem = broken_seal(directory / CHECKSUMS)
+    if problem:
+        yield problem
         return None
+    checksums: Mapping[str, Any] = read_json(directory / CHECKSUMS)["checksums"]
     yield from broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
     yield from _unlisted(directory, {*checksums, CHECKSUMS})
@@ -139,7 +140,11 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
     where = directory / _MANIFEST
-    manifest = read_sealed(where)
+    problem = broken_seal(where)
+    if problem:
+        yield problem
+        return
+    manifest = read_json(where)
     if manifest["data_model_version"] != DATA_MODEL_VERSION:
         yield (
             f"{where}: of data model {manifest['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
@@ -173,7 +178,7 @@ def _disagreements(directory: Path, manifest: Mapping[str, Any], tables: Mapping
     covered_m, kept_m = math.fsum(floats(tables["segments"], "arc_length_m")), manifest["ledger_m"].get(KEPT, 0.0)
     if not math.isclose(covered_m, kept_m, rel_tol=1e-9, abs_tol=1e-6):
         yield f"the ledger keeps {kept_m:.3f} m, the segments cover {covered_m:.3f} m"
-    recipe = parse_recipe(manifest["recipe"], where=str(directory / _MANIFEST))
+    recipe = manifest["recipe"]
     if manifest["ingest_key"] != ingest_key(recipe) or directory.name != recipe_id(recipe, manifest["robot"]):
         yield "its recipe is not the one that the directory is named after"
     if manifest["run_id"] != directory.parent.name:

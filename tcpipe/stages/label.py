@@ -6,6 +6,7 @@ from collections import Counter
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.cost.labels import Labels
@@ -17,7 +18,6 @@ from tcpipe.stages.label_facts import label_facts, label_warnings
 from tcpipe.stages.label_physics import with_physics
 from tcpipe.stages.label_power import energy_entries, rails_of
 from tcpipe.stages.label_quality import clock_doubtful, motion_flags, power_flags
-from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, LabelledSegments, Segments, Streams, with_findings
@@ -29,8 +29,6 @@ def label_segments(
     streams: Streams,
     config: LabelConfig,
     *,
-    flag_arc_to_chord: float,
-    max_position_std_m: float,
     voltage_range_volt: tuple[float, float] | None,
 ) -> LabelledSegments:
     """Return the segments with w, v, T, E, their standard deviations as costs of the true metre, and quality bits.
@@ -38,13 +36,13 @@ def label_segments(
     Parameters
     ----------
     streams : for its power; without it, or where it does not reach, power and energy are null.
-    flag_arc_to_chord, max_position_std_m, voltage_range_volt : beyond these a label is flagged; no range, no flag.
+    voltage_range_volt : [V], of the robot's profile; beyond it a label is flagged; no range, no flag.
     """
     rule: Rule = "averaged" if streams.power_averaged else config.integration
     parts, joules, rails_by_epoch = [LABELLED_SEGMENTS.empty()], Counter[str](), {}
     variance_j2: list[dict[str, NDArray[np.float64]]] = []
     for epoch in np.unique(integers(gated.table, "epoch")).tolist():
-        rows, cut = (rows_where(table, "epoch", epoch) for table in (gated.table, segments.table))
+        rows, cut = (table.filter(pc.equal(table["epoch"], epoch)) for table in (gated.table, segments.table))
         rails = rails_by_epoch[epoch] = rails_of(streams, epoch)
         joules.update(energy_entries(rows, rails, rate_hz=gated.info.rate_hz, rule=rule))
         if not cut.num_rows:
@@ -60,8 +58,8 @@ def label_segments(
                 cut,
                 rows,
                 gated.info,
-                arc_to_chord=flag_arc_to_chord,
-                max_position_std_m=max_position_std_m,
+                arc_to_chord=config.flag_arc_to_chord,
+                max_position_std_m=config.flag_position_std_m,
             ),
         }
         parts.append(

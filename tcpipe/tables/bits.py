@@ -42,7 +42,7 @@ class Quality(IntFlag):
     HIGH_SLIP = 1 << 2
     """Wheel speed and ground speed differ by more than 20 %."""
     WEAK_GNSS = 1 << 3
-    """Horizontal position standard deviation above `max_position_std_m` at either end."""
+    """Horizontal position standard deviation above `label.flag_position_std_m` at either end."""
     CURVED = 1 << 4
     """Arc over chord above 1.01."""
     MEAN_POWER_DIFFERS = 1 << 5
@@ -73,7 +73,7 @@ class Loss(IntFlag):
     NOT_TRAVERSABLE = 1 << 20
     """The class under the chord is not traversable."""
     POSITION_UNCERTAIN = 1 << 21
-    """Absolute position standard deviation above `max_position_std_m` when sampling."""
+    """Absolute position standard deviation above `sample.max_position_std_m` when sampling."""
     SPLIT_BUFFER = 1 << 22
     """The footprint straddles, or is nearer than the buffer to, a region's border."""
     NO_POWER = 1 << 23

@@ -29,8 +29,6 @@ def run(site, *, config=None):
         gated,
         streams,
         LabelConfig(),
-        flag_arc_to_chord=1.01,
-        max_position_std_m=0.1,
         voltage_range_volt=(20.0, 30.0),
     )
     return gated, labelled, read_truth(site.truths[0])

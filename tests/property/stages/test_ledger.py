@@ -65,8 +65,6 @@ def labelled(track):
         gated,
         power,
         LabelConfig(),
-        flag_arc_to_chord=1.01,
-        max_position_std_m=0.1,
         voltage_range_volt=None,
     )
     return found, 144.0 * (t_ns[-1] - t_ns[0]) * 1e-9

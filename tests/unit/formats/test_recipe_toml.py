@@ -1,7 +1,11 @@
 """The recipe: found, checked with all errors at once, written with comments."""
 
+import re
+import tomllib
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tcpipe.errors import RecipeError
@@ -14,7 +18,7 @@ from tcpipe.formats.recipe_toml import (
     read_key,
     recipe_id,
 )
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import FuseConfig, Placement, ReadConfig, Recipe, SegmentConfig, SplitConfig
 
 
 def test_commented_recipe_is_the_default_recipe(tmp_path: Path) -> None:
@@ -25,7 +29,7 @@ def test_commented_recipe_is_the_default_recipe(tmp_path: Path) -> None:
 
 def test_uncommented_keys_parse_to_the_same_defaults(tmp_path: Path) -> None:
     lines = [
-        line[2:] if line.startswith("# ") and " = " in line and not line.endswith("=") else line
+        line[2:] if line.startswith("# ") and " = " in line and not re.search(r"=( +#|$)", line) else line
         for line in commented_toml().splitlines()
     ]
     path = tmp_path / "tcpipe.toml"
@@ -50,21 +54,31 @@ WRONG = {
     'read.topics.gnsss = ["/a"]': "unknown key read.topics.gnsss; known here: gnss, imu, wheel_odometry, visual_odometry",
     'read.topics.imu = "/a"': 'read.topics.imu is "/a"; wanted a list',
     "read.topics.imu = [1]": "read.topics.imu.0 is 1; wanted text in quotes",
-    "read.placement.imu.xyz_m = [1, 2]": "read.placement.imu.xyz_m is [1, 2]; wanted more values",
+    "read.placement.imu.xyz_m = [1, 2]": "read.placement.imu.xyz_m is [1, 2]; wanted 3 values, got 2",
     "read.placement.imu.xyz_m = [1, 2, 3, 4]": "wanted 3 values, got 4",
     'read.placement.imu.xyz_m = [1, 2, "up"]': 'read.placement.imu.xyz_m.2 is "up"; wanted a number',
     "read.placement.imu = 3": "read.placement.imu is 3; wanted a table of keys",
     "read.topics = 3": "read.topics is 3; wanted a table",
     "read.placement.imu.xyz_m = 3": "read.placement.imu.xyz_m is 3; wanted a list of numbers",
     'read.imu_units = "kg"': 'read.imu_units is "kg"; wanted one of si, deg, g, deg_g',
-    "fuse.rate_hz = -1": "fuse.rate_hz is -1; wanted more than 0",
+    "fuse.rate_hz = -1": "fuse.rate_hz is -1; wanted from 1 to 500",
+    "fuse.rate_hz = true": "fuse.rate_hz is true; wanted a number",
+    'fuse.rate_hz = "20"': 'fuse.rate_hz is "20"; wanted a number',
+    "fuse.rate_hz = 1e9": "fuse.rate_hz is 1000000000.0; wanted from 1 to 500",
+    "segment.chord_m = 1e300": "segment.chord_m is 1e+300; wanted from 0.05 to 1000",
+    "segment.chord_m = 1e-300": "segment.chord_m is 1e-300; wanted from 0.05 to 1000",
+    "split.test_fraction = 1.0": "split.test_fraction is 1.0; wanted from 0 to below 1",
+    "split.block_m = 1e-12": "split.block_m is 1e-12; wanted from 0.1 to 1000000",
+    "split.seed = -1": "split.seed is -1; wanted from 0 to 9223372036854775807",
+    'fuse.estimator = "UKF"': 'fuse.estimator is "UKF"; wanted one of smoother, ukf',
+    'split.holdout = "samples"': 'split.holdout is "samples"; wanted one of block, sample, run',
     "fuse.rate_hz = nan": "fuse.rate_hz is nan; wanted a finite number",
     "fuse.rate_hz = [1]": "fuse.rate_hz is [1]; wanted a number",
-    "fuse.gate_probability = 1": "fuse.gate_probability is 1; wanted less than 1",
-    "gate.full_speed_fraction = 1.2": "wanted 1 or less",
+    "fuse.gate_probability = 1": "fuse.gate_probability is 1; wanted from 0.5 to 0.999999999",
+    "gate.full_speed_fraction = 1.2": "gate.full_speed_fraction is 1.2; wanted from 0 to 1",
     'gate.keep_reversing = "maybe"': "wanted true or false",
     "gate.keep_reversing = [1]": "wanted true or false",
-    "sample.patch_px = 1": "sample.patch_px is 1; wanted 2 or more",
+    "sample.patch_px = 1": "sample.patch_px is 1; wanted from 2 to 1024",
     "split.folds = 2.5": "split.folds is 2.5; wanted a whole number",
     'split.seed = "x"': 'split.seed is "x"; wanted a whole number',
     "split.seed = [1]": "wanted a whole number",
@@ -80,6 +94,46 @@ def test_what_is_wanted_is_said_plainly(tmp_path: Path, line: str) -> None:
     (problem,) = caught.value.problems
     assert WRONG[line] in problem
     assert "another value" not in problem
+
+
+@pytest.mark.parametrize("line", [line for line in WRONG if "." in line.partition("=")[0]])
+def test_a_recipe_made_in_python_is_refused_in_the_same_words(line: str) -> None:
+    ((section, keys),) = tomllib.loads(line).items()
+    with pytest.raises(RecipeError) as caught:
+        type(getattr(Recipe(), section))(**keys)
+    (problem,) = caught.value.problems
+    assert WRONG[line] in problem
+
+
+def test_all_wrong_values_of_a_section_are_said_at_once_also_by_replace() -> None:
+    with pytest.raises(RecipeError) as caught:
+        replace(FuseConfig(), estimator="UKF", wheel_std_mps=-1, rate_hz=10**5000)  # type: ignore[arg-type]
+    assert len(caught.value.problems) == 3
+    assert all(problem.startswith("recipe: fuse.") and len(problem) < 200 for problem in caught.value.problems)
+
+
+def test_one_value_is_one_recipe_however_it_is_written() -> None:
+    plain = Recipe(segment=SegmentConfig(chord_m=2.0), read=ReadConfig(placement={"imu": Placement((0.0, 0.0, 1.0))}))
+    same = (
+        Recipe(segment=SegmentConfig(chord_m=2), read=ReadConfig(placement={"imu": {"xyz_m": [0, -0.0, 1]}})),  # type: ignore[dict-item]
+        Recipe(
+            segment=SegmentConfig(chord_m=np.float32(2)),  # type: ignore[arg-type]
+            read=ReadConfig(placement={"imu": Placement(np.array([0, 0, 1]))}),  # type: ignore[arg-type]
+        ),
+        parse_recipe({"segment": {"chord_m": 2}, "read": {"placement": {"imu": {"xyz_m": [0, 0, 1]}}}}, where="r"),
+    )
+    for other in same:
+        assert other == plain
+        assert ingest_key(other) == ingest_key(plain)
+    assert SplitConfig(folds=np.int64(3)).folds == SplitConfig(folds=3.0).folds == 3  # type: ignore[arg-type]
+    assert type(SplitConfig(folds=np.int64(3)).folds) is int  # type: ignore[arg-type]
+
+
+def test_a_recipe_does_not_change_with_the_lists_it_was_made_of() -> None:
+    topics = {"imu": ["/imu"]}
+    config = ReadConfig(topics=topics)  # type: ignore[arg-type]
+    topics["imu"].append("/other")
+    assert config.topics == {"imu": ["/imu"]}
 
 
 @pytest.mark.parametrize(("text", "said"), [("robot = ", "not valid TOML"), (None, "cannot be read")])
@@ -110,4 +164,6 @@ def test_dataset_keys_do_not_rename_runs_but_ingest_keys_do() -> None:
     fused = parse_recipe({"label": {"velocity": "fused"}}, where="r")
     assert ingest_key(default) == ingest_key(split) != ingest_key(fused)
     assert recipe_id(default, "husky") == recipe_id(split, "husky") != recipe_id(default, "warthog")
-    assert read_key(default, None) == read_key(fused, None) != read_key(default, "husky")
+    plain = read_key(default, None, definitions="")
+    assert plain == read_key(fused, None, definitions="")
+    assert plain not in (read_key(default, "husky", definitions=""), read_key(default, None, definitions="ab"))

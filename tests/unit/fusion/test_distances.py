@@ -84,8 +84,19 @@ def test_an_hour_of_standing_is_not_what_is_judged():
     assert (at_ns[-1] - at_ns[0]) * 1e-9 == pytest.approx(1800.0, abs=0.1)
 
 
+def wheels_at(at_s):
+    nothing = np.full(at_s.size, np.nan)
+    velocity = np.column_stack((np.ones(at_s.size), nothing, nothing))
+    return BodyVelocities(np.int64(at_s) * 10**9, velocity, np.ones((at_s.size, 3)), nothing, nothing)
+
+
+def test_where_nothing_was_measured_for_years_there_are_no_windows():
+    years = np.concatenate((np.arange(600), 10**9 + np.arange(600)))
+    assert len(list(windows_ns(Measurements(wheels=wheels_at(years)), 600 * 10**9))) == 4
+
+
 def test_windows_cover_all_of_the_time_once():
-    found = list(windows_ns(0, 2500 * 10**9, 600 * 10**9))
+    found = list(windows_ns(Measurements(wheels=wheels_at(np.arange(2501))), 600 * 10**9))
     assert len(found) == 4
     assert found[0][0] == 0
     assert all(abs(b[0] - a[-1]) <= GRID_NS for a, b in itertools.pairwise(found))

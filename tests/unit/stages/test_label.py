@@ -32,8 +32,6 @@ def label_gated(gated, streams, *, config=None, voltage_range_volt=(20.0, 30.0))
         gated,
         streams,
         config or LabelConfig(),
-        flag_arc_to_chord=1.01,
-        max_position_std_m=0.10,
         voltage_range_volt=voltage_range_volt,
     )
 

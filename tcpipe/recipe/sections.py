@@ -1,7 +1,9 @@
-"""The recipe: every key that rules the pipeline, one frozen dataclass a stage, with its default and its reason.
+"""Every key of the recipe, one frozen dataclass a stage, with its default, its bounds and its reason.
 
-``formats.recipe_toml`` reads and checks it from TOML; docs/reference/recipe.md and ``tcpipe init`` are written from the docstrings here.
+``formats.recipe_toml`` reads it from TOML; docs/reference/recipe.md and ``tcpipe init`` are written from the docstrings here.
 Units stand in the names. Rulings and their sources: docs/explanation/rulings.md.
+
+A bound is where a value can mean nothing any more, or costs without end: it is far outside of what any robot, sensor or site asks for.
 """
 
 from __future__ import annotations
@@ -9,14 +11,31 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Gt, Le, Lt
+from annotated_types import Ge, Le, Lt
+
+from tcpipe.recipe.checking import settle
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
 Role = Literal["gnss", "imu", "wheel_odometry", "visual_odometry", "power", "command"]
-Positive = Annotated[float, Gt(0)]
-NotNegative = Annotated[float, Ge(0)]
 Fraction = Annotated[float, Ge(0), Le(1)]
+Deviation = Annotated[float, Ge(1e-6), Le(1e3)]
+"""A standard deviation or noise: a millionth is lost beside what it is added to, a thousand weighs nothing."""
+Limit = Annotated[float, Ge(1e-6), Le(1e3)]
+"""A speed, rate, acceleration or radius that something is compared with: beyond, all or nothing passes."""
+Window = Annotated[float, Ge(0.01), Le(60)]
+"""Time that one motion takes [s]: less than any sensor's period, more than any manoeuvre."""
+Gap = Annotated[float, Ge(0.01), Le(3600)]
+"""Time without messages [s]: less than any sensor's period, more than odometry holds."""
+Widening = Annotated[float, Ge(0), Le(600)]
+"""Time around an event that is dropped with it [s]."""
+ArcToChord = Annotated[float, Ge(1), Le(10)]
+"""Length of an arc over that of its chord: 1 is straight, 1.57 a half circle."""
+Metres = Annotated[float, Ge(-1000), Le(1000)]
+Radians = Annotated[float, Ge(-6.3), Le(6.3)]
+"""An angle: one turn either way; more is mostly degrees."""
+Offset = Annotated[float, Ge(-2e9), Le(2e9)]
+"""Between two clocks [s]: from one that counts from its start to UTC, or back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +44,13 @@ class Placement:
 
     __pydantic_config__ = _STRICT
 
-    xyz_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    xyz_m: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
     """Position of the sensor in base_link (x forward, y left, z up) [m]."""
-    rpy_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    rpy_rad: tuple[Radians, Radians, Radians] = (0.0, 0.0, 0.0)
     """Rotation sensor to base_link as roll, pitch, yaw about fixed axes [rad]."""
+
+    def __post_init__(self) -> None:
+        settle(self, "placement")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +71,7 @@ class ReadConfig:
     """Geographic CRS of the GNSS positions; RTK often comes in a national datum."""
     time: dict[Role, Literal["auto", "header", "log"]] = field(default_factory=dict)
     """Which stamp rules, by role; auto takes header.stamp when it is set and follows the log time."""
-    time_offset_s: dict[Role, float] = field(default_factory=dict)
+    time_offset_s: dict[Role, Offset] = field(default_factory=dict)
     """Added to the stamps of a role [s]."""
     imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
     """Units of the IMU: si is rad/s and m/s² as REP-103 asks; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
@@ -59,6 +81,9 @@ class ReadConfig:
     """Whether the power source averages over its message period: auto takes the message type's."""
     husky_power: Literal["battery", "drivers"] = "battery"
     """A Husky's power: battery takes battery voltage times both driver currents (the paper's), drivers each driver's own voltage."""
+
+    def __post_init__(self) -> None:
+        settle(self, "read")
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,28 +96,31 @@ class FuseConfig:
     """smoother: error-state unscented filter and fixed-interval smoother; ukf: the paper's forward filter, 15 states."""
     engine: Literal["compiled", "filterpy"] = "compiled"
     """What runs the 15-state filter; filterpy is the slow reference."""
-    rate_hz: Positive = 20.0
-    """Rate of the track (the paper: 20 Hz)."""
-    gate_probability: Annotated[float, Gt(0), Lt(1)] = 0.999
+    rate_hz: Annotated[float, Ge(1), Le(500)] = 20.0
+    """Rate of the track (the paper: 20 Hz); no motion of a robot wants more than 500 rows a second."""
+    gate_probability: Annotated[float, Ge(0.5), Le(0.999999999)] = 0.999
     """Chi-square gate: a measurement less likely than this is refused and listed."""
-    gnss_std_floor_m: Positive = 0.01
+    gnss_std_floor_m: Deviation = 0.01
     """No GNSS standard deviation is taken below this, whatever the receiver says [m]."""
-    gnss_default_std_m: Positive = 0.05
+    gnss_default_std_m: Deviation = 0.05
     """Horizontal standard deviation where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
-    wheel_std_mps: Positive = 0.05
+    wheel_std_mps: Deviation = 0.05
     """Standard deviation of wheel velocity where the source gives none [m/s]."""
-    visual_std_mps: Positive = 0.05
+    visual_std_mps: Deviation = 0.05
     """Standard deviation of visual velocity where the source gives none [m/s]."""
-    nonholonomic_std_mps: Positive = 0.15
+    nonholonomic_std_mps: Deviation = 0.15
     """Sideways and vertical body velocity are zero to within this; much smaller values lock GNSS out [m/s]."""
-    gyro_noise_radps: Positive = 0.003
+    gyro_noise_radps: Deviation = 0.003
     """White noise of the gyroscope at its rate [rad/s]."""
-    accelerometer_noise_mps2: Positive = 0.10
+    accelerometer_noise_mps2: Deviation = 0.10
     """White noise of the accelerometer at its rate, vibration included [m/s²]."""
-    max_gap_s: Positive = 1.0
+    max_gap_s: Gap = 1.0
     """Without any motion measurement for this long the track has a gap [s]."""
-    max_power_gap_s: Positive = 0.3
+    max_power_gap_s: Gap = 0.3
     """A power gap longer than this, and than three periods, leaves the track without power there and ends a segment [s]."""
+
+    def __post_init__(self) -> None:
+        settle(self, "fuse")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,44 +129,47 @@ class GateConfig:
 
     __pydantic_config__ = _STRICT
 
-    max_acceleration_mps2: Positive = 0.3
+    max_acceleration_mps2: Limit = 0.3
     """Without a command topic: steadier than this [m/s²]."""
-    acceleration_window_s: Positive = 0.45
+    acceleration_window_s: Window = 0.45
     """Acceleration is the slope of the forward velocity over this long, centred [s]."""
-    ramp_acceleration_mps2: Positive = 0.1
+    ramp_acceleration_mps2: Limit = 0.1
     """A start or stop ramp, beside standing or turning in place, lasts while the speed changes faster than this [m/s²]."""
-    min_event_s: Positive = 0.2
+    min_event_s: Window = 0.2
     """An acceleration or rotation shorter than this is noise [s]."""
-    dilate_s: NotNegative = 0.25
+    dilate_s: Widening = 0.25
     """Acceleration marks are widened by this on both sides [s]."""
-    command_step_mps: Positive = 0.1
+    command_step_mps: Limit = 0.1
     """A command change larger than this within `command_window_s` is a change (a joystick jitters) [m/s]."""
-    command_window_s: Positive = 0.5
+    command_window_s: Window = 0.5
     """See `command_step_mps` [s]."""
-    command_settle_s: NotNegative = 2.0
+    command_settle_s: Widening = 2.0
     """Rows this long after a commanded change are dropped [s]."""
     require_full_speed: bool = True
     """With commands: drop rows commanded below `full_speed_fraction` of the robot's maximum; their speed is not the terrain's limit."""
     full_speed_fraction: Fraction = 0.95
     """See `require_full_speed`."""
-    max_velocity_mps: Positive | None = None
+    max_velocity_mps: Limit | None = None
     """The robot's maximum speed; none takes the profile's [m/s]."""
-    standing_velocity_mps: Positive = 0.05
+    standing_velocity_mps: Limit = 0.05
     """Slower than this (and not turning) is standing [m/s]."""
-    standing_yaw_rate_radps: Positive = 0.05
+    standing_yaw_rate_radps: Limit = 0.05
     """See `standing_velocity_mps` [rad/s]."""
-    stuck_wheel_velocity_mps: Positive = 0.2
+    stuck_wheel_velocity_mps: Limit = 0.2
     """Wheels faster than this while the ground speed is that of standing are stuck [m/s]."""
-    turning_velocity_mps: Positive = 0.10
+    turning_velocity_mps: Limit = 0.10
     """Slower than this while turning is turning in place [m/s]."""
-    turning_yaw_rate_radps: Positive = 0.10
+    turning_yaw_rate_radps: Limit = 0.10
     """See `turning_velocity_mps` [rad/s]."""
-    min_turn_radius_m: Positive = 0.5
+    min_turn_radius_m: Limit = 0.5
     """Turning tighter than this is turning in place [m]."""
     keep_reversing: bool = False
     """Keep stretches driven backwards."""
-    max_relative_position_std_m: Positive = 0.10
+    max_relative_position_std_m: Deviation = 0.10
     """A stretch whose position error over one chord would exceed this is a gap [m]."""
+
+    def __post_init__(self) -> None:
+        settle(self, "gate")
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,12 +178,13 @@ class SegmentConfig:
 
     __pydantic_config__ = _STRICT
 
-    chord_m: Positive = 1.0
+    chord_m: Annotated[float, Ge(0.05), Le(1000)] = 1.0
     """d: straight-line length of a segment in the horizontal plane [m]."""
-    max_arc_to_chord: Annotated[float, Ge(1)] = 1.02
+    max_arc_to_chord: ArcToChord = 1.02
     """A segment more curved than this is dropped (radius below 1.5 m for 1 m)."""
-    flag_arc_to_chord: Annotated[float, Ge(1)] = 1.01
-    """A segment more curved than this is flagged."""
+
+    def __post_init__(self) -> None:
+        settle(self, "segment")
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,6 +197,13 @@ class LabelConfig:
     """Which velocity trains: ground is chord / duration; fused the mean of the filter's forward velocity (the paper's v*)."""
     integration: Literal["exact", "right_endpoint"] = "exact"
     """exact integrates the product of two piecewise-linear signals; right_endpoint is the paper's sum."""
+    flag_arc_to_chord: ArcToChord = 1.01
+    """A segment more curved than this is flagged."""
+    flag_position_std_m: Deviation = 0.10
+    """A segment with an end whose absolute position is less certain than this is flagged as of weak GNSS [m]."""
+
+    def __post_init__(self) -> None:
+        settle(self, "label")
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,14 +212,17 @@ class SampleConfig:
 
     __pydantic_config__ = _STRICT
 
-    patch_m: Positive = 1.0
+    patch_m: Annotated[float, Ge(0.05), Le(100)] = 1.0
     """Side of the patch on the ground [m]."""
     patch_px: Annotated[int, Ge(2), Le(1024)] = 40
     """Side of the patch in pixels; the pitch is patch_m / patch_px whatever the map's resolution."""
     min_valid_fraction: Fraction = 1.0
     """A patch with a smaller share of valid pixels is dropped."""
-    max_position_std_m: Positive = 0.10
+    max_position_std_m: Deviation = 0.10
     """A sample whose absolute position is less certain than this is dropped [m]."""
+
+    def __post_init__(self) -> None:
+        settle(self, "sample")
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,16 +233,19 @@ class SplitConfig:
 
     holdout: Literal["block", "sample", "run"] = "block"
     """block keeps spatial neighbours together, sample is the paper's random draw, run keeps whole runs together."""
-    test_fraction: Fraction = 0.2
+    test_fraction: Annotated[float, Ge(0), Lt(1)] = 0.2
     """Share of test among the samples inside the region."""
-    block_m: Positive = 10.0
+    block_m: Annotated[float, Ge(0.1), Le(1e6)] = 10.0
     """Side of a spatial block [m]."""
-    buffer_m: NotNegative | None = None
+    buffer_m: Annotated[float, Ge(0), Le(1e6)] | None = None
     """A footprint nearer than this to a region's border goes to no split; none takes sqrt(2) times the chord [m]."""
     folds: Annotated[int, Ge(2), Le(100)] = 5
     """Folds of spatial cross-validation among train and test: whole blocks, or whole runs with the holdout run."""
-    seed: int = 0
+    seed: Annotated[int, Ge(0), Le(2**63 - 1)] = 0
     """Seed of the split and of the row order."""
+
+    def __post_init__(self) -> None:
+        settle(self, "split")
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,6 +265,20 @@ class DatasetConfig:
     compression: Literal["zstd", "lz4"] = "zstd"
     """How patches are stored in Zarr: zstd takes less room, lz4 is read two to three times as fast."""
 
+    def __post_init__(self) -> None:
+        settle(self, "dataset")
+
+
+@dataclass(frozen=True, slots=True)
+class IngestSections:
+    """What rules a run's files, beside its log and robot: all that its stages get, and what `recipe_id` is the hash of."""
+
+    read: ReadConfig
+    fuse: FuseConfig
+    gate: GateConfig
+    segment: SegmentConfig
+    label: LabelConfig
+
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
@@ -237,3 +296,11 @@ class Recipe:
     sample: SampleConfig = field(default_factory=SampleConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
+
+    def __post_init__(self) -> None:
+        settle(self, "")
+
+    @property
+    def ingest(self) -> IngestSections:
+        """The sections that rule a run's files."""
+        return IngestSections(self.read, self.fuse, self.gate, self.segment, self.label)

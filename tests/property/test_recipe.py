@@ -1,0 +1,109 @@
+"""The recipe as a whole: what is the same by name is the same by bytes, and no valid value breaks a stage or lasts."""
+
+from contextlib import suppress
+from dataclasses import fields, replace
+
+import pytest
+from recipe_values import keys, other_values, with_value
+from simulated_streams import log_of, streams_of
+
+from tcpipe.errors import TcpipeError
+from tcpipe.formats.recipe_toml import commented_toml, ingest_key, load_recipe, parse_recipe, read_key, recipe_id
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.recipe import IngestSections, Recipe
+from tcpipe.simulation.scenarios import tiny
+from tcpipe.stages.fuse import fuse_run
+from tcpipe.stages.gate import gate_track
+from tcpipe.stages.label import label_segments
+from tcpipe.stages.segment import segment_track
+
+INGEST = {section.name for section in fields(IngestSections)}
+
+
+def section(key):
+    return key.partition(".")[0]
+
+
+@pytest.fixture(scope="module")
+def log(tmp_path_factory):
+    scenario = tiny(seconds=20.0)
+    return log_of(scenario, scenario.drives[0], tmp_path_factory.mktemp("site"))
+
+
+@pytest.fixture(scope="module")
+def streams(log):
+    return streams_of(log)
+
+
+@pytest.fixture(scope="module")
+def track(streams):
+    return fuse_run(streams, Recipe().fuse, run_id="run")
+
+
+def after_fusion(track, streams, recipe):
+    gated = gate_track(track, recipe.gate, max_velocity_mps=1.0, chord_m=recipe.segment.chord_m)
+    segments = segment_track(gated, recipe.segment)
+    return label_segments(segments, gated, streams, recipe.label, voltage_range_volt=None)
+
+
+@pytest.mark.parametrize("key", keys())
+def test_a_key_changes_the_name_of_a_run_if_and_only_if_its_section_reaches_a_stage_of_it(key):
+    default = Recipe()
+    values = other_values(key)
+    assert values
+    for value in values:
+        other = with_value(default, key, value)
+        assert (recipe_id(other, "husky") != recipe_id(default, "husky")) == (section(key) in INGEST)
+        assert (ingest_key(other) != ingest_key(default)) == (section(key) in INGEST)
+        streams_differ = read_key(other, None, definitions="") != read_key(default, None, definitions="")
+        assert streams_differ == (section(key) == "read")
+
+
+def test_one_name_is_one_set_of_bytes_whatever_the_other_sections_say(log, tmp_path):
+    other = Recipe()
+    for key in keys():
+        if section(key) not in {*INGEST, "robot"}:
+            other = with_value(other, key, other_values(key)[0])
+    assert other != Recipe()
+    found = []
+    for recipe in (Recipe(), other):
+        store = tmp_path / recipe.dataset.name
+        (result,) = ingest([log], store=store, recipe=recipe).results
+        assert result.status == "done"
+        run = store / "runs" / result.run_id
+        found.append({path.relative_to(run): path.read_bytes() for path in run.rglob("*") if path.is_file()})
+    assert len(found[0]) > 5
+    assert found[0] == found[1]
+
+
+NUMBERS = [
+    (key, value)
+    for key in keys()
+    for value in other_values(key)
+    if section(key) in INGEST - {"read"} and isinstance(value, float)
+]
+
+
+@pytest.mark.parametrize(("key", "value"), NUMBERS, ids=lambda of: f"{of}")
+def test_no_stage_breaks_at_the_ends_of_a_key(track, streams, key, value):
+    recipe = with_value(Recipe(), key, value)
+    fused = fuse_run(streams, recipe.fuse, run_id="run") if section(key) == "fuse" else track
+    labelled = after_fusion(fused, streams, recipe)
+    assert sum(labelled.ledger_m.values()) > 1.0
+
+
+@pytest.mark.parametrize("value", [*other_values("read.placement")[2:6], None], ids=str)
+def test_no_placement_and_no_offset_breaks_fusion(log, value):
+    config = replace(Recipe().read, **({"placement": value} if value else {"time_offset_s": {"gnss": 2e9}}))
+    streams = streams_of(log, config)
+    with suppress(TcpipeError):  # a plain line is an answer
+        after_fusion(fuse_run(streams, Recipe().fuse, run_id="run"), streams, Recipe())
+
+
+@pytest.mark.parametrize("key", keys())
+def test_toml_and_python_make_the_same_recipe(tmp_path, key):
+    for value in other_values(key):
+        recipe = with_value(Recipe(), key, value)
+        (tmp_path / "r.toml").write_text(commented_toml(recipe), encoding="utf-8")
+        assert load_recipe(tmp_path / "r.toml") == recipe
+    assert parse_recipe({}, where="r") == Recipe()

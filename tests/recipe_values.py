@@ -1,0 +1,69 @@
+"""Other values for every key of the recipe, found by walking its annotations."""
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
+
+from annotated_types import Ge, Le, Lt
+
+from tcpipe.recipe import Recipe
+from tcpipe.recipe.checking import kinds_of
+
+
+def keys() -> list[str]:
+    """Return every key of the recipe, by dots."""
+    default, found = Recipe(), ["robot"]
+    for section in fields(default):
+        of = getattr(default, section.name)
+        found += [f"{section.name}.{name}" for name in kinds_of(type(of))] if is_dataclass(of) else []
+    return found
+
+
+def other_values(key: str) -> list[Any]:
+    """Return valid values of a key that are not its default: of a number both ends, of a choice all others."""
+    section, _, name = key.rpartition(".")
+    holder = getattr(Recipe(), section) if section else Recipe()
+    return [value for value in _values(kinds_of(type(holder))[name]) if value != getattr(holder, name)]
+
+
+def with_value(recipe: Recipe, key: str, value: Any) -> Recipe:
+    """Return the recipe with one key set."""
+    section, _, name = key.rpartition(".")
+    changed = {name: value} if not section else {section: replace(getattr(recipe, section), **{name: value})}
+    return replace(recipe, **changed)
+
+
+def _values(kind: Any, bounds: tuple[Any, ...] = ()) -> Iterator[Any]:
+    origin, of = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        yield from _values(of[0], of[1:])
+    elif origin in (Union, UnionType):
+        yield from _values(next(each for each in of if each is not NoneType))
+    elif origin is Literal:
+        yield from of
+    elif origin is dict:
+        yield from ({role: value} for role in get_args(of[0]) for value in _values(of[1]))
+    elif origin is list:
+        yield ["/another"]
+    elif origin is tuple:
+        yield from zip(*(list(_values(each)) for each in of), strict=True)
+    elif is_dataclass(kind):
+        yield from (kind(**{name: value}) for name, each in kinds_of(kind).items() for value in _values(each))
+    elif kind is bool:
+        yield from (False, True)
+    elif kind is str:
+        yield "another"
+    else:
+        yield from _ends(kind, bounds)
+
+
+def _ends(kind: Any, bounds: tuple[Any, ...]) -> Iterator[Any]:
+    for bound in bounds:
+        match bound:
+            case Ge():
+                yield kind(bound.ge)
+            case Le():
+                yield kind(bound.le)
+            case Lt():
+                yield kind(bound.lt) - 1e-15
