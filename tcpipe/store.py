@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -25,10 +25,10 @@ from typing import Any
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, exclusive
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
 from tcpipe.formats.json_files import read_json
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.seals import checksums_to_json, write_checksums, write_sealed
+from tcpipe.formats.seals import CHECKSUMS, checksums_to_json, prove_files, read_sealed, write_checksums, write_sealed
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     Findings,
@@ -43,7 +43,14 @@ from tcpipe.tables.levels import (
     with_metadata,
 )
 
-_RUN_FILES = ("track.parquet", "segments.parquet", "rejections.parquet")
+RUN_FILES = ("track.parquet", "segments.parquet", "rejections.parquet")
+
+_MANIFEST = {
+    "run_id": str, "recipe_id": str, "ingest_key": str, "tcpipe_version": str, "robot": str, "tags": dict, "recipe": dict,
+    "counts": {"segments": int}, "ledger_m": dict, "warnings": [str], "damage": [str], "info": dict, "checksums": dict,
+}  # fmt: skip
+_RUN = {"source": {"paths": [str], "sha256": str}}
+_HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -61,9 +68,24 @@ class RunDirectory:
         """The robot profile the run was ingested as."""
         return str(self.manifest["robot"])
 
+    @property
+    def version(self) -> str:
+        """The data model it was written in."""
+        return str(self.manifest.get("data_model_version"))
+
+    def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
+        self.prove(f"{name}.parquet")
+        columns = None if columns is None else list(columns)
+        return read_table(self.path / f"{name}.parquet", columns).replace_schema_metadata(None)
+
+    def prove(self, *names: str) -> None:
+        """Compare files with what the manifest has of them; `StoreError` has a line for each that is not as it was written."""
+        prove_files(self.path, self.manifest["checksums"], names)
+
     def segments(self) -> pa.Table:
         """Read the labelled segments (schema LABELLED_SEGMENTS)."""
-        return read_table(self.path / "segments.parquet").replace_schema_metadata(None)
+        return self.table("segments")
 
     def labelled_segments(self) -> LabelledSegments:
         """Read the labelled segments as a checked level, with the run's info and ledger."""
@@ -71,12 +93,23 @@ class RunDirectory:
 
     def track(self) -> GatedTrack:
         """Read the gated track as a checked level."""
-        table = read_table(self.path / "track.parquet").replace_schema_metadata(None)
-        return GatedTrack(table, info_from_json(self.manifest["info"]))
+        return GatedTrack(self.table("track"), info_from_json(self.manifest["info"]))
 
     def rejections(self) -> pa.Table:
         """Read the measurements that the filter refused (schema REJECTIONS)."""
-        return read_table(self.path / "rejections.parquet").replace_schema_metadata(None)
+        return self.table("rejections")
+
+
+@dataclass(frozen=True, slots=True)
+class Ingestions:
+    """What a store, or one of its runs, holds of finished ingestions."""
+
+    finished: tuple[RunDirectory, ...]
+    """Those of this data-model version, by run and recipe."""
+    outdated: Mapping[str, RunDirectory]
+    """By run, of those that are finished in other data-model versions only: the last."""
+    damaged: Mapping[Path, str]
+    """By directory of an ingestion: what is not as it was written."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +117,13 @@ class Store:
     """A store on the local file system."""
 
     root: Path
+
+    def clear(self) -> None:
+        """Put in order what killed commands left anywhere in the store."""
+        for directory in (self.root, self.root / "maps", self.runs_path):
+            clear(directory)
+        for run_id in self.run_ids():
+            clear(self.runs_path / run_id)
 
     @property
     def runs_path(self) -> Path:
@@ -102,36 +142,37 @@ class Store:
         """Return the names of the maps, sorted."""
         return sorted(path.stem for path in self.root.glob("maps/*.zarr") if not path.name.startswith(TEMPORARY_PREFIX))
 
-    def runs(self, *, robot: str | None = None) -> list[RunDirectory]:
+    def runs(self) -> list[RunDirectory]:
         """Return every finished ingestion of this data-model version, by run and recipe."""
-        found = list(self._finished(self.runs_path.glob("*/*/manifest.json")))
-        return [run for run in found if robot is None or run.robot == robot]
-
-    def outdated(self) -> dict[str, str]:
-        """Return the runs that are finished in other data-model versions only, and in which."""
-        versions: dict[str, set[str]] = {}
-        for run in self._whole(self.runs_path.glob("*/*/manifest.json")):
-            versions.setdefault(run.run_id, set()).add(str(run.manifest.get("data_model_version")))
-        return {
-            run_id: ", ".join(sorted(found)) for run_id, found in versions.items() if DATA_MODEL_VERSION not in found
-        }
+        return list(self.ingestions().finished)
 
     def recipes_of(self, run_id: str) -> list[RunDirectory]:
         """Return the finished ingestions of one run."""
-        return list(self._finished((self.runs_path / run_id).glob("*/manifest.json")))
+        return list(self.ingestions(run_id).finished)
+
+    def ingestions(self, run_id: str | None = None) -> Ingestions:
+        """Return what there is of all runs, or of one; every manifest is read once, and proved."""
+        finished, others, damaged = list[RunDirectory](), dict[str, RunDirectory](), dict[Path, str]()
+        for name in self.run_ids() if run_id is None else [run_id]:
+            for path in sorted((self.runs_path / name).glob("*/")):
+                if path.name == "streams" or path.name.startswith(TEMPORARY_PREFIX):
+                    continue
+                try:
+                    run = _ingestion(path)
+                except StoreError as error:
+                    damaged[path] = error.problems[0]
+                    continue
+                if run.version == DATA_MODEL_VERSION:
+                    finished.append(run)
+                else:
+                    others[name] = run
+        current = {run.run_id for run in finished}
+        return Ingestions(tuple(finished), {name: run for name, run in others.items() if name not in current}, damaged)
 
     def run_ids(self) -> list[str]:
         """Return the names of all runs, finished or not."""
-        return sorted(path.name for path in self.runs_path.glob("*") if path.is_dir())
-
-    def _finished(self, manifests: Iterator[Path]) -> Iterator[RunDirectory]:
-        return (run for run in self._whole(manifests) if run.manifest.get("data_model_version") == DATA_MODEL_VERSION)
-
-    def _whole(self, manifests: Iterator[Path]) -> Iterator[RunDirectory]:
-        for path in sorted(manifests):
-            whole = all((path.parent / name).is_file() for name in _RUN_FILES)
-            if whole and not path.parent.name.startswith(TEMPORARY_PREFIX):
-                yield RunDirectory(path.parent.parent.name, path.parent.name, path.parent, read_json(path))
+        here = (path for path in self.runs_path.glob("*") if path.is_dir())
+        return sorted(path.name for path in here if not path.name.startswith(TEMPORARY_PREFIX))
 
     @contextmanager
     def claimed_run(self, stem: str, sha256: str) -> Iterator[str]:
@@ -163,12 +204,17 @@ class Store:
             *(run.path / "manifest.json" for run in self.recipes_of(run_id)),
         ):
             if path.exists():
-                write_sealed(path, {**read_json(path), "tags": dict(tags)})
+                write_sealed(path, {**read_sealed(path), "tags": dict(tags)})
 
     def run_json(self, run_id: str) -> dict[str, Any] | None:
-        """Return what is known of a run's log, or None."""
+        """Return what is known of a run's log, or None; `StoreError` if it is not as it was written, or another run's."""
         path = self.runs_path / run_id / "run.json"
-        return read_json(path) if path.exists() else None
+        if not path.exists():
+            return None
+        found, name = read_sealed(path, _RUN), _HASH_IN_NAME.search(run_id)
+        if name and not found["source"]["sha256"].startswith(name[1]):
+            raise StoreError(f"{path}: is of another run: its log's sha256 does not begin with {name[1]}")
+        return found
 
     def write_run_json(self, run_id: str, values: Mapping[str, Any]) -> None:
         """Write what is known of a run's log."""
@@ -203,10 +249,16 @@ class Store:
 
     def read_streams(self, run_id: str, *, key: str) -> Streams | None:
         """Return L1 if it is there, whole, of this data model and made with these read settings; else None."""
+        directory = self.runs_path / run_id / "streams"
+        try:
+            listed = read_sealed(directory / CHECKSUMS, {"checksums": dict})["checksums"]
+            prove_files(directory, listed, {*listed, *(path.name for path in directory.glob("*.parquet"))})
+        except StoreError:
+            return None
         tables: dict[str, pa.Table] = {}
         sensors: dict[str, Sensor] = {}
         shared: dict[str, Any] = {}
-        for path in sorted((self.runs_path / run_id / "streams").glob("*.parquet")):
+        for path in sorted(directory.glob("*.parquet")):
             try:
                 table = read_table(path)
             except StoreError:
@@ -253,6 +305,22 @@ class Store:
         return path
 
 
+def _ingestion(path: Path) -> RunDirectory:
+    """Read an ingestion; `StoreError` if its manifest is not as it was written, or another's, or a file is gone."""
+    name = path / "manifest.json"
+    found = read_sealed(name, _MANIFEST, ours=lambda found: found.get("data_model_version") == DATA_MODEL_VERSION)
+    run = RunDirectory(path.parent.name, path.name, path, found)
+    if run.version == DATA_MODEL_VERSION:
+        if (found["run_id"], found["recipe_id"]) != (run.run_id, run.recipe_id):
+            raise StoreError(
+                f"{name}: is of {found['run_id']}/{found['recipe_id']}, but lies in {run.run_id}/{run.recipe_id}"
+            )
+        gone = [file for file in RUN_FILES if not (path / file).is_file()]
+        if gone:
+            raise StoreError(f"{path / gone[0]}: is gone; ingest the log again")
+    return run
+
+
 def is_store(path: Path) -> bool:
     """Tell whether a directory is a store: it holds runs or maps."""
     return any(path.glob("runs/*/run.json")) or any(path.glob("maps/*.zarr")) or (path / "sources.json").is_file()
@@ -270,7 +338,10 @@ def run_at(path: Path) -> tuple[Store, list[RunDirectory]] | None:
     for run_path in (real, real.parent):
         if run_path.parent.name == "runs" and (run_path / "run.json").is_file():
             store = Store(run_path.parent.parent)
-            runs = [run for run in store.recipes_of(run_path.name) if real in (run_path, run.path)]
+            found = store.ingestions(run_path.name)
+            runs = [run for run in found.finished if real in (run_path, run.path)]
+            if damaged := [line for path, line in found.damaged.items() if real in (run_path, path)]:
+                raise StoreError(*damaged)
             if not runs:
                 raise StoreError(
                     f"{path}: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again"
@@ -297,4 +368,7 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
             raise StoreError(
                 f"{path}: the store cannot be written ({error.strerror}); name another with --store"
             ) from None
-    return Store(path)
+    store = Store(path)
+    if create:
+        store.clear()
+    return store

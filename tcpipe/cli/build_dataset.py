@@ -41,6 +41,12 @@ from tcpipe.cli.options import json_option, quiet_option, recipe_option, store_o
 @click.option(
     "--keep-split", metavar="OLD", help="An earlier dataset (OUT, too): its samples keep their split and fold."
 )
+@click.option(
+    "--min-runs",
+    type=click.IntRange(1, 1_000_000),
+    metavar="N",
+    help="Build nothing from fewer runs; so many are enough: that others are left out or gone is a warning then.",
+)
 @json_option
 @quiet_option
 def build_dataset(
@@ -57,19 +63,23 @@ def build_dataset(
     holdout: Literal["block", "sample", "run"] | None,
     seed: int | None,
     keep_split: str | None,
+    min_runs: int | None,
     as_json: bool,
     quiet: bool,
-) -> None:
-    """Sample a rotated patch for every segment, split by region, and write the dataset to OUT (default: dataset)."""
-    from dataclasses import asdict
+) -> int:
+    """Sample a rotated patch for every segment, split by region, and write the dataset to OUT (default: dataset).
 
-    from tcpipe.cli.output import print_json, progress, ruling_recipe, say
+    Exit code 3: runs that belong in are left out or gone, or a split that was asked for is empty; each is a line that says what mends it.
+    """
+    from dataclasses import asdict, replace
+
+    from tcpipe.cli.output import print_json, progress, ruling_recipe, say, say_lines
     from tcpipe.pipeline.build import build_dataset as run
 
     ruling, source = ruling_recipe(recipe)
     if not as_json:
         say(f"recipe: {source}")
-    with progress("build-dataset", 1, quiet=quiet):
+    with progress("build-dataset", 1, quiet=quiet) as shown:
         result = run(
             out,
             store=store,
@@ -83,8 +93,12 @@ def build_dataset(
             holdout=holdout,
             seed=seed,
             keep_split=keep_split,
+            min_runs=min_runs,
         )
+        for problem in result.problems:
+            shown.problem(problem)
     if as_json:
-        print_json({**asdict(result), "recipe": source})
+        print_json({**asdict(result), "exit_code": result.exit_code, "recipe": source})
     else:
-        click.echo(str(result))
+        say_lines(replace(result, problems=()))
+    return result.exit_code

@@ -167,6 +167,8 @@ def _print_store(found: Mapping[str, Any]) -> None:
     _print_table(["run", "recipe", "robot", "segments", "metres", "damage"], rows)
     for run_id, version in found["outdated"].items():
         say(f"of another data model ({version}): {run_id}; ingest its log again")
+    for line in found["damaged_runs"].values():
+        say(f"damaged: {line}")
     for run_id in found["unfinished"]:
         say(f"not finished: {run_id}; ingest its log again")
 

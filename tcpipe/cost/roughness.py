@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 
+from tcpipe.cost.least_squares import non_negative
 from tcpipe.cost.power import Samples
 
 Floats = NDArray[np.float64]
@@ -143,8 +143,7 @@ def curvature(signal: Samples) -> Floats:
 
 def _fitted(made: Floats, seen: Floats, weight: Floats) -> list[float]:
     """Return the non-negative size of each row of ``made``, shape (J, S), whose sum is nearest to what is seen."""
-    size, _ = nnls((made * weight).T, seen * weight)
-    fitted: list[float] = size.tolist()
+    fitted: list[float] = non_negative((made * weight).T, seen * weight).tolist()
     return fitted
 
 

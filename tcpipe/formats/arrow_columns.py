@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.formats.arrow_values import IrregularColumns, arrow_type, scalars, texts
+from tcpipe.formats.arrow_values import IrregularColumns, arrow_type, texts
 from tcpipe.formats.log_part import MessageBlock, gathered
 from tcpipe.formats.ros_types import DefinitionError, MessageType, RowError
 from tcpipe.logs.units import field_units
@@ -42,6 +42,7 @@ from tcpipe.logs.wire_layout import (
     strided,
 )
 from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, WireType, flat_fields, in_form, wide_texts
+from tcpipe.tables.arrays import number_column
 
 FLUSH_BYTES = 1 << 20
 """Payloads are turned into columns when about this much has gathered: it still lies in the cache."""
@@ -208,7 +209,7 @@ class TopicTable:
         log, publish, ordinal = times
         order = np.lexsort((ordinal, log))
         if (np.diff(order) < 0).any():
-            table = _contiguous(table).take(scalars(order))
+            table = _contiguous(table).take(number_column(order))
             log, publish, ordinal = log[order], publish[order], ordinal[order]
         count = len(log) if share >= 1 else int(np.searchsorted(log, log[int(share * (len(log) - 1))], "right"))
         self._expected_rows = len(log)
@@ -221,7 +222,7 @@ class TopicTable:
         """Return all parts as one table of many pieces, both times before the fields."""
         log, publish, _ = times
         fields = pa.concat_tables([table for _, table in self._parts])
-        arrays = [[scalars(log)], [scalars(publish)], *(column.chunks for column in fields.columns)]
+        arrays = [[number_column(log)], [number_column(publish)], *(column.chunks for column in fields.columns)]
         return pa.Table.from_arrays(
             [pa.chunked_array(chunks, field.type) for chunks, field in zip(arrays, self.schema, strict=True)],
             schema=self.schema,
@@ -299,9 +300,9 @@ class TopicTable:
         """Build one column of ``count`` elements from its leaves, which come in the order of `_leaves`."""
         match node:
             case ScalarAt():
-                return scalars(next(leaves).reshape(-1))
+                return number_column(next(leaves).reshape(-1))
             case ScalarsAt():
-                return _listed(scalars(next(leaves).reshape(-1)), count, node.array)
+                return _listed(number_column(next(leaves).reshape(-1)), count, node.array)
             case TextAt():
                 raw = pa.py_buffer(next(leaves).reshape(-1).view(np.uint8) if node.length else b"")
                 found, replaced = texts(count, _offsets(count, node.length), raw, node.codec)
@@ -325,7 +326,7 @@ class TopicTable:
             return _listed(pa.array([], arrow_type(node.array.element)), count, node.array)
         columns = [self._column(element, node.array.element, count, leaves) for element in node.elements]
         in_turn = (np.arange(each) * count + np.arange(count)[:, None]).ravel()
-        return _listed(pa.concat_arrays(columns).take(scalars(in_turn)), count, node.array)
+        return _listed(pa.concat_arrays(columns).take(number_column(in_turn)), count, node.array)
 
     def _add_ragged(self, rows: _Int64, buffer: memoryview, offsets: _Int64, lengths: _Int64) -> None:
         self._ragged.add(rows, buffer, offsets, lengths)

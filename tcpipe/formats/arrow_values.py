@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from tcpipe.logs.wire_cursors import Fields, Int64Array, Lists, Runs, Scalars, Values
 from tcpipe.logs.wire_types import Array, Record, Scalar, Text, WireType
+from tcpipe.tables.arrays import number_column
 
 
 def arrow_type(of: WireType) -> pa.DataType:
@@ -24,15 +24,6 @@ def arrow_type(of: WireType) -> pa.DataType:
             return pa.struct([pa.field(name, arrow_type(field)) for name, field in of.fields])
         case Array():
             return pa.list_(arrow_type(of.element), of.length or -1)
-
-
-def scalars(values: NDArray[Any]) -> pa.Array:
-    """Return an Arrow array over numpy values, shape (N,), without pa.array, which would import pandas where it is installed."""
-    if values.dtype == np.bool_:
-        packed = np.packbits(values.view(np.uint8) != 0, bitorder="little")
-        return pa.Array.from_buffers(pa.bool_(), values.size, [None, pa.py_buffer(packed)])
-    values = np.ascontiguousarray(values, values.dtype.newbyteorder("="))
-    return pa.Array.from_buffers(pa.from_numpy_dtype(values.dtype), values.size, [None, pa.py_buffer(values)])
 
 
 def texts(count: int, offsets: pa.Buffer, raw: pa.Buffer, codec: str) -> tuple[pa.StringArray, int]:
@@ -91,7 +82,7 @@ class IrregularColumns:
             case Lists(), Array():
                 return lists(self._array(values.elements, of.element), values.counts, of.length)
             case Runs(kind=np.dtype() as dtype), Array():
-                elements = scalars(np.frombuffer(self._compact(values)[1], dtype))
+                elements = number_column(np.frombuffer(self._compact(values)[1], dtype))
                 return lists(elements, values.lengths // dtype.itemsize, of.length)
             case Runs(kind=str() as codec), Text():
                 found, replaced = texts(len(values.offsets), *self._compact(values), codec)
@@ -102,7 +93,7 @@ class IrregularColumns:
                 windows: NDArray[np.void] = np.ndarray(
                     shape, f"V{dtype.itemsize}", self._data if shape[0] else b"", 0, (1,)
                 )
-                return scalars(windows[offsets].view(dtype))
+                return number_column(windows[offsets].view(dtype))
         raise TypeError(f"{type(values).__name__} are no values of {of}")
 
     def _compact(self, runs: Runs) -> tuple[pa.Buffer, pa.Buffer]:
@@ -117,5 +108,5 @@ class IrregularColumns:
             return pa.py_buffer(np.zeros(1, np.int32)), pa.py_buffer(b"")
         buffers = [None, pa.py_buffer(bounds), pa.py_buffer(self._data)]
         everything = pa.Array.from_buffers(pa.binary(), 2 * count - 1, buffers)
-        _, offsets, raw = everything.take(scalars(np.arange(0, 2 * count, 2))).buffers()
+        _, offsets, raw = everything.take(number_column(np.arange(0, 2 * count, 2))).buffers()
         return offsets, raw

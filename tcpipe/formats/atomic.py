@@ -1,7 +1,8 @@
 """Outputs appear whole or not at all: written under a temporary name beside their place, synced, then renamed.
 
-The directory that holds a temporary is locked as long as its writer lives. So what a killed process left behind is told from what
-another one is writing; it goes when its place is written again.
+A temporary lies in a *holder* beside its place, ``.tmp-<name of the place>-<8 hex>``, that is locked as long as its writer lives. So what
+a killed process left behind is told from what another one is writing. One rule for all of it: whoever writes into a directory, or looks
+whether there is something to do in it, clears it first (`clear`). What a kill took away from its place comes back then, the rest goes.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import ctypes
 import errno
 import fcntl
 import os
+import re
 import shutil
 import uuid
 from collections.abc import Callable, Iterator
@@ -21,6 +23,13 @@ from tcpipe.errors import StoreError
 
 TEMPORARY_PREFIX = ".tmp-"
 """What is left behind by a killed process begins with this; readers skip it."""
+
+_HOLDER = re.compile(re.escape(TEMPORARY_PREFIX) + r"(.+)-[0-9a-f]{8}", re.DOTALL)
+_LONGEST_NAME = 200
+"""Bytes of a place's name in that of its holder."""
+
+_BEFORE = ".before"
+"""In a holder: what was at the place, where the system cannot exchange two directories in one step."""
 
 _UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
 """Errors that only writing can meet, whatever file they name."""
@@ -148,12 +157,9 @@ def _parents_of(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _holder_beside(place: Path) -> Iterator[Path]:
-    """Yield a new locked directory beside ``place`` and remove it in the end; what was abandoned there is removed first."""
-    prefix = f"{TEMPORARY_PREFIX}{os.fsdecode(os.fsencode(place.name)[:200])}-"
-    for entry in place.parent.iterdir():
-        if entry.name.startswith(prefix):
-            _remove_if_abandoned(entry)
-    holder, lock = _locked_directory(place.parent, prefix)
+    """Yield a new locked directory beside ``place`` and remove it in the end; what was abandoned there is cleared first."""
+    clear(place.parent)
+    holder, lock = _locked_directory(place.parent, _prefix(place.name))
     try:
         yield holder
     finally:
@@ -174,13 +180,48 @@ def _locked_directory(parent: Path, prefix: str) -> tuple[Path, int]:
             os.close(lock)
 
 
+def _prefix(name: str) -> str:
+    return f"{TEMPORARY_PREFIX}{os.fsdecode(os.fsencode(name)[:_LONGEST_NAME])}-"
+
+
+def clear(directory: Path) -> None:
+    """Put a directory in order after killed writers: what they took away comes back, what they left behind goes."""
+    for holder in _holders(directory):
+        _claimed(holder, lambda holder=holder: _clear_holder(holder))  # type: ignore[misc]
+
+
+def clear_beside(path: Path) -> None:
+    """Clear the directory in which ``path`` lies, or would."""
+    clear(Path(os.path.realpath(path)).parent)
+
+
+def left_beside(path: Path) -> list[Path]:
+    """Return what killed writers of ``path`` left beside it."""
+    place = Path(os.path.realpath(path))
+    mine = (holder for holder in _holders(place.parent) if holder.name.startswith(_prefix(place.name)))
+    return [holder for holder in mine if is_abandoned(holder)]
+
+
 def is_abandoned(holder: Path) -> bool:
     """Return whether nobody writes into a temporary any more; it may be removed then."""
     return _claimed(holder, lambda: None)
 
 
-def _remove_if_abandoned(holder: Path) -> None:
-    _claimed(holder, lambda: shutil.rmtree(holder))
+def _holders(directory: Path) -> list[Path]:
+    try:
+        names = [entry.name for entry in os.scandir(directory) if entry.name.startswith(TEMPORARY_PREFIX)]
+    except OSError:  # nothing to be cleared here, or by us
+        return []
+    return [directory / name for name in sorted(names) if _HOLDER.fullmatch(name)]
+
+
+def _clear_holder(holder: Path) -> None:
+    before = holder / _BEFORE
+    if before.exists():
+        for written in holder.iterdir():  # beside what was there: what was to take its place, under its name
+            if written != before and not os.path.lexists(holder.parent / written.name):
+                before.rename(holder.parent / written.name)
+    shutil.rmtree(holder)
 
 
 def _claimed(holder: Path, act: Callable[[], object]) -> bool:
@@ -208,14 +249,13 @@ def _take_place(temporary: Path, place: Path) -> None:
             return
     if _exchanged(temporary, place):
         return
-    aside = place.with_name(f"{TEMPORARY_PREFIX}{uuid.uuid4().hex}")
-    place.rename(aside)
+    before = temporary.with_name(_BEFORE)
+    place.rename(before)
     try:
         temporary.rename(place)
     except OSError:
-        aside.rename(place)
+        before.rename(place)
         raise
-    aside.rename(temporary)
 
 
 def _exchanged(one: Path, other: Path) -> bool:

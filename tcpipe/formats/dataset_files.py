@@ -13,16 +13,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.formats.json_files import read_json
 from tcpipe.formats.parquet import column_names, read_row_group, read_table, write_table
-from tcpipe.formats.shards import ShardedArray, open_sharded
+from tcpipe.formats.seals import prove_files, read_sealed
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION
@@ -51,6 +51,13 @@ _LEVELS: dict[Compression, int] = {"zstd": 3, "lz4": 5}
 
 GROUP_ROWS = 1024
 """Patches in one row group of a Parquet shard: 6.5 MB, what a streaming reader holds."""
+
+
+MOST_SAMPLES = 10_000_000
+"""Samples in a dataset: ten thousand kilometres of driving."""
+
+MOST_PX = 1024
+"""Side of a patch in pixels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,8 +227,28 @@ def _list_column(layer: Layer, patches: NDArray[Any]) -> tuple[pa.Field, pa.Arra
     return pa.field(layer.name, dtype, nullable=False, metadata=metadata), column
 
 
-def read_card(directory: Path) -> dict[str, Any]:
-    """Return the card of the dataset in ``directory``; `DatasetError` if there is none."""
+_CARD = {
+    "tcpipe_version": str, "inputs": str, "name": str, "description": str, "recipe": dict, "tensor": {"channels": [str]},
+    "samples": int, "splits": dict.fromkeys(SPLITS, int), "format": str, "patch_m": float, "patch_px": int, "layers": dict,
+    "classes": [{"id": int, "name": str}], "label": {"columns": [str], "velocity": str},
+    "split": {"region": (dict, type(None)), "audit": [dict], "test_fraction": float, "holdout": str},
+    "ledger_m": dict, "removal": dict, "balance": dict, "warnings": [str], "checksums": dict,
+    "maps": [{"name": str, "crs": str}],
+    "runs": [{"run_id": str, "recipe_id": str, "robot": str, "logs": [str], "samples": int}],
+    "shards": [{"path": str, "split": str, "rows": int}],
+}  # fmt: skip
+"""What every reader of a card may rely on."""
+
+
+def read_card(directory: Path, *, proved: bool = True) -> dict[str, Any]:
+    """Return the card of the dataset in ``directory``, of any data model.
+
+    Raises
+    ------
+    DatasetError
+        There is none; or it is of this data model and not as it was written, unless that is not to be ``proved``.
+
+    """
     if not directory.exists():
         raise DatasetError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
     if not directory.is_dir():
@@ -229,7 +256,7 @@ def read_card(directory: Path) -> dict[str, Any]:
     if not (directory / CARD).is_file():
         raise DatasetError(f"{directory}: not a dataset: it has no {CARD}")
     try:
-        card = read_json(directory / CARD)
+        card = read_sealed(directory / CARD, _CARD, ours=lambda found: proved and _is_current(found))
     except StoreError as error:
         raise DatasetError(*error.problems) from None
     if card.get("kind") != KIND:
@@ -237,13 +264,31 @@ def read_card(directory: Path) -> dict[str, Any]:
     return card
 
 
+def _is_current(card: Mapping[str, Any]) -> bool:
+    return card.get("kind") == KIND and card.get("data_model_version") == DATA_MODEL_VERSION
+
+
 def read_current_card(directory: Path) -> dict[str, Any]:
-    """Return the card of a dataset of this data model; `DatasetError` if there is none, or it is of another."""
+    """Return the card of a dataset of this data model, whose samples and descriptions of patches are as they were written.
+
+    Patches carry checksums of their own, which are proved when they are read.
+
+    Raises
+    ------
+    DatasetError
+        There is none, it is of another data model, or not as it was written.
+
+    """
     card = read_card(directory)
-    if card.get("data_model_version") != DATA_MODEL_VERSION:
+    if not _is_current(card):
         raise DatasetError(
             f"{directory}: written by data model {card.get('data_model_version')}, wanted {DATA_MODEL_VERSION}; build it again"
         )
+    described = [name for name in card["checksums"] if Path(name).name == DESCRIPTION]
+    try:
+        prove_files(directory, card["checksums"], [SAMPLES, *described])
+    except StoreError as error:
+        raise DatasetError(*error.problems) from None
     return card
 
 
@@ -325,22 +370,40 @@ def layer_dtype(layer: str) -> type[np.unsignedinteger[Any]]:
 
 
 def open_patches(directory: Path, card: Mapping[str, Any]) -> PatchFiles:
-    """Return where the patches of a dataset lie; `DatasetError` if they are gone."""
-    layers, px = tuple(layer for layer in LAYERS if layer in card["layers"]), card["patch_px"]
+    """Return where the patches of a dataset lie; `DatasetError` if they are gone, or not what the card says."""
+    layers, px, samples = tuple(layer for layer in LAYERS if layer in card["layers"]), card["patch_px"], card["samples"]
+    known = card["format"] in get_args(FileFormat)
+    if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES):
+        raise DatasetError(
+            f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card['format']}: wanted up to "
+            f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"
+        )
+    if card["format"] == "parquet":
+        return _in_shards(directory, layers, px, card)
     try:
-        if card["format"] == "parquet":
-            groups = [
-                (shard["path"], group, min(GROUP_ROWS, shard["rows"] - group * GROUP_ROWS))
-                for shard in card["shards"]
-                for group in range(-(-shard["rows"] // GROUP_ROWS))
-            ]
-            starts = np.concatenate([[0], np.cumsum([rows for *_, rows in groups])]).astype(np.int64)
-            return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
-        starts = np.append(np.arange(0, card["samples"], CHUNK_ROWS), card["samples"])
         arrays = {layer: open_sharded(directory / PATCHES / layer) for layer in layers}
-        return PatchFiles(directory, layers, px, starts, arrays)
     except StoreError as error:
         raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
+    for layer, array in arrays.items():
+        found = f"{array.shape} in {array.chunk_shape} of {array.dtype}"
+        wanted = f"{(samples, px, px)} in {(CHUNK_ROWS, px, px)} of {np.dtype(layer_dtype(layer))}"
+        if found != wanted:
+            raise DatasetError(f"{array.path}: holds {found}, the card says {wanted}; build the dataset again")
+    starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
+    return PatchFiles(directory, layers, px, starts, arrays)
+
+
+def _in_shards(directory: Path, layers: tuple[str, ...], px: int, card: Mapping[str, Any]) -> PatchFiles:
+    rows = [shard["rows"] for shard in card["shards"]]
+    if min(rows, default=0) < 0 or sum(rows) != card["samples"]:
+        raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, wanted {card['samples']}")
+    groups = [
+        (shard["path"], group, min(GROUP_ROWS, shard["rows"] - group * GROUP_ROWS))
+        for shard in card["shards"]
+        for group in range(-(-shard["rows"] // GROUP_ROWS))
+    ]
+    starts = np.concatenate([[0], np.cumsum([rows for *_, rows in groups])]).astype(np.int64)
+    return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
 
 
 def zarr_sample_ids(directory: Path) -> list[str]:

@@ -81,6 +81,33 @@ def parse_json(data: bytes, path: Path) -> dict[str, Any]:
     return found
 
 
+def misfit(value: Any, form: Any, where: str = "") -> str | None:
+    """Return what of a JSON value is not of a form, None if all is.
+
+    A form is a type or a tuple of types (a number is a float), an object of forms by key, of which all must be there and others may be,
+    or a list with the form of each element.
+    """
+    if isinstance(form, dict) and isinstance(value, dict):
+        pairs = [(f"{where}{key}", value.get(key, _ABSENT), of) for key, of in form.items()]
+    elif isinstance(form, list) and isinstance(value, list):
+        pairs = [(f"{where.rstrip('.')}[{number}]", element, form[0]) for number, element in enumerate(value)]
+    else:
+        wanted = (dict,) if isinstance(form, dict) else (list,) if isinstance(form, list) else form
+        types = wanted if isinstance(wanted, tuple) else (wanted,)
+        fits = type(value) in types or (type(value) is int and float in types)
+        names = " or ".join(_JSON_NAMES[of] for of in types)
+        found = "missing" if value is _ABSENT else _JSON_NAMES[type(value)]
+        return None if fits else f"{where.rstrip('.')} is {found}, wanted {names}"
+    return next((line for name, part, of in pairs if (line := misfit(part, of, f"{name}."))), None)
+
+
+_ABSENT = object()
+_JSON_NAMES = {
+    dict: "an object", list: "a list", str: "a text", int: "a whole number", float: "a number", bool: "true or false",
+    type(None): "null",
+}  # fmt: skip
+
+
 def digest(value: Any) -> str:
     """Return the sha256 (hex) of the canonical JSON of ``value``."""
     return hashlib.sha256(to_json(value).encode()).hexdigest()

@@ -396,7 +396,7 @@ class Log:
         topics: dict[str, Topic] = {}
         channels = [channel for part in self._parts for channel in part.channels.values()]
         for channel in sorted(channels, key=lambda c: (c.topic, -(c.message_count or 0), not c.definition)):
-            topic = _topic(channel)
+            topic = _topic(channel, self._types)
             first = self._channel_of.setdefault(channel.topic, channel)
             if channel is first:
                 topics[channel.topic] = topic
@@ -405,10 +405,14 @@ class Log:
         return topics
 
 
-def _topic(channel: Channel) -> Topic:
+def _topic(channel: Channel, types: TypeLibrary) -> Topic:
     problem = None
     if channel.encoding not in ("cdr", "ros1"):
         problem = f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
+    elif not channel.type_name:
+        problem = "the log does not say of which type its messages are"
+    elif not channel.definition.strip() and not types.knows(channel.type_name):
+        problem = f"type {channel.type_name} is unknown: the log holds no definition of it, and none is bundled; give its .msg files"
     return Topic(
         channel.topic,
         channel.type_name,

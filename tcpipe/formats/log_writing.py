@@ -8,8 +8,6 @@ field lies is found by serialising it twice with different bytes, not by a secon
 from __future__ import annotations
 
 import functools
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -27,7 +25,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_file
+from tcpipe.formats.atomic import atomic_directory, atomic_file
 from tcpipe.logs.definitions import DEFINITIONS
 
 Encoding = Literal["ros1", "cdr"]
@@ -105,15 +103,12 @@ def write_rosbag2(
 ) -> None:
     """Write a ROS 2 bag directory (metadata.yaml beside one .db3 or .mcap)."""
     store, plugin = _typestore("cdr"), {"sqlite3": StoragePlugin.SQLITE3, "mcap": StoragePlugin.MCAP}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=TEMPORARY_PREFIX, dir=path.parent) as holder:
-        directory = Path(holder) / path.name  # the files inside are named after it
+    with atomic_directory(path) as directory:
+        directory.rmdir()  # the writer wants to make it; the files inside are named after it
         with Rosbag2Writer(directory, version=9, storage_plugin=plugin[storage]) as writer:
             connections = [writer.add_connection(s.topic, s.type_name, typestore=store) for s in streams]
             for index, _, payload, log_time, _ in _in_log_order(streams, "cdr"):
                 writer.write(connections[index], log_time, payload)
-        shutil.rmtree(path, ignore_errors=True)
-        directory.rename(path)
 
 
 def _in_log_order(streams: Sequence[MessageStream], encoding: Encoding) -> list[tuple[int, int, bytes, int, int]]:

@@ -29,7 +29,8 @@ from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
 from tcpipe.formats.class_table import table_from_json, table_to_json
-from tcpipe.formats.shards import ShardedArray, open_sharded
+from tcpipe.formats.seals import CHECKSUMS, prove_files, read_sealed
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
 from tcpipe.terrain.classes import ClassScheme, ClassTable
 from tcpipe.terrain.grid import MapGrid
@@ -114,13 +115,14 @@ class MapFile:
             ) from error
 
 
-def open_map(path: Path) -> MapFile:
+def open_map(path: Path, *, proved: bool = True) -> MapFile:
     """Open a map for reading.
 
     Raises
     ------
     MapError
-        There is none, or it is not a map of this program.
+        There is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were written
+        or a file is gone: lost tiles would read as ground without data.
     """
     try:
         group = open_group(path)
@@ -135,6 +137,8 @@ def open_map(path: Path) -> MapFile:
     missing = [array for array in wanted if not (path / array / "zarr.json").is_file()]
     if missing:
         raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
+    if proved:
+        _prove(path)
     return MapFile(
         name=found["name"],
         grid=MapGrid(**found["grid"]),
@@ -150,6 +154,26 @@ def open_map(path: Path) -> MapFile:
             for f in factors
         },
     )
+
+
+def _prove(path: Path) -> None:
+    """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
+    try:
+        listed = read_sealed(path / CHECKSUMS, {"checksums": dict})["checksums"]
+        prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
+    except StoreError as error:
+        raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
+    lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry["size_bytes"])]
+    if lost:
+        more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
+        raise MapError(f"{lost[0]}{more}: gone or cut short; add the map again")
+
+
+def _has_size(path: Path, size_bytes: int) -> bool:
+    try:
+        return path.stat().st_size == size_bytes
+    except OSError:
+        return False
 
 
 def _level_path(factor: int) -> str:

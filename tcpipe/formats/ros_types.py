@@ -161,6 +161,10 @@ class TypeLibrary:
             raise found
         return found
 
+    def knows(self, type_name: str) -> bool:
+        """Return whether a type can be read of which a log holds no definition."""
+        return type_name in self._own or self._fallback(type_name, ros1=False) is not None
+
     def _resolve(self, type_name: str, definition: str, schema_encoding: str, *, ros1: bool) -> MessageType:
         known, source = self._known(type_name, definition, schema_encoding)
         fallback = functools.partial(self._fallback, ros1=ros1)

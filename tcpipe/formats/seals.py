@@ -9,12 +9,12 @@ from __future__ import annotations
 import hashlib
 import re
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import digest, parse_json, plain, read_document, write_json
+from tcpipe.formats.json_files import digest, misfit, parse_json, plain, read_document, write_json
 
 SEAL = "document_sha256"
 """Key of a sealed document that holds the sha256 (hex) of its canonical JSON without this key."""
@@ -24,6 +24,8 @@ CHECKSUMS = "checksums.json"
 
 _SEAL_LINE = re.compile(rb'^  "document_sha256": "([0-9a-f]{64})"(,?)\n', re.MULTILINE)
 """The seal in canonical JSON: the text without this line is what it is the hash of."""
+
+_TELLS = "; 'tcpipe verify {}' tells what else is not as it was written"
 
 _PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -35,13 +37,17 @@ def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
     write_json(path, {**bare, SEAL: digest(bare)})
 
 
-def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
+def read_sealed(
+    path: Path, form: Mapping[str, Any] | None = None, *, ours: Callable[[Mapping[str, Any]], bool] = lambda _: True
+) -> dict[str, Any]:
     """Read a JSON object that `write_sealed` wrote, and prove it.
 
     Parameters
     ----------
     path
         The document.
+    form
+        What it must hold (`tcpipe.formats.json_files.misfit`).
     ours
         Tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
         refuse.
@@ -49,14 +55,26 @@ def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Any]], bool] = lambd
     Raises
     ------
     StoreError
-        It cannot be read, or is not as it was written.
+        It cannot be read, is not as it was written, or does not hold what it must.
 
     """
     data = read_document(path)
     found = parse_json(data, path)
-    if ours(found) and not _document_is_whole(data):
-        raise StoreError(f"{broken(path)}; 'tcpipe verify {path.parent}' tells what else is not")
+    if not ours(found):
+        return found
+    if not _document_is_whole(data):
+        raise StoreError(f"{broken(path)}{_TELLS.format(path.parent)}")
+    wrong = misfit(found, form or {})
+    if wrong:
+        raise StoreError(f"{path}: is not what this version writes: {wrong}")
     return found
+
+
+def prove_files(directory: Path, checksums: Mapping[str, Any], names: Iterable[str]) -> None:
+    """Compare files of a directory with what a sealed document has of them; `StoreError` with a line for each that differs."""
+    lines = list(broken_checksums(directory, {name: checksums.get(name) for name in names}))
+    if lines:
+        raise StoreError(*(f"{line}{_TELLS.format(directory)}" for line in lines))
 
 
 def write_checksums(directory: Path) -> None:

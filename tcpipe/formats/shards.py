@@ -23,6 +23,9 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError
 
+DESCRIPTION = "zarr.json"
+"""What an array or a group is, in its directory."""
+
 _CRC_BYTES = 4
 _ABSENT = 2**64 - 1
 """Offset of a chunk that is all fill value."""
@@ -147,7 +150,7 @@ class ShardedArray:
 def open_sharded(path: Path, *, sparse: bool = False) -> ShardedArray:
     """Return the array whose description is ``path``/zarr.json; `StoreError` if it is none that this program writes."""
     try:
-        described = json.loads((path / "zarr.json").read_text(encoding="utf-8"))
+        described = json.loads((path / DESCRIPTION).read_text(encoding="utf-8"))
         sharding = described["codecs"][0]["configuration"]
         names = [codec["name"] for codec in sharding["codecs"]]
         index_names = [codec["name"] for codec in sharding["index_codecs"]]

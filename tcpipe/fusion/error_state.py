@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD, process_noise, turn_scale_std, turn_sources
 from tcpipe.fusion.signals import median_period_ns
@@ -224,7 +224,7 @@ class _Run:
         self.displacement_variance_m2 = np.full((timeline.output.max() + 1, len(DISPLACEMENT_LAGS_S)), np.nan)
         self.gates = np.full(8, np.inf)
         for kind in (*_ROLES, kernel.STANDING, kernel.STANDING_RATE):
-            self.gates[kind] = chdtri(_DOF[kind], 1 - gate_probability)
+            self.gates[kind] = chi_square_gate(_DOF[kind], gate_probability)
         self._levers = np.zeros((8, 3))
         for kind, source in (
             (kernel.GNSS_POSITION, measurements.gnss),

@@ -17,15 +17,15 @@ go round the circle. Estimates use the past only; the smoother is `tcpipe.fusion
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtri
 
-from tcpipe.fusion import filterpy_engine, ukf15_kernel
+from tcpipe.fusion import ukf15_kernel
+from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, InitialState, Measurements
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.fusion.ukf15_kernel import (
@@ -210,7 +210,7 @@ def filter_forward(
     nis = [np.full(source.stamp_ns.size, np.nan) for source in sources]
     outcome = [np.full(source.stamp_ns.size, NOT_RUN, np.int8) for source in sources]
     packed = _packed(sources, gates)
-    run = filterpy_engine.run if engine == "filterpy" else ukf15_kernel.run
+    run = _run_of(engine)
     reached, repairs = [0] * len(sources), 0
     for first in range(0, output_ns.size, _BLOCK):
         block = slice(first, first + _BLOCK)
@@ -226,6 +226,15 @@ def filter_forward(
                 all_of[at][rows[at]] = part
         reached = until
     return Forward(states, variances, (belief.x[:STATES], belief.P[:, :STATES]), nis, outcome, repairs)
+
+
+def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., int]:
+    if engine == "compiled":
+        compiled: Callable[..., int] = ukf15_kernel.run
+        return compiled
+    from tcpipe.fusion import filterpy_engine  # noqa: PLC0415  it takes more than a second to load
+
+    return filterpy_engine.run
 
 
 def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[Source]:
@@ -331,7 +340,7 @@ def _priors(sensors: Sequence[Source], start_ns: int, end_ns: int) -> list[Sourc
 def _gate(source: Source, probability: float) -> float:
     if source.role in {_GROUND, _PRIOR}:
         return math.inf
-    return float(chdtri(len(source.entries), 1.0 - probability))
+    return chi_square_gate(len(source.entries), probability)
 
 
 def _initial_belief(initial: InitialState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import write_text
+from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import digest, read_json, to_json, write_json
 from tcpipe.learning.evaluation import NETWORKS, EvaluateConfig, PlantCosts, evaluate
@@ -65,6 +65,7 @@ def run_evaluation(
 
     """
     place = Path(out)
+    clear(place)
     ours = {JSON, CSV, PAGE, NETWORKS}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours

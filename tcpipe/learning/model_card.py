@@ -64,6 +64,11 @@ def card_to_json(card: ModelCard) -> dict[str, Any]:
     return {"kind": KIND, "schema_version": SCHEMA_VERSION, **values}
 
 
+def is_current(found: Mapping[str, Any]) -> bool:
+    """Return whether a document is the card of a model of this schema."""
+    return found.get("kind") == KIND and found.get("schema_version") == SCHEMA_VERSION
+
+
 def card_from_json(found: Mapping[str, Any], where: str) -> ModelCard:
     """Return the card that `card_to_json` wrote.
 

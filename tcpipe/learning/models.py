@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError, StoreError
 from tcpipe.formats.atomic import atomic_directory, write_text
-from tcpipe.formats.json_files import digest, read_json
+from tcpipe.formats.json_files import digest
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.seals import checksums_to_json, file_checksum, write_sealed
+from tcpipe.formats.seals import broken_checksums, checksums_to_json, read_sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
-from tcpipe.learning.model_card import ModelCard, card_from_json, card_to_json
+from tcpipe.learning.model_card import ModelCard, card_from_json, card_to_json, is_current
 from tcpipe.learning.network import named_weights, resnet18
 from tcpipe.terrain.classes import ClassTable
 
@@ -169,11 +169,8 @@ def load_model(path: str | Path) -> Model:
     place = Path(path)
     found = read_model_card(place)
     card = card_from_json(found, str(place / CARD))
-    for name, entry in found.get("checksums", {}).items():
-        if not (place / name).is_file() or file_checksum(place / name)[1] != entry["sha256"]:
-            raise ModelError(
-                f"{place / name}: gone, cut short or damaged (its checksum is not the card's); train the model again"
-            )
+    if problems := list(broken_checksums(place, found["checksums"])):
+        raise ModelError(*(f"{problem}; train the model again" for problem in problems))
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
     return Model(str(path), card, place, digest(found), residuals)
@@ -186,9 +183,9 @@ def read_model_card(place: Path) -> dict[str, Any]:
     if not (place / CARD).is_file():
         raise ModelError(f"{place}: not a model: it has no {CARD}")
     try:
-        return read_json(place / CARD)
+        return read_sealed(place / CARD, {"checksums": dict}, ours=is_current)
     except StoreError as error:
-        reason = error.problems[0].partition(";")[0]
+        reason = error.problems[0].removesuffix("; remove it and run the command again")
         raise ModelError(f"{reason}; remove the folder and train the model again") from None
 
 

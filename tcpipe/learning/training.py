@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError
+from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.class_table import table_from_json
 from tcpipe.formats.json_files import digest
 from tcpipe.learning.checkpoint import Progress
@@ -100,6 +101,7 @@ def train(
 
     """
     rules, other, place, data = config or FitConfig(), variant or Variant(), Path(out), open_dataset(dataset)
+    clear_beside(place)
     key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     if (known := _known(place)) is not None and known["training"].get("key") == key and not fresh and _is_whole(place):
         return _unchanged(place, known)

@@ -1,7 +1,8 @@
 """Which topic plays which role, decided from the topic list alone, and why; what cannot be decided is asked for with the recipe line.
 
 Rules, in this order: the recipe; topics that are other estimators' outputs play no role (fusing them again would count a sensor twice);
-the message type; how the topic is called. Where two topics are left that no rule tells apart, nobody guesses.
+the message type; how the topic is called, unless a topic covers but a small share of what a rival covers. Where two topics are left that
+no rule tells apart, nobody guesses. What is left out, and what cannot be decoded, is a warning.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TypeVar
 
+from tcpipe.logs.coverage import coverage, covering_little
 from tcpipe.logs.power_sources import (
     BATTERY_STATE,
     FLOAT_TYPES,
@@ -87,10 +89,17 @@ class _Casting:
 
     roles: dict[str, Role] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
+    passed_over: dict[str, dict[str, str]] = field(default_factory=dict)
+    """By role, why topics that hold data were not taken, though nobody asked for that."""
     problems: list[str] = field(default_factory=list)
     ambiguous: list[str] = field(default_factory=list)
     recipe_lines: list[str] = field(default_factory=list)
     undecided: set[str] = field(default_factory=set)
+
+    def pass_over(self, role: str, topic: Topic, why: str) -> None:
+        """Leave a candidate out."""
+        self.left_out[topic.name] = why
+        self.passed_over.setdefault(role, {})[topic.name] = f"{coverage(topic)}; {why}"
 
 
 RoleName = TypeVar("RoleName", bound=str)
@@ -144,14 +153,15 @@ def assign_roles(
     else:
         for role, candidates in found.items():
             _decide(casting, role, candidates)
+    problems = casting.problems + (_without_motion(casting, list(listed.values())) or _questions(casting))
     return Assignment(
         profile,
         robot_why,
         {role: casting.roles[role] for role in ROLE_TYPES if role in casting.roles},
         casting.left_out,
         _transform_topics(listed.values(), ignored),
-        tuple(casting.problems + (_without_motion(casting, list(listed.values())) or _questions(casting))),
-        tuple(_warnings(casting)),
+        tuple(problems),
+        tuple(line for line in _warnings(casting, listed.values()) if line not in problems),
     )
 
 
@@ -253,11 +263,14 @@ def _candidates(
     found: dict[str, Ranked] = {role: [] for role in ROLE_TYPES}
     bare = [topic for topic in topics if topic.type_name in FLOAT_TYPES]
     for topic in topics:
-        if topic in bare:
+        if topic.type_name in FLOAT_TYPES:
             continue
         role, rank, why = _SORTERS[topic.type_name](topic)
         if role is None:
             casting.left_out[topic.name] = why
+            usual = next(role for role, types in ROLE_TYPES.items() if topic.type_name in types)
+            if usual not in chosen:
+                casting.pass_over(usual, topic, why)
         elif role in chosen:
             casting.left_out[topic.name] = f"the recipe chooses what plays {role}"
         else:
@@ -353,13 +366,15 @@ _SORTERS: dict[str, Callable[[Topic], Sorted]] = {
 def _decide(casting: _Casting, role: str, candidates: Ranked) -> None:
     if not candidates:
         return
-    best = min(rank for rank, _, _ in candidates)
-    first = [(why, topic) for rank, why, topic in candidates if rank == best]
+    first = _best(role, candidates)
     topics = [topic for _, topic in first]
     names = tuple(topic.name for topic in topics)
+    taken = set(names)
+    others = [topic for _, _, topic in candidates if topic.name not in taken]
+    thin = covering_little(others, topics)
     if len(first) == 1:
-        others = [topic.name for rank, _, topic in candidates if rank != best]
-        better = f"it fits better than {', '.join(others)}" if others else f"the only {topics[0].type_name}"
+        better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
+        better = f"{better} than {_names(others)}" if others else f"the only {topics[0].type_name}"
         why = first[0][0] or better
     elif role == "power" and _are_sides(rails := _rails(topics)):
         why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
@@ -369,9 +384,22 @@ def _decide(casting: _Casting, role: str, candidates: Ranked) -> None:
         casting.undecided.add(role)
         return
     casting.roles[role] = Role(role, names, topics[0].type_name, why)
-    for rank, _, topic in candidates:
-        if rank != best:
-            casting.left_out[topic.name] = f"{' + '.join(names)} fits {role} better"
+    winner = " + ".join(names)
+    little = f"it covers little of what {winner} covers ({coverage(topics[0])})"
+    for topic in others:
+        casting.pass_over(role, topic, little if topic.name in thin else f"{winner} fits {role} better")
+
+
+def _best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
+    """Return the candidates of the best rank, each with what speaks for it; those that cover little beside another do not count.
+
+    Of power all of a rank are taken, since sides are summed: one that fell silent is still a side.
+    """
+    topics = [topic for _, _, topic in candidates]
+    thin = covering_little(topics, topics)
+    ample = [entry for entry in candidates if entry[2].name not in thin] or candidates
+    best = min(rank for rank, _, _ in ample)
+    return [(why, topic) for rank, why, topic in (candidates if role == "power" else ample) if rank == best]
 
 
 def _rails(topics: Iterable[Topic]) -> tuple[str, ...]:
@@ -407,29 +435,47 @@ def _without_motion(casting: _Casting, topics: Sequence[Topic]) -> list[str]:
     if any(role in casting.roles or role in casting.undecided for role in MOTION_ROLES):
         return []
     lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
-    could = {name: why for name, why in casting.left_out.items() if _is_motion(topics, name)}
+    types = {topic.name: topic.type_name for topic in topics}
+    could = {name: why for name, why in casting.left_out.items() if _is_motion(types[name])}
     if could:
         name = next(iter(could))
-        role = "gnss" if _type_of(topics, name) in ROLE_TYPES["gnss"] else "wheel_odometry"
+        role = "gnss" if types[name] in ROLE_TYPES["gnss"] else "wheel_odometry"
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:_LISTED])
         lines.append(f'left out: {reasons}; to use one all the same: [read.topics] {role} = ["{name}"]')
-    return [*lines, f"the log holds {_listing(topics)}"]
+    return [*lines, *_undecodable(topics), f"the log holds {_listing(topics)}"]
 
 
-def _is_motion(topics: Sequence[Topic], name: str) -> bool:
-    return any(_type_of(topics, name) in ROLE_TYPES[role] for role in MOTION_ROLES)
+def _undecodable(topics: Iterable[Topic]) -> Iterable[str]:
+    """Yield one line of the topics that hold data that cannot be decoded, by the reason."""
+    by_reason: dict[str, list[Topic]] = {}
+    for topic in topics:
+        if topic.problem is not None and topic.message_count != 0:
+            by_reason.setdefault(topic.problem, []).append(topic)
+    if by_reason:
+        reasons = "; ".join(f"{_names(topics)}: {why}" for why, topics in list(by_reason.items())[:_LISTED])
+        more = f"; {len(by_reason) - _LISTED} more reasons" if len(by_reason) > _LISTED else ""
+        yield f"topics that hold data which cannot be decoded: {reasons}{more}"
 
 
-def _type_of(topics: Sequence[Topic], name: str) -> str:
-    return next(topic.type_name for topic in topics if topic.name == name)
+def _names(topics: Sequence[Topic]) -> str:
+    shown = ", ".join(topic.name for topic in topics[:_LISTED])
+    return f"{shown} and {len(topics) - _LISTED} more" if len(topics) > _LISTED else shown
 
 
-def _warnings(casting: _Casting) -> Iterable[str]:
+def _is_motion(type_name: str) -> bool:
+    return any(type_name in ROLE_TYPES[role] for role in MOTION_ROLES)
+
+
+def _warnings(casting: _Casting, topics: Iterable[Topic]) -> Iterable[str]:
     there = casting.roles.keys() | casting.undecided
     if "gnss" not in there:
         yield "no topic plays gnss: the track lies in a local frame and cannot be placed on a map"
     if "power" not in there:
         yield "no topic plays power: there will be a track but no energy"
+    for role, passed in casting.passed_over.items():
+        shown = ", ".join(f"{name} ({why})" for name, why in list(passed.items())[:_LISTED])
+        yield f"{role}: left out: {shown}" + (f" and {len(passed) - _LISTED} more" if len(passed) > _LISTED else "")
+    yield from _undecodable(topics)
 
 
 def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 _ENOUGH = 3
@@ -24,10 +25,11 @@ def namespaces_of_robots(candidates: Mapping[str, Sequence[str]]) -> dict[str, t
             first, _, rest = topic.strip("/").partition("/")
             if rest:
                 roles_of.setdefault(f"/{first}", set()).add(role)
+    kinds = Counter(map(frozenset, roles_of.values()))  # few, however many namespaces there are
     robots = {
         name
         for name, roles in roles_of.items()
-        for other, others in roles_of.items()
-        if name != other and len(roles & others) >= _ENOUGH and roles & others & _PLACES
+        for others, count in kinds.items()
+        if count > (others == roles) and len(roles & others) >= _ENOUGH and roles & others & _PLACES
     }
     return {name: tuple(role for role in candidates if role in roles_of[name]) for name in sorted(robots)}

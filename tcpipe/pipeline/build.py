@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError
-from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -25,6 +25,7 @@ from tcpipe.formats.dataset_files import (
     FileFormat,
     Pixels,
     read_card,
+    read_current_card,
     read_samples,
     write_patches_parquet,
     write_patches_zarr,
@@ -46,8 +47,9 @@ from tcpipe.pipeline.dataset_card import (
 )
 from tcpipe.pipeline.dataset_content import Content, gather_content
 from tcpipe.pipeline.dataset_inputs import Inputs, choose_inputs, earlier_splits
+from tcpipe.pipeline.dataset_runs import gone_runs
 from tcpipe.pipeline.dataset_segments import KEPT
-from tcpipe.pipeline.dataset_splitting import regions_to_json
+from tcpipe.pipeline.dataset_splitting import empty_splits, regions_to_json
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import maps_overview, write_overview
@@ -74,7 +76,14 @@ class BuildResult:
     ledger_m: Mapping[str, float]
     audit: tuple[HeldOut, ...]
     warnings: tuple[str, ...]
+    problems: tuple[str, ...] = ()
+    """Runs that belong in and are left out, and splits that were asked for and are empty: the dataset is not what it should be."""
     energy_budget: Mapping[str, Any] | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """Return 3 if the dataset is not what it should be, else 0."""
+        return 3 if self.problems else 0
 
     def __str__(self) -> str:
         """Return counts, the audit, where the metres went and how wrong a label may be, as plain lines."""
@@ -87,9 +96,8 @@ class BuildResult:
         ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
         floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
-        return "\n".join(
-            (head, *audit_lines(self.audit), ledger, *floor, *(f"warning: {text}" for text in self.warnings))
-        )
+        said = (f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s"))
+        return "\n".join((head, *audit_lines(self.audit), ledger, *floor, *said))
 
 
 def build_dataset(
@@ -106,8 +114,12 @@ def build_dataset(
     holdout: Holdout | None = None,
     seed: int | None = None,
     keep_split: str | Path | None = None,
+    min_runs: int | None = None,
 ) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
+
+    Runs that are not as they were written are left out; those, runs that have to be ingested again, runs of the dataset that is replaced
+    that are gone, and empty splits are the result's ``problems``.
 
     Parameters
     ----------
@@ -133,6 +145,8 @@ def build_dataset(
         Instead of the recipe's.
     keep_split
         An earlier dataset, which may be ``out`` itself: its samples keep their split and fold, only new ones are drawn.
+    min_runs
+        Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
 
     Raises
     ------
@@ -142,7 +156,8 @@ def build_dataset(
     """
     ruling = _ruling(recipe, holdout=holdout, seed=seed)
     place, house = Path(out), open_store(store)
-    known = _card_in_place(place)
+    clear_beside(place)
+    known, proved = _card_in_place(place)
     regions = None if split is None else read_regions(Path(split))
     region = None if split is None else Path(split).read_bytes()
     robot = robot or ruling.robot
@@ -157,17 +172,33 @@ def build_dataset(
         file_format=file_format,
         earlier=earlier,
     )
-    if known is not None and known.get("inputs") == inputs.digest and is_whole(place, known):
-        return _result(place, "unchanged", known)
+    problems, warnings = _left_out(inputs, known, robot=robot, tags=tags or {}, min_runs=min_runs)
+    inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
+    if proved and known is not None and known["inputs"] == inputs.digest and is_whole(place, known):
+        return _result(place, "unchanged", known, problems)
     try:
         with atomic_directory(place.absolute()) as directory:
             card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
     except OSError as error:
         raise DatasetError(f"{place}: the dataset cannot be written ({error.strerror or error})") from None
-    return _result(place, "done", card)
+    return _result(place, "done", card, problems)
 
 
-def _result(place: Path, status: str, card: Mapping[str, Any]) -> BuildResult:
+def _left_out(
+    inputs: Inputs, known: Mapping[str, Any] | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what is wrong with the choice of runs, and what is worth a warning; `DatasetError` where there are too few."""
+    chosen = inputs.chosen
+    fewer = (*chosen.missing, *(() if known is None else gone_runs(known, chosen, robot=robot, tags=tags)))
+    if min_runs is None:
+        return (*chosen.damaged, *fewer), ()
+    if len(inputs.runs) < min_runs:
+        count = f"{len(inputs.runs)} runs, wanted {min_runs} or more (--min-runs); nothing is written"
+        raise DatasetError(count, *chosen.damaged, *fewer)
+    return chosen.damaged, fewer
+
+
+def _result(place: Path, status: str, card: Mapping[str, Any], problems: Sequence[str]) -> BuildResult:
     return BuildResult(
         path=place,
         status=status,
@@ -176,6 +207,7 @@ def _result(place: Path, status: str, card: Mapping[str, Any]) -> BuildResult:
         ledger_m=card["ledger_m"],
         audit=tuple(HeldOut(**part) for part in card["split"]["audit"]),
         warnings=tuple(card["warnings"]),
+        problems=(*problems, *empty_splits(card)),
         energy_budget=card.get("energy_budget"),
     )
 
@@ -192,21 +224,26 @@ def _ruling(recipe: Recipe | str | Path | None, *, holdout: Holdout | None, seed
     return replace(recipe, split=rules)
 
 
-def _card_in_place(place: Path) -> Mapping[str, Any] | None:
-    """Return the card of the dataset that is there, None if nothing is; `DatasetError` if it is something else."""
+def _card_in_place(place: Path) -> tuple[Mapping[str, Any] | None, bool]:
+    """Return the card of the dataset that is there, if one is, and whether it is as it was written; `DatasetError` for anything else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
-        return None
+        return None, False
     if not place.is_dir():
         raise DatasetError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
     if not (place / CARD).is_file():
         raise DatasetError(f"{place}: exists and is no dataset (it has no {CARD}); it is left alone; give another OUT")
-    card = read_card(place)
+    card, proved = read_card(place, proved=False), True
+    try:
+        read_current_card(place)
+    except DatasetError as error:
+        proved = False
+        logger.warning("%s; it is built again", error.problems[0])
     ours = {*card.get("checksums", {}), CARD, CROISSANT, REPORT}
     others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
         raise DatasetError(f"{place}: holds {others[0]}{more} beside the dataset; move it away or give another OUT")
-    return card
+    return card, proved
 
 
 def _build(
@@ -262,6 +299,7 @@ def _build(
         ledger_m=content.ledger_m,
         removal=content.removal.to_json(),
         balance=balance.facts,
+        problems=inputs.problems,
         warnings=content.warnings,
         shards=shards,
         checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},

@@ -49,6 +49,8 @@ class CardFacts:
     ledger_m: Mapping[str, float]
     removal: Mapping[str, Any]
     balance: Mapping[str, Any]
+    problems: Sequence[str]
+    """What is wrong with the choice of runs."""
     warnings: Sequence[str]
     shards: Sequence[Mapping[str, Any]]
     checksums: Mapping[str, tuple[int, str]]
@@ -99,6 +101,7 @@ def dataset_card(samples: pa.Table, recipe: Recipe, facts: CardFacts) -> dict[st
         "balance": dict(facts.balance),
         "runs": [{**run, "samples": _count(samples, "run_id", run["run_id"])} for run in facts.runs],
         "maps": list(facts.maps),
+        "problems": list(facts.problems),
         "warnings": list(facts.warnings),
         "shards": list(facts.shards),
         "checksums": {

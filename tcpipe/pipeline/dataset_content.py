@@ -163,7 +163,7 @@ def gather_content(
         ledger_m=move_out(pool.ledger_m, {**patches.lost_m, **unused_m}),
         registrations=[found for found, _ in registered],
         removal=removal,
-        warnings=(*inputs.warnings, *pool.warnings, *off, *patches.warnings, *drawn.warnings, *removal.warnings),
+        warnings=(*inputs.warnings, *pool.warnings, *off, *patches.warnings, *removal.warnings),
     )
 
 

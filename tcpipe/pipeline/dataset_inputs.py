@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,9 +22,9 @@ from tcpipe.formats.dataset_files import (
     read_samples,
     sample_columns,
 )
-from tcpipe.formats.json_files import digest, plain, read_json
-from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.seals import CHECKSUMS, broken_seal, file_checksum, file_checksums
+from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_sealed
+from tcpipe.pipeline.dataset_runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store
@@ -46,7 +47,10 @@ class Inputs:
     again: Mapping[str, NDArray[np.bool_]]
     """By run: which of its segments another run has too."""
     digest: str
+    chosen: Chosen
     warnings: tuple[str, ...]
+    problems: tuple[str, ...] = ()
+    """What is wrong with the choice of runs."""
 
 
 def choose_inputs(
@@ -62,8 +66,8 @@ def choose_inputs(
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     names = choose_maps(store, map_names)
-    chosen, warnings = choose_runs(store, recipe, robot=robot, tags=tags or {})
-    once = each_drive_once(chosen, {run.run_id: _source(store, run)["sha256"] for run in chosen})
+    chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
+    once = each_drive_once(chosen.runs, {run_id: log["sha256"] for run_id, log in chosen.logs.items()})
     runs = once.runs
     paths = tuple(store.map_path(name) for name in names)
     map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths, strict=True))
@@ -79,22 +83,25 @@ def choose_inputs(
             **({} if earlier is None else {"kept_split": _table_digest(earlier)}),
         }
     )
-    sources = tuple(run_source(store, run) for run in runs)
-    return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, (*warnings, *once.warnings))
+    sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
+    warnings = (*chosen.warnings, *once.warnings)
+    return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings)
 
 
 def _map_digest(name: str, path: Path) -> str:
     """Return one hash over a map's files; `MapError` if they are not as they were written: a lost one would read as no data."""
-    found = file_checksums(path)
-    problem = broken_seal(path / CHECKSUMS)
-    recorded = {} if problem else read_json(path / CHECKSUMS)["checksums"]
-    wrong = sorted(
-        file
-        for file in {*found, *recorded} - {CHECKSUMS}
-        if found.get(file) != tuple(recorded.get(file, {}).get(key) for key in ("size_bytes", "sha256"))
-    )
-    if problem or wrong:
-        what = problem or f"{path / wrong[0]}{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}"
+    found, wrong = file_checksums(path), list[str]()
+    try:
+        recorded = {
+            name: (entry["size_bytes"], entry["sha256"])
+            for name, entry in read_sealed(path / CHECKSUMS, {"checksums": dict})["checksums"].items()
+        }
+        names = {*found, *recorded} - {CHECKSUMS}
+        wrong = [str(path / name) for name in sorted(names) if found.get(name) != recorded.get(name)]
+    except StoreError as error:
+        wrong = list(error.problems)
+    if wrong:
+        what = f"{wrong[0]}{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}"
         raise MapError(
             f"map {name}: not as it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
         )
@@ -127,85 +134,25 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names)) or (maps[0],)
 
 
-def choose_runs(
-    store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]
-) -> tuple[list[RunDirectory], list[str]]:
-    """Return the runs to pool, those that carry all of the tags, and warnings; two robots are never pooled unasked."""
-    every, outdated = store.runs(), store.outdated()
-    if not every and outdated:
-        versions = ", ".join(sorted(set(outdated.values())))
-        raise DatasetError(
-            f"{store.root}: {len(outdated)} runs in the store, all of data model {versions}, wanted {DATA_MODEL_VERSION}; "
-            "ingest their logs again"
-        )
-    if not every:
-        raise DatasetError(f"{store.root}: no runs in the store; ingest one: tcpipe ingest LOG")
-    key = ingest_key(recipe)
-    mine = [run for run in every if run.manifest["ingest_key"] == key]
-    if not mine:
-        raise DatasetError(
-            f"{store.root}: {len({run.run_id for run in every})} runs in the store, none ingested with this recipe; "
-            "ingest them with it (tcpipe ingest LOG), or give the recipe they were ingested with (--recipe FILE)"
-        )
-    mine = _tagged(store, mine, tags)
-    robots = sorted({run.robot for run in mine})
-    chosen = [run for run in mine if robot is None or run.robot == robot]
-    if not chosen:
-        raise DatasetError(f"{store.root}: no run of robot {robot!r}; there are runs of {', '.join(robots)}")
-    if robot is None and len(robots) > 1:
-        raise DatasetError(f"{store.root}: runs of {len(robots)} robots ({', '.join(robots)}); name one with --robot")
-    left_out = sorted(
-        {run.run_id for run in every} - {run.run_id for run in every if run.manifest["ingest_key"] == key}
-    )
-    warnings = [f"run {run_id}: ingested with another recipe only; left out" for run_id in left_out]
-    warnings += [
-        f"run {run_id}: of data model {version}, not {DATA_MODEL_VERSION}; left out until its log is ingested again"
-        for run_id, version in outdated.items()
-    ]
-    return chosen, warnings
-
-
-def _tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
-    """Return the runs that carry all of the tags; `DatasetError` with the tags there are where none does."""
-    chosen = [run for run in runs if tags.items() <= run.manifest.get("tags", {}).items()]
-    if not chosen:
-        wanted = " ".join(f"{key}={value}" for key, value in tags.items())
-        there = sorted({f"{key}={value}" for run in runs for key, value in run.manifest.get("tags", {}).items()})
-        raise DatasetError(f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(there) or 'none'}")
-    return chosen
-
-
-def run_source(store: Store, run: RunDirectory) -> dict[str, Any]:
-    """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, warnings and error budget."""
-    source = _source(store, run)
+def run_source(run: RunDirectory, log: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, warnings and error budget."""
     return {
         "run_id": run.run_id,
         "recipe_id": run.recipe_id,
         "robot": run.robot,
-        "tags": dict(run.manifest.get("tags", {})),
-        "logs": [Path(path).name for path in source["paths"]],
-        "sha256": source["sha256"],
-        "segments_sha256": file_checksum(run.path / "segments.parquet")[1],
+        "tags": dict(run.manifest["tags"]),
+        "logs": [Path(path).name for path in log["paths"]],
+        "sha256": log["sha256"],
+        "segments_sha256": run.manifest["checksums"]["segments.parquet"]["sha256"],
+        "driven_m": math.fsum(run.manifest["ledger_m"].values()),
         "warnings": list(run.manifest["warnings"]),
         "energy_budget": run.manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget"),
     }
 
 
-def _source(store: Store, run: RunDirectory) -> dict[str, Any]:
-    known = store.run_json(run.run_id)
-    if known is None:
-        raise DatasetError(f"{run.path.parent}: run.json is missing; ingest the log again with --force")
-    source: dict[str, Any] = known["source"]
-    return source
-
-
 def _run_fingerprint(run: RunDirectory) -> list[Any]:
-    found = size_bytes, sha256 = file_checksum(run.path / "segments.parquet")
-    if run.manifest["checksums"].get("segments.parquet") != {"size_bytes": size_bytes, "sha256": sha256}:
-        raise StoreError(
-            f"{run.path / 'segments.parquet'}: is not as it was written; ingest the log again with --force"
-        )
-    return [run.run_id, run.recipe_id, found, run.manifest["tags"]]
+    written = run.manifest["checksums"]["segments.parquet"]
+    return [run.run_id, run.recipe_id, [written["size_bytes"], written["sha256"]], run.manifest["tags"]]
 
 
 def _table_digest(table: pa.Table) -> str:

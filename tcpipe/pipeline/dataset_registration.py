@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.formats.map_files import MapFile
-from tcpipe.formats.parquet import read_table
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory
 from tcpipe.tables.columns import floats
@@ -52,7 +51,7 @@ def register_runs(
 
 
 def _register(run: RunDirectory, source: MapFile, projection: Projection, *, max_std_m: float) -> Registration | None:
-    track = read_table(run.path / "track.parquet", _COLUMNS)
+    track = run.table("track", _COLUMNS)
     lon, lat, height_m, x_std_m, y_std_m = (floats(track, name) for name in _COLUMNS)
     sure: NDArray[np.bool_] = np.hypot(x_std_m, y_std_m) <= max_std_m
     lonlat = np.stack([lon, lat], axis=1)[sure]

@@ -11,7 +11,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.formats.map_files import MapFile
-from tcpipe.formats.parquet import read_table
 from tcpipe.motion.ledger import interval_length_m, interval_reason
 from tcpipe.motion.pieces import piece_of_rows
 from tcpipe.motion.removal import Group, main_reason, named_groups, tally_m, uneven
@@ -118,7 +117,7 @@ def _metres(
     grounds: Sequence[_Ground],
 ) -> tuple[NDArray[Any], ...]:
     """Return length [m], reason, slope and class (ids as `classes_at`) of every interval of a run's track."""
-    track = read_table(run.path / "track.parquet", list(_COLUMNS))
+    track = run.table("track", _COLUMNS)
     stamp_ns, epoch = integers(track, "stamp_ns"), integers(track, "epoch")
     piece = piece_of_rows(stamp_ns, epoch, period_ns=1e9 / run.manifest["info"]["rate_hz"])
     position = np.column_stack([floats(track, f"{axis}_m") for axis in "xyz"])

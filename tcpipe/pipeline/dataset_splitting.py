@@ -38,7 +38,6 @@ class Drawn:
     audit: tuple[HeldOut, ...]
     kept: Mapping[str, int] | None
     """Samples whose split is an earlier dataset's, and those of it that are gone; None where none was to be kept."""
-    warnings: tuple[str, ...]
 
 
 def draw_splits(
@@ -102,7 +101,7 @@ def draw_splits(
     if kept is not None and earlier is not None:
         found = int((kept.split != "").sum())
         counts = {"samples": found, "gone": earlier.num_rows - found}
-    return Drawn(assigned, buffer_m, audit, counts, tuple(_warnings(split, recipe)))
+    return Drawn(assigned, buffer_m, audit, counts)
 
 
 def _runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
@@ -184,11 +183,19 @@ def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: ND
     )
 
 
-def _warnings(split: NDArray[np.str_], recipe: Recipe) -> list[str]:
-    """Return a line for each of train and test that is empty."""
-    if not (split == "train").any():
-        return ["no sample trains; the region holds too few"]
-    if recipe.split.test_fraction > 0 and not (split == "test").any():
-        one = {"run": "one run", "block": "one block"}.get(recipe.split.holdout, "too few samples")
-        return [f"no sample tests: all inside samples are {one}; try --holdout sample, or a smaller split.block_m"]
-    return []
+def empty_splits(card: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a line for each split of a dataset that was asked for and holds no sample, by its card."""
+    counts, rules, found = card["splits"], card["split"], list[str]()
+    if not counts["train"]:
+        found.append("no sample trains: too few lie inside the region; draw it larger")
+    if not counts["test"] and rules["test_fraction"] > 0:
+        one = {"run": "one run", "block": "one block"}.get(rules["holdout"], "too few samples")
+        found.append(
+            f"no sample tests: all inside samples are {one}; try --holdout sample, or a smaller split.block_m, "
+            "or want none with split.test_fraction = 0"
+        )
+    if not counts["unseen"] and rules["region"] is not None:
+        found.append(
+            "no sample is unseen: all lie inside the region (--split), or near it; draw it smaller, or give none"
+        )
+    return tuple(found)

@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError
+from tcpipe.formats.atomic import clear
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.log_file import Log, open_log
 from tcpipe.formats.parquet import parquet_rows, read_schema, storable
@@ -78,10 +79,11 @@ def export(
     ------
     LogError
         The log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log
-        or is none of an export, or ``out`` is a dataset, run, map or store.
+        or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
 
     """
     _refuse_what_is_ours(out)
+    clear(out)
     with open_log(log_path, message_definitions=message_definitions) as log:
         wanted = _wanted(log, log_path, topics)
         made_from = _identity(log, log_path, message_definitions)
@@ -135,8 +137,11 @@ def _index(out: Path) -> dict[str, Any]:
 
 
 def _refuse_what_is_ours(out: Path) -> None:
-    """Refuse to write between the files of a dataset, run, map or store: what is counted and sealed there."""
-    signs = {"dataset": "dataset.json", "run": "run.json", "run's recipe": "manifest.json", "map": "zarr.json"}
+    """Refuse to write between the files of what is counted and sealed."""
+    signs = {
+        "dataset": "dataset.json", "run": "run.json", "run's recipe": "manifest.json", "map": "zarr.json",
+        "model": "model.json", "cost map": "cost-map.json",
+    }  # fmt: skip
     kind = "store" if is_store(out) else next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
     if kind:
         raise LogError(f"{out}: is a {kind}; give another directory for the topics")

@@ -117,7 +117,10 @@ def _run(path: Path, store: Store, runs: list[RunDirectory]) -> dict[str, Any]:
 
 
 def _store(store: Store) -> dict[str, Any]:
-    runs, outdated = store.runs(), store.outdated()
+    found = store.ingestions()
+    runs, outdated = found.finished, {run_id: run.version for run_id, run in found.outdated.items()}
+    damaged = {str(path): line for path, line in found.damaged.items()}
+    seen = {*outdated, *(run.run_id for run in runs), *(path.parent.name for path in found.damaged)}
     return {
         "kind": "store",
         "path": str(store.root),
@@ -127,7 +130,8 @@ def _store(store: Store) -> dict[str, Any]:
             for run in runs
         ],
         "outdated": outdated,
-        "unfinished": sorted(set(store.run_ids()) - outdated.keys() - {run.run_id for run in runs}),
+        "damaged_runs": damaged,
+        "unfinished": sorted(set(store.run_ids()) - seen),
     }
 
 

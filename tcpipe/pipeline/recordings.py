@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.parquet import read_table
 from tcpipe.store import RunDirectory
 from tcpipe.tables.columns import floats, integers
 
@@ -81,7 +80,7 @@ def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, st
 
 def _way(run: RunDirectory) -> _Way:
     names = [f"{end}_{what}" for end in ("start", "end") for what in ("ns", "lon_deg", "lat_deg")]
-    table = read_table(run.path / "segments.parquet", names)
+    table = run.table("segments", names)
     middle = [(floats(table, f"start_{axis}_deg") + floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")]
     return _Way(integers(table, "start_ns"), integers(table, "end_ns"), np.column_stack(middle))
 

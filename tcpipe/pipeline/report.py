@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import write_text
+from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.seals import sealed_page
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.run_report import run_report
@@ -43,6 +43,7 @@ def report(path: Path) -> list[Page]:
 
 
 def _write(directory: Path, html: str) -> Page:
+    clear(directory)
     path, html = directory / "report.html", sealed_page(html)
     changed = not path.is_file() or path.read_bytes() != html.encode()
     if changed:

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import TcpipeError, UsageError
+from tcpipe.formats.atomic import left_beside
 from tcpipe.formats.dataset_files import CARD
-from tcpipe.formats.json_files import read_json
-from tcpipe.formats.seals import broken_checksums, broken_seal
+from tcpipe.formats.seals import broken_checksums, read_sealed
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
 from tcpipe.store import Store, is_store
@@ -71,6 +71,9 @@ def verify(path: Path) -> Verified:
                 read[finding[0]] = read.get(finding[0], 0) + finding[1]
     except TcpipeError as error:
         problems += error.problems
+    if kind != "store":
+        again = "the next command that writes it removes it"
+        problems += [f"{left}: was left behind by a command that was killed; {again}" for left in left_beside(path)]
     return Verified(path, kind, read, tuple(dict.fromkeys(problems)))
 
 
@@ -95,11 +98,7 @@ def _what(path: Path) -> tuple[str, Iterator[Finding]]:
 
 def _sealed_directory(directory: Path, card: str) -> Iterator[Finding]:
     """Compare every file with what the card has of it; name those that it does not know."""
-    problem = broken_seal(directory / card)
-    if problem:
-        yield problem
-        return
-    checksums: Mapping[str, Any] = read_json(directory / card)["checksums"]
+    checksums: Mapping[str, Any] = read_sealed(directory / card, {"checksums": dict})["checksums"]
     yield from broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}

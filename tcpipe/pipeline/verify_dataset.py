@@ -38,7 +38,7 @@ Finding = tuple[str, int] | str
 
 def verify_dataset(directory: Path) -> Iterator[Finding]:
     """Yield what was read, and a line for everything that is not as the card says."""
-    card = read_card(directory)
+    card = read_card(directory, proved=False)
     for path in (directory / CARD, directory / REPORT):
         problem = broken_seal(path)
         yield problem or ("files", 1)

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.errors import TcpipeError
+from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.json_files import read_json
 from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
-from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal
+from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal, read_sealed
 from tcpipe.pipeline.dataset_segments import KEPT
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
@@ -72,7 +71,7 @@ def verify_map(path: Path) -> Iterator[Finding]:
     checksums = yield from _listed(path)
     if checksums is None:
         return
-    source = open_map(path)
+    source = open_map(path, proved=False)
     for factor in source.factors:
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:
@@ -95,7 +94,7 @@ def _stranger(path: Path) -> Iterator[str]:
     if not path.name.startswith(TEMPORARY_PREFIX):
         yield f"{path}: is no file of this store"
     elif is_abandoned(path):
-        yield f"{path}: was left behind by a command that was killed; remove it"
+        yield f"{path}: was left behind by a command that was killed; the next tcpipe ingest or add-map removes it"
 
 
 def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
@@ -108,11 +107,11 @@ def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
 
 def _listed(directory: Path) -> Any:
     """Compare every file below a directory with its ``checksums.json``; return what that lists, or None if it cannot be trusted."""
-    problem = broken_seal(directory / CHECKSUMS)
-    if problem:
-        yield problem
+    try:
+        checksums: Mapping[str, Any] = read_sealed(directory / CHECKSUMS, {"checksums": dict})["checksums"]
+    except StoreError as error:
+        yield from error.problems
         return None
-    checksums: Mapping[str, Any] = read_json(directory / CHECKSUMS)["checksums"]
     yield from broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
     yield from _unlisted(directory, {*checksums, CHECKSUMS})
@@ -140,11 +139,7 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
     where = directory / _MANIFEST
-    problem = broken_seal(where)
-    if problem:
-        yield problem
-        return
-    manifest = read_json(where)
+    manifest = read_sealed(where)
     if manifest["data_model_version"] != DATA_MODEL_VERSION:
         yield (
             f"{where}: of data model {manifest['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "

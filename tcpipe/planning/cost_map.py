@@ -25,12 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, UsageError
-from tcpipe.formats.atomic import atomic_directory, exclusive
+from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive
 from tcpipe.formats.geotiff import read_bands, write_cog
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.map_files import MapFile
 from tcpipe.formats.nav2_map import HIGHEST, LETHAL, write_nav2_map
-from tcpipe.formats.seals import broken_checksums, broken_seal, checksums_to_json, write_sealed
+from tcpipe.formats.seals import broken_checksums, checksums_to_json, read_sealed, write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
@@ -117,6 +117,7 @@ def make_cost_map(
 
     """
     check_model(model, source)
+    clear_beside(out)
     grid, key = grid_over(source, step_m), cost_map_key(model, source, step_m)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
@@ -137,9 +138,10 @@ def make_cost_map(
 
 def read_cost_map_card(path: Path) -> dict[str, Any] | None:
     """Return the card of a cost map, or None where there is none, or one that is not as it was written."""
-    if not (path / CARD).is_file() or broken_seal(path / CARD):
+    try:
+        card = read_sealed(path / CARD, {"key": str, "grid": {"pitch_m": float}, "checksums": dict})
+    except StoreError:
         return None
-    card = read_json(path / CARD)
     return card if card.get("kind") == KIND else None
 
 

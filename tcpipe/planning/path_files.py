@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import read_line
-from tcpipe.formats.json_files import digest, read_json
+from tcpipe.formats.json_files import digest
 from tcpipe.formats.map_files import MapFile
-from tcpipe.formats.seals import file_checksum, write_sealed
+from tcpipe.formats.seals import file_checksum, read_sealed, write_sealed
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.intervals import COVERAGE
 from tcpipe.planning.path_cost import cost_of_path
@@ -85,6 +86,7 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
     """
     if out is not None:
         check_ending(out)
+        clear_beside(out)
         if out.resolve() == path.resolve():
             raise UsageError(f"{out}: is the path itself; give the table another name")
     lonlat_deg = read_line(path)
@@ -110,7 +112,7 @@ def _summary_of(out: Path, key: str) -> dict[str, Any] | None:
     if not (out.is_file() and summary_path(out).is_file()):
         return None
     try:
-        found = read_json(summary_path(out))
+        found = read_sealed(summary_path(out))
     except StoreError:
         return None
     same = found.get("key") == key and found.get("sha256") == file_checksum(out)[1]

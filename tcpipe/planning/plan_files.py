@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from tcpipe.errors import ModelError, StoreError, UsageError
+from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import check_lonlat, write_lines
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.map_files import MapFile
@@ -87,6 +88,7 @@ def plan(
 
     """
     _check_names(out, picture)
+    clear_beside(out)
     start, goal = (np.array(end, np.float64) for end in (request.start_deg, request.goal_deg))
     for label, end in (("--from", start), ("--to", goal)):
         check_lonlat(label, end[None])

@@ -58,7 +58,7 @@ def dataset_report(directory: Path) -> str:
             Number(f"{len(card['runs'])}", "runs"),
             Number(f"{driven:.0f} m", "driven"),
         ],
-        warnings=card["warnings"],
+        warnings=[*card.get("problems", ()), *card["warnings"]],
         sections=[
             _split_section(directory, card, samples),
             _gallery_section(directory, card, samples),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.geotiff import write_geotiff
 from tcpipe.formats.json_files import to_json, write_json
 from tcpipe.formats.log_writing import write_bag, write_mcap, write_rosbag2
@@ -61,6 +61,7 @@ def simulate(out: Path, *, scenario: str | Scenario = "demo", seed: int = 1) -> 
     """
     chosen = scenario_by_name(scenario) if isinstance(scenario, str) else scenario
     about = {"seed": seed, "datum": chosen.world.site.datum, "scenario": chosen, "tcpipe_version": __version__}
+    clear_beside(out)
     site = _site_at(out, chosen)
     if _holds(site, about):
         return replace(site, unchanged=True)

@@ -7,12 +7,12 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-import pyarrow.compute as pc
 
 from tcpipe.fusion.clock_offsets import POWER, ClockOffsets, Offset, Pair, PowerSignal, find_clock_offsets
 from tcpipe.fusion.rails import power_at
 from tcpipe.stages.fuse_inputs import Inputs, rails_of
 from tcpipe.stages.fuse_sanity import longest_epoch
+from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.levels import Findings, Streams
 
 _MAX_GAP_NS = 300_000_000
@@ -76,7 +76,7 @@ def _power(streams: Streams, epoch: int) -> PowerSignal | None:
     if POWER not in streams.tables:
         return None
     table = streams.tables[POWER]
-    rails = rails_of(table.filter(pc.equal(table["epoch"], epoch)))
+    rails = rails_of(rows_where(table, "epoch", epoch))
     if not rails or any(rail.current_ns.size < 2 for rail in rails):
         return None
     stamp_ns = np.unique(np.concatenate([rail.current_ns for rail in rails]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities
@@ -14,6 +13,7 @@ from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import rails_of
+from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import Streams
 
@@ -80,5 +80,5 @@ def _of_epoch(streams: Streams, role: str, epoch: int) -> pa.Table | None:
     if role not in streams.tables:
         return None
     table = streams.tables[role]
-    part = table.filter(pc.equal(table["epoch"], epoch))
+    part = rows_where(table, "epoch", epoch)
     return part if part.num_rows else None

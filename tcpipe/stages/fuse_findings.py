@@ -112,9 +112,4 @@ def rejections_table(inputs: Inputs, found: list[Trajectory]) -> pa.Table:
     }
     joined = {name: np.concatenate(values) for name, values in columns.items()}
     order = np.lexsort((joined["role"], joined["stamp_ns"]))
-    return REJECTIONS.table(
-        **{
-            name: pa.array(values[order].tolist(), pa.string()) if name in {"role", "reason"} else values[order]
-            for name, values in joined.items()
-        }
-    )
+    return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})

@@ -17,6 +17,7 @@ from tcpipe.fusion.preparation import Prepared
 from tcpipe.fusion.rails import RailSamples
 from tcpipe.fusion.stamp_jitter import steadied
 from tcpipe.recipe import FuseConfig
+from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import FloatColumns, floats, integers
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -51,7 +52,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> Inputs:
         datum = preparation.find_datum(fixes["lon_deg"], fixes["lat_deg"], fixes["alt_m"])
     inputs = Inputs(datum)
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
-        parts = {role: table.filter(pc.equal(table["epoch"], epoch)) for role, table in tables.items()}
+        parts = {role: rows_where(table, "epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
         gnss, remarks = steadied(found.get(GNSS), found.get(WHEELS) or found.get(VISUAL))
         inputs.remarks += remarks
@@ -102,7 +103,7 @@ def rails_of(table: pa.Table) -> list[RailSamples]:
     """Return the rails of a power table, in order of their names; voltage and current may stand in different rows."""
     rails = []
     for name in sorted(pc.unique(table["rail"]).to_pylist()):
-        part = table.filter(pc.equal(table["rail"], name))
+        part = rows_where(table, "rail", name)
         stamp = integers(part, "stamp_ns")
         volt, amp = floats(part, "voltage_volt"), floats(part, "current_amp")
         rails.append(RailSamples(*_known(stamp, volt), *_known(stamp, amp)))

@@ -7,12 +7,12 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pyarrow.compute as pc
 
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.sensor_checks import Command, Refusal, check_sensors
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import Findings, Sensor, Streams
 
@@ -84,7 +84,7 @@ def _command(streams: Streams, epoch: int) -> Command | None:
     if "command" not in streams.tables:
         return None
     table = streams.tables["command"]
-    table = table.filter(pc.equal(table["epoch"], epoch))
+    table = rows_where(table, "epoch", epoch)
     order = np.argsort(integers(table, "stamp_ns"), kind="stable")
     return Command(integers(table, "stamp_ns")[order], floats(table, "forward_velocity_mps")[order])
 

@@ -15,7 +15,6 @@ from tcpipe.fusion.measurements import InitialState
 from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.stretches import Stretch, cut_stretches, track_stamps
 from tcpipe.fusion.trajectory import Trajectory
-from tcpipe.fusion.ukf15 import run_ukf15
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_columns import command_columns, pose_columns, power_columns, wheel_column
 from tcpipe.stages.fuse_findings import stretch_facts
@@ -64,6 +63,8 @@ def _initial(stretch: Stretch, last: Trajectory | None) -> InitialState:
 def _estimate(stretch: Stretch, initial: InitialState, output_ns: NDArray[np.int64], config: FuseConfig) -> Trajectory:
     gate = config.gate_probability
     if config.estimator == "ukf":
+        from tcpipe.fusion.ukf15 import run_ukf15  # noqa: PLC0415  its kernels load only when it is asked for
+
         return run_ukf15(
             stretch.measurements, initial, output_ns=output_ns, gate_probability=gate, engine=config.engine
         )

@@ -6,7 +6,6 @@ from collections import Counter
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.cost.labels import Labels
@@ -18,6 +17,7 @@ from tcpipe.stages.label_facts import label_facts, label_warnings
 from tcpipe.stages.label_physics import with_physics
 from tcpipe.stages.label_power import energy_entries, rails_of
 from tcpipe.stages.label_quality import clock_doubtful, motion_flags, power_flags
+from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, LabelledSegments, Segments, Streams, with_findings
@@ -42,7 +42,7 @@ def label_segments(
     parts, joules, rails_by_epoch = [LABELLED_SEGMENTS.empty()], Counter[str](), {}
     variance_j2: list[dict[str, NDArray[np.float64]]] = []
     for epoch in np.unique(integers(gated.table, "epoch")).tolist():
-        rows, cut = (table.filter(pc.equal(table["epoch"], epoch)) for table in (gated.table, segments.table))
+        rows, cut = (rows_where(table, "epoch", epoch) for table in (gated.table, segments.table))
         rails = rails_by_epoch[epoch] = rails_of(streams, epoch)
         joules.update(energy_entries(rows, rails, rate_hz=gated.info.rate_hz, rule=rule))
         if not cut.num_rows:

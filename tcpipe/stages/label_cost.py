@@ -13,6 +13,7 @@ from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.pieces import piece_of_rows, runs
 from tcpipe.motion.uncertainty import along_std_m, between_durations_m, displacement_std_m
+from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import GATED_TRACK, TrackInfo
@@ -78,5 +79,5 @@ def _still_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
     """Return begin and end [ns] of every stretch in which the robot stands, shape (S, 2)."""
     stamp_ns = integers(rows, "stamp_ns")
     piece = piece_of_rows(stamp_ns, integers(rows, "epoch"), period_ns=1e9 / rate_hz)
-    standing = (rows["dropped_by"].to_numpy() & np.uint32(DropReason.STANDING)) != 0
+    standing = (numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
     return stamp_ns[runs(standing, piece)]

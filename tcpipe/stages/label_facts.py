@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tcpipe.cost.budget import energy_budget
 from tcpipe.cost.power import Rail, Rule
 from tcpipe.stages.label_power import rail_facts
+from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats
 
@@ -40,7 +41,7 @@ def label_facts(
     velocity : which velocity trains, ground or fused.
     """
     powered = any(len(each.stamp_ns) for epoch in rails.values() for each in epoch)
-    quality = table["quality"].to_numpy()
+    quality = numbers(table["quality"])
     energy = floats(table, "energy_joule")
     return {
         "distance_m": sum(ledger_m.values()),

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.cost.physics import Physics, fit_physics
+from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import LABELLED_SEGMENTS
@@ -31,7 +32,7 @@ def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, dict[str, A
         return table, {"fitted": False, "standing_watt": standing}
     predicted = np.where(np.isfinite(power), found.power_watt(velocity_mps=speed, rise=rise), np.nan)
     odd = found.is_outlier(power - predicted)
-    quality = table["quality"].to_numpy() | np.where(odd, np.uint32(Quality.PHYSICS_OUTLIER), np.uint32(0))
+    quality = numbers(table["quality"]) | np.where(odd, np.uint32(Quality.PHYSICS_OUTLIER), np.uint32(0))
     columns = {"physics_power_watt": predicted, "quality": quality.astype(np.uint32)}
     table = LABELLED_SEGMENTS.table(**{name: columns.get(name, table[name]) for name in table.column_names})
     return table, {"fitted": True, **_facts(found, standing), "outliers": int(odd.sum())}
@@ -39,7 +40,7 @@ def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, dict[str, A
 
 def _standing_watt(rows: pa.Table) -> float | None:
     power = floats(rows, "power_watt")
-    standing = (rows["dropped_by"].to_numpy() & np.uint32(DropReason.STANDING)) != 0
+    standing = (numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
     drawn = power[standing & np.isfinite(power)]
     return float(np.median(drawn)) if drawn.size >= _FEWEST_STANDING else None
 

@@ -13,6 +13,7 @@ from tcpipe.cost.noise import median_period_s, resolution
 from tcpipe.cost.power import Rail, Rule, rail, recorded_energy_joule, samples
 from tcpipe.motion.ledger import by_reason, interval_reason
 from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.tables.arrays import numbers, rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import Streams
 
@@ -23,10 +24,10 @@ def rails_of(streams: Streams, epoch: int) -> list[Rail]:
     if table is None:
         return []
     names = sorted(pc.unique(table["rail"]).to_pylist())
-    table = table.filter(pc.equal(table["epoch"], epoch))
+    table = rows_where(table, "epoch", epoch)
     rails = []
     for name in names:
-        mine = table.filter(pc.equal(table["rail"], name))
+        mine = rows_where(table, "rail", name)
         signals = (samples(integers(mine, "stamp_ns"), floats(mine, c)) for c in ("voltage_volt", "current_amp"))
         rails.append(rail(name, *signals, averaged=streams.power_averaged))
     return rails
@@ -60,7 +61,7 @@ def energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rule: R
     """
     stamp_ns = integers(rows, "stamp_ns")
     piece = piece_of_rows(stamp_ns, integers(rows, "epoch"), period_ns=1e9 / rate_hz)
-    reason = interval_reason(rows["dropped_by"].to_numpy(), piece)
+    reason = interval_reason(numbers(rows["dropped_by"]), piece)
     spent = recorded_energy_joule(rails, stamp_ns[:-1], stamp_ns[1:], rule=rule)
     record = _whole_record_joule(rails, rule)
     steady = float(spent[reason == 0].sum())

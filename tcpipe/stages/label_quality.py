@@ -10,6 +10,7 @@ from tcpipe.cost.power import Rail
 from tcpipe.cost.quality import low_power_rate, near, slipping, voltage_outside
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import Streams, TrackInfo
@@ -63,7 +64,7 @@ def _gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
     """Return the rows that are in a gap, or beside a hole."""
     piece = piece_of_rows(integers(rows, "stamp_ns"), integers(rows, "epoch"), period_ns=1e9 / rate_hz)
     hole = np.diff(piece) != 0
-    edge: NDArray[np.bool_] = (rows["dropped_by"].to_numpy() & np.uint32(DropReason.GAP)) != 0
+    edge: NDArray[np.bool_] = (numbers(rows["dropped_by"]) & np.uint32(DropReason.GAP)) != 0
     edge[:-1] |= hole
     edge[1:] |= hole
     return edge

@@ -10,6 +10,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.logs.placements import Transforms
+from tcpipe.tables.arrays import numbers, texts
 
 
 def message_arrays(table: pa.Table) -> dict[str, NDArray[Any]]:
@@ -22,9 +23,9 @@ def message_arrays(table: pa.Table) -> dict[str, NDArray[Any]]:
         array = _combined(table.column(name))
         kind = array.type
         if pa.types.is_string(kind) or pa.types.is_large_string(kind):
-            found[name] = array.to_numpy(zero_copy_only=False).astype(str)
+            found[name] = texts(array)
         elif _is_number(kind):
-            found[name] = array.to_numpy(zero_copy_only=False)
+            found[name] = numbers(array)
         elif _is_list(kind) and _is_number(kind.value_type):
             found[name] = _matrix(array)
     return found
@@ -44,8 +45,8 @@ def _is_list(kind: pa.DataType) -> bool:
 
 
 def _matrix(lists: pa.Array) -> NDArray[np.float64]:
-    lengths = pc.list_value_length(lists).to_numpy(zero_copy_only=False).astype(np.int64)
-    values: NDArray[np.float64] = pc.list_flatten(lists).to_numpy(zero_copy_only=False).astype(np.float64, copy=False)
+    lengths = numbers(pc.list_value_length(lists)).astype(np.int64)
+    values: NDArray[np.float64] = numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
     if pa.types.is_fixed_size_list(lists.type):
         return values.reshape(len(lengths), lists.type.list_size)
     if len(lengths) and lengths.min() == lengths.max():
@@ -59,14 +60,14 @@ def transforms(table: pa.Table) -> Transforms:
     """Return all transforms of a tf2_msgs/TFMessage table, message after message."""
     flat = pc.list_flatten(_combined(table.column("transforms")))
 
-    def texts(*path: str) -> list[str]:
+    def names(*path: str) -> list[str]:
         found: list[str] = pc.struct_field(flat, list(path)).to_pylist()
         return found
 
-    def numbers(name: str, components: str) -> NDArray[np.float64]:
+    def vectors(name: str, components: str) -> NDArray[np.float64]:
         parts = [pc.struct_field(flat, ["transform", name, component]) for component in components]
-        return np.stack([part.to_numpy(zero_copy_only=False).astype(np.float64) for part in parts], -1)
+        return np.stack([numbers(part).astype(np.float64) for part in parts], -1)
 
     return Transforms(
-        texts("header", "frame_id"), texts("child_frame_id"), numbers("translation", "xyz"), numbers("rotation", "xyzw")
+        names("header", "frame_id"), names("child_frame_id"), vectors("translation", "xyz"), vectors("rotation", "xyzw")
     )

@@ -15,6 +15,7 @@ from tcpipe.motion.ledger import by_reason, interval_duration_s, interval_length
 from tcpipe.motion.pieces import piece_of_rows
 from tcpipe.path.cutting import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
+from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason, Loss, name_of
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, with_findings
@@ -30,7 +31,7 @@ def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
     position_m = np.column_stack([floats(table, f"{axis}_m") for axis in "xyz"])
     velocity_mps = np.column_stack([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")])
     piece = piece_of_rows(stamp_ns, epoch, period_ns=1e9 / info.rate_hz)
-    dropped_by = table["dropped_by"].to_numpy()
+    dropped_by = numbers(table["dropped_by"])
     reason = interval_reason(dropped_by, piece)
     metres = dict.fromkeys(ENTRIES, 0.0) | by_reason(
         reason, interval_length_m(stamp_ns, position_m, velocity_mps, piece)

@@ -16,6 +16,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import TableError
+from tcpipe.tables.arrays import number_column, numbers, text_column
 from tcpipe.tables.bits import name_of
 
 
@@ -74,7 +75,7 @@ class TableSchema:
 
     def empty(self) -> pa.Table:
         """Return the table without rows."""
-        return self.arrow().empty_table()
+        return pa.Table.from_batches([], self.arrow())
 
     def only(self, *names: str) -> TableSchema:
         """Return the contract of some of the columns."""
@@ -110,7 +111,7 @@ class TableSchema:
 
 def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
     """Return a column as float64, null as NaN, shape (N,)."""
-    values: NDArray[np.float64] = table.column(name).to_numpy().astype(np.float64, copy=False)
+    values: NDArray[np.float64] = numbers(table.column(name)).astype(np.float64, copy=False)
     return values
 
 
@@ -135,7 +136,7 @@ class FloatColumns(Mapping[str, NDArray[np.float64]]):
 
 def integers(table: pa.Table, name: str) -> NDArray[np.int64]:
     """Return a column without nulls as int64, shape (N,)."""
-    values: NDArray[np.int64] = table.column(name).to_numpy().astype(np.int64, copy=False)
+    values: NDArray[np.int64] = numbers(table.column(name)).astype(np.int64, copy=False)
     return values
 
 
@@ -144,5 +145,9 @@ def _arrow_array(values: object, column: Column) -> pa.Array:
         values = values.combine_chunks()
     if isinstance(values, pa.Array):
         return values if values.type == column.dtype else values.cast(column.dtype)
-    from_pandas = column.nullable and pa.types.is_floating(column.dtype)
-    return pa.array(values, type=column.dtype, from_pandas=from_pandas)
+    wanted, array = column.dtype, np.asarray(values)
+    if pa.types.is_string(wanted) and array.dtype.kind == "U":
+        return text_column(array.tolist())
+    if array.dtype.kind not in "biuf":
+        return pa.array(values, type=wanted)
+    return number_column(array, nan_is_null=column.nullable and array.dtype.kind == "f").cast(wanted)

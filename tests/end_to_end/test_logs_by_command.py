@@ -59,6 +59,36 @@ def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     assert any("its headers count simulated time" in line for line in found["findings"]["warnings"])
 
 
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_why_a_log_of_another_encoding_is_refused_is_said(tmp_path, encoding):
+    with (tmp_path / "run.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema("foxglove.PoseInFrame", f"{encoding}schema", b"{}")
+        channel = writer.register_channel("/pose", encoding, schema)
+        writer.add_message(channel, START_NS, b"{}", START_NS)
+        writer.finish()
+    said = plain_lines(tcpipe("ingest", "run.mcap", cwd=tmp_path), 1)
+    assert (
+        f"topics that hold data which cannot be decoded: /pose: its messages are encoded as {encoding}; cdr and" in said
+    )
+
+
+def test_what_plays_no_role_is_said_and_kept(tmp_path):
+    (stream,) = drive()
+    columns = {name: values[:20] for name, values in stream.columns.items()}
+    few = MessageStream("/odom", ODOMETRY, stream.log_time_ns[:20], columns, stream.constants)
+    write_mcap(tmp_path / "run.mcap", [stream, few])
+    done = tcpipe("ingest", "run.mcap", cwd=tmp_path)
+    line = (
+        "wheel_odometry: left out: /odom (20 messages over 0.4 s; "
+        "it covers little of what /wheel/odom covers (1500 messages over 30.0 s))"
+    )
+    assert line in " ".join((done.stdout + done.stderr).split())
+    (manifest,) = (tmp_path / "tcpipe-store").glob("runs/*/*/manifest.json")
+    assert line in json.loads(manifest.read_text())["warnings"]
+
+
 def test_logs_in_object_storage(tmp_path):
     bucket = tmp_path / "store" / "drives"
     bucket.mkdir(parents=True)

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import atomic_directory, atomic_file
+from tcpipe.formats.atomic import atomic_directory, atomic_file, clear_beside, left_beside
 
 
 class _Cut(Exception):  # noqa: N818
@@ -104,3 +104,75 @@ def test_a_link_to_a_directory_stays_a_link(tmp_path: Path) -> None:
         (directory / "f").touch()
     assert (tmp_path / "link").is_symlink()
     assert [p.name for p in (tmp_path / "real").iterdir()] == ["f"]
+
+
+_KILLED_EVERYWHERE = """
+import os, sys
+from pathlib import Path
+from tcpipe.formats import atomic
+
+parent, kind, swap = Path(sys.argv[1]), sys.argv[2], sys.argv[3]
+place = parent / "place"
+if swap == "in two steps":
+    atomic._exchanged = lambda *_: False
+
+def write(text):
+    if kind == "directory":
+        with atomic.atomic_directory(place) as directory:
+            (directory / "f").write_text(text)
+    else:
+        with atomic.atomic_file(place) as path:
+            path.write_text(text)
+
+def read():
+    return ((place / "f") if kind == "directory" else place).read_text()
+
+def killed_at(step):
+    def hook(*_):
+        nonlocal step
+        step -= 1
+        if step < 0:
+            os._exit(9)
+    child = os.fork()
+    if not child:
+        sys.addaudithook(hook)
+        write("new")
+        os._exit(0)
+    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+
+write("old")
+step, left, seen = 0, 0, set()
+while killed_at(step):
+    step += 1
+    there = os.listdir(parent)
+    left += len(there) > 1
+    assert len(atomic.left_beside(place)) == len(there) - place.exists(), there
+    atomic.clear_beside(place)  # as a command does that finds nothing to do
+    assert os.listdir(parent) == ["place"], os.listdir(parent)
+    seen.add(read())
+    write("old")
+assert seen == {"old", "new"} and left > 5 and step > 10, (seen, left, step)
+assert read() == "new" and os.listdir(parent) == ["place"]
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "swap"), [("file", "in one step"), ("directory", "in one step"), ("directory", "in two steps")]
+)
+def test_killed_at_any_step_a_place_is_old_or_new_and_what_is_left_goes_with_the_next_look(
+    tmp_path: Path, kind: str, swap: str
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _KILLED_EVERYWHERE, tmp_path, kind, swap], capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_clearing_leaves_what_lives_and_what_is_not_ours(tmp_path: Path) -> None:
+    (tmp_path / ".tmp-mine").mkdir()
+    with atomic_directory(tmp_path / "d-e") as slow:
+        clear_beside(tmp_path / "d")
+        assert slow.is_dir()
+        assert left_beside(tmp_path / "d-e") == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == [".tmp-mine", "d-e"]
+    clear_beside(tmp_path / "nowhere" / "x")

@@ -13,6 +13,7 @@ from map_worlds import World
 from tcpipe.errors import MapError
 from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import SHARD_PX, MapWriter, open_map
+from tcpipe.formats.seals import write_checksums
 from tcpipe.terrain.classes import PAPER_SCHEME
 from tcpipe.terrain.grid import MapGrid
 
@@ -95,6 +96,7 @@ def test_overviews_across_shards_have_no_seam(tmp_path):
             for layer, values in (("height", height), ("terrain", ids)):
                 writer.write(layer, row, col, values[row : row + SHARD_PX, col : col + SHARD_PX])
     writer.finish({})
+    write_checksums(tmp_path / "m.zarr")
     for factor in (2, 32):
         level, side = open_map(tmp_path / "m.zarr").at(factor), 2100 // factor
         cells = height[: side * factor, : side * factor].reshape(side, factor, side, factor).mean(axis=(1, 3))

@@ -11,6 +11,7 @@ import pytest
 from made_models import CARD, made_model
 
 from tcpipe.errors import ModelError
+from tcpipe.formats.seals import write_sealed
 from tcpipe.learning.models import WEIGHTS, load_model
 from tcpipe.pipeline.verify import verify
 
@@ -61,7 +62,7 @@ def test_no_model_and_half_a_model(tmp_path, place):
     _refused(cut, r"model.json: not a readable JSON file \(.*\); remove the folder and train the model again")
     cut = made_model(tmp_path / "cut")
     (cut / WEIGHTS).write_bytes((cut / WEIGHTS).read_bytes()[:-100])
-    _refused(cut, "weights.npz: gone, cut short or damaged")
+    _refused(cut, "weights.npz: its sha256 is .*; train the model again")
 
 
 @pytest.mark.parametrize(
@@ -75,8 +76,24 @@ def test_no_model_and_half_a_model(tmp_path, place):
 def test_another_card(tmp_path, change, match):
     place = made_model(tmp_path / "model")
     card = json.loads((place / "model.json").read_text())
-    (place / "model.json").write_text(json.dumps({**card, **change}))
+    write_sealed(place / "model.json", {**card, **change})
     _refused(place, match)
+
+
+def test_an_edited_card_is_refused_and_every_damaged_file_is_named(tmp_path):
+    place = made_model(tmp_path / "model")
+    (place / "weights.npz").write_bytes(b"")
+    (place / "residuals.parquet").unlink()
+    with pytest.raises(ModelError) as told:
+        load_model(place)
+    assert [line.split(":")[0] for line in told.value.problems] == [
+        str(place / "residuals.parquet"),
+        str(place / "weights.npz"),
+    ]
+    card = (place / "model.json").read_text()
+    assert '"robot": "husky"' in card
+    (place / "model.json").write_text(card.replace('"robot": "husky"', '"robot": "jackal"'))
+    _refused(place, r"model\.json: is not as it was written.*; remove the folder and train the model again")
 
 
 def test_a_card_is_read_without_keras(place):

@@ -57,7 +57,12 @@ def test_a_ros1_husky_with_everything() -> None:
     }
     assert found.robot.name == "husky"
     assert found.transforms == ("/tf_static", "/tf")
-    assert found.warnings == ()
+    assert [line.split(" (")[0] for line in found.warnings] == [
+        "wheel_odometry: left out: /odometry/filtered",
+        "gnss: left out: /navsat/nmea_sentence",
+        "imu: left out: /imu/data_raw",
+        "command: left out: /joy_teleop/cmd_vel",
+    ]
     assert "filtered" in found.left_out["/odometry/filtered"]
     assert "gps" in found.left_out["/odometry/gps"]
     assert "/rosout" not in found.left_out
@@ -175,6 +180,64 @@ def test_the_recipe_rules_over_types_names_and_ambiguity() -> None:
     assert found.left_out["/battery"] == "the recipe ignores it"
     assert "recipe" in found.left_out["/fix"]
     assert len(found.warnings) == 2
+
+
+def covering(name: str, type_name: str, count: int, span_s: float) -> Topic:
+    return Topic(name, type_name, count, 0, round(span_s * 1e9), "cdr", "")
+
+
+@pytest.mark.parametrize(("little", "much"), [("/wheel/odom", "/odom"), ("/odom_a", "/odom_b"), ("/odom_b", "/odom_a")])
+@pytest.mark.parametrize(("count", "span_s"), [(3, 65.0), (60, 6.0), (1, 0.0)])
+def test_a_topic_that_covers_little_does_not_win_by_its_name(little: str, much: str, count: int, span_s: float) -> None:
+    topics = [covering(little, ODOMETRY, count, span_s), covering(much, ODOMETRY, 658, 65.7)]
+    found = assign_roles(topics, {})
+    assert played(found) == {"wheel_odometry": (much,)}
+    assert found.roles["wheel_odometry"].why == f"it covers more than {little}"
+    (said,) = [line for line in found.warnings if "left out" in line]
+    assert said == (
+        f"wheel_odometry: left out: {little} ({count} messages over {span_s:.1f} s; it covers little of what {much} covers "
+        "(658 messages over 65.7 s))"
+    )
+    assert played(assign_roles(topics, {"wheel_odometry": [little]})) == {"wheel_odometry": (little,)}
+
+
+def test_what_covers_as_much_wins_by_its_name_and_a_slow_sensor_covers_all() -> None:
+    slow = [covering("/wheel/odom", ODOMETRY, 66, 65.0), covering("/odom", ODOMETRY, 6580, 65.7)]
+    assert played(assign_roles(slow, {})) == {"wheel_odometry": ("/wheel/odom",)}
+    unknown = [Topic("/wheel/odom", ODOMETRY, None, None, None, "cdr", ""), slow[1]]
+    assert played(assign_roles(unknown, {})) == {"wheel_odometry": ("/wheel/odom",)}
+    alike = [covering("/odom_a", ODOMETRY, 400, 40.0), covering("/odom_b", ODOMETRY, 658, 65.7)]
+    assert "ambiguous" in assign_roles(alike, {}).problems[0]
+
+
+def test_of_power_a_side_that_fell_silent_is_still_a_side() -> None:
+    sides = [covering("/left/battery", BATTERY, 3, 1.0), covering("/right/battery", BATTERY, 658, 65.7)]
+    found = assign_roles([*sides, covering("/wheel/odom", ODOMETRY, 658, 65.7)], {})
+    assert played(found)["power"] == ("/left/battery", "/right/battery")
+    status = covering("/status", HUSKY, 3, 1.0)
+    assert played(assign_roles([status, sides[1], covering("/wheel/odom", ODOMETRY, 658, 65.7)], {}))["power"] == (
+        "/right/battery",
+    )
+
+
+def test_what_cannot_be_decoded_is_said_in_one_line_by_reason() -> None:
+    json = [
+        topic(f"/json{n}", "foxglove.Pose", problem="its messages are encoded as json; cdr and ros1 are read")
+        for n in range(12)
+    ]
+    proto = topic("/proto", IMU, problem="its messages are encoded as protobuf; cdr and ros1 are read")
+    empty = topic("/empty", IMU, 0, problem="its messages are encoded as cbor; cdr and ros1 are read")
+    for others in ([], [topic("/odom", ODOMETRY)]):
+        found = assign_roles([*json, proto, empty, *others], {})
+        (said,) = [
+            line for line in (*found.problems, *found.warnings) if line.startswith("topics that hold data which")
+        ]
+        assert (
+            "/json0, /json1, /json10, /json11, /json2, /json3, /json4, /json5 and 4 more: its messages are encoded as json"
+            in said
+        )
+        assert "/proto: its messages are encoded as protobuf" in said
+        assert "cbor" not in said
 
 
 def test_a_recipe_that_does_not_fit_the_log_is_an_error_with_what_there_is() -> None:

@@ -58,8 +58,9 @@ def make_outdated(store, *run_ids):
 def test_runs_of_another_data_model_are_named(store, tmp_path):
     make_outdated(store, "a")
     assert runs(store, tmp_path) == ["b", "c"]
-    (line,) = [line for line in open_dataset(tmp_path / "out").card["warnings"] if line.startswith("run a")]
-    assert line == "run a: of data model 0.9, not 1.0; left out until its log is ingested again"
+    assert open_dataset(tmp_path / "out").card["problems"] == [
+        "1 of 3 runs have no ingestion of data model 1.0 (they have 0.9): a; ingest their logs again: tcpipe ingest /logs/a.mcap"
+    ]
     found = inspect(store.root, recipe=Recipe())
     assert (found["outdated"], found["unfinished"]) == ({"a": "0.9"}, [])
     with pytest.raises(

@@ -69,6 +69,8 @@ def test_a_bare_number_is_told_by_the_name_of_its_topic(tmp_path):
         ("run.json", "run"),
         ("manifest.json", "run's recipe"),
         ("zarr.json", "map"),
+        ("model.json", "model"),
+        ("cost-map.json", "cost map"),
     ],
 )
 def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, sign, kind):

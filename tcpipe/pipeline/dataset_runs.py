@@ -1,0 +1,178 @@
+"""Which runs of a store a dataset is made of: those of one robot and recipe that are as they were written, and what is left out and why."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcpipe.errors import DatasetError, StoreError
+from tcpipe.formats.json_files import misfit
+from tcpipe.formats.recipe_toml import ingest_key
+from tcpipe.recipe import Recipe
+from tcpipe.store import Ingestions, RunDirectory, Store
+from tcpipe.tables.levels import DATA_MODEL_VERSION
+
+
+@dataclass(frozen=True, slots=True)
+class Chosen:
+    """Runs of one robot and recipe, and what belongs to them but cannot be used."""
+
+    runs: tuple[RunDirectory, ...]
+    logs: Mapping[str, Mapping[str, Any]]
+    """By run, what its run.json says of its log."""
+    missing: tuple[str, ...]
+    """A line for each reason why runs that belong in have no ingestion that could be used."""
+    damaged: tuple[str, ...]
+    """A line for each run that is not as it was written."""
+    left_out: frozenset[str]
+    """The runs that those lines are about."""
+    warnings: tuple[str, ...]
+
+
+def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
+    """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
+    found, key = store.ingestions(), ingest_key(recipe)
+    mine = [run for run in found.finished if run.manifest["ingest_key"] == key]
+    if not mine:
+        raise DatasetError(*_nothing_to_pool(store, found))
+    runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
+    known = {run.run_id for run in mine}
+    for path, line in found.damaged.items():
+        if path.parent.name not in known and _belongs(_known(store, path.parent.name), robot, tags):
+            damaged.setdefault(path.parent.name, line)
+    lines = tuple(
+        f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items()
+    )
+    if not runs:
+        raise DatasetError(*lines)
+    others = [run for run in (*found.finished, *found.outdated.values()) if run.run_id not in {*known, *damaged}]
+    others = [run for run in others if _belongs(run.manifest, robot, tags)]
+    left_out = {*damaged, *(run.run_id for run in others)}
+    total = len({run.run_id for run in runs} | left_out)
+    seen = {run.run_id for run in (*found.finished, *found.outdated.values())} | {
+        path.parent.name for path in found.damaged
+    }
+    unfinished = set(store.run_ids()) - seen
+    warnings = (f"no ingestion of {_named(unfinished)} has finished; ingest again",) if unfinished else ()
+    return Chosen(tuple(runs), logs, tuple(_missing(store, others, total)), lines, frozenset(left_out), warnings)
+
+
+def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:
+    robots = sorted({run.robot for run in runs})
+    wanted = [run for run in runs if robot is None or run.robot == robot]
+    if not wanted:
+        raise DatasetError(f"{store.root}: no run of robot {robot!r}; there are runs of {', '.join(robots)}")
+    if robot is None and len(robots) > 1:
+        raise DatasetError(f"{store.root}: runs of {len(robots)} robots ({', '.join(robots)}); name one with --robot")
+    return wanted
+
+
+def _tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
+    """Return the runs that carry all of the tags; `DatasetError` with the tags there are where none does."""
+    chosen = [run for run in runs if tags.items() <= run.manifest.get("tags", {}).items()]
+    if not chosen:
+        wanted = " ".join(f"{key}={value}" for key, value in tags.items())
+        there = sorted({f"{key}={value}" for run in runs for key, value in run.manifest.get("tags", {}).items()})
+        raise DatasetError(f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(there) or 'none'}")
+    return chosen
+
+
+def _nothing_to_pool(store: Store, found: Ingestions) -> list[str]:
+    """Say why no run of the store can be used."""
+    if not (found.finished or found.outdated or found.damaged):
+        return [f"{store.root}: no runs in the store; ingest one: tcpipe ingest LOG"]
+    head = ""
+    if found.finished:
+        head = (
+            f"{len({run.run_id for run in found.finished})} runs in the store, none ingested with this recipe; ingest them with it "
+            "(tcpipe ingest LOG), or give the recipe they were ingested with (--recipe FILE)"
+        )
+    elif found.outdated:
+        versions = ", ".join(sorted({run.version for run in found.outdated.values()}))
+        head = (
+            f"{len(found.outdated)} runs in the store, all of data model {versions}, wanted {DATA_MODEL_VERSION}; "
+            "ingest their logs again"
+        )
+    return [*([f"{store.root}: {head}"] if head else []), *found.damaged.values()]
+
+
+def _proved(
+    store: Store, runs: Sequence[RunDirectory]
+) -> tuple[list[RunDirectory], dict[str, Mapping[str, Any]], dict[str, str]]:
+    """Return the runs that are as they were written, what is known of their logs, and by run what is wrong with the others."""
+    whole, logs, damaged = list[RunDirectory](), dict[str, Mapping[str, Any]](), dict[str, str]()
+    for run in runs:
+        try:
+            known = store.run_json(run.run_id)
+            run.prove("segments.parquet", "track.parquet")
+        except StoreError as error:
+            damaged[run.run_id] = error.problems[0]
+            continue
+        if known is None:
+            damaged[run.run_id] = f"{run.path.parent / 'run.json'}: is gone"
+        else:
+            logs[run.run_id] = known["source"]
+            whole.append(run)
+    return whole, logs, damaged
+
+
+def _missing(store: Store, others: Sequence[RunDirectory], total: int) -> list[str]:
+    """Return a line for each reason why runs that belong in have no ingestion that could be used."""
+    by_recipe, by_version = dict[str, str](), dict[str, str]()
+    for run in others:
+        if run.version == DATA_MODEL_VERSION:
+            by_recipe[run.run_id] = run.recipe_id
+        else:
+            by_version[run.run_id] = run.version
+    return [
+        f"{len(of)} of {total} runs have no ingestion {what} (they have {', '.join(sorted(set(of.values())))}): {_named(of)}; "
+        f"ingest their logs again: tcpipe ingest {_logs_of(store, of)}"
+        for what, of in (("under this recipe", by_recipe), (f"of data model {DATA_MODEL_VERSION}", by_version))
+        if of
+    ]
+
+
+def _known(store: Store, run_id: str) -> Mapping[str, Any]:
+    """Return what run.json says, nothing where it cannot be believed."""
+    with suppress(StoreError):
+        return store.run_json(run_id) or {}
+    return {}
+
+
+def _belongs(known: Mapping[str, Any], robot: str | None, tags: Mapping[str, str]) -> bool:
+    """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
+    if robot is not None and known.get("robot", robot) != robot:
+        return False
+    its_tags = known.get("tags")
+    return not isinstance(its_tags, Mapping) or tags.items() <= its_tags.items()
+
+
+def _named(run_ids: Iterable[str], most: int = 3) -> str:
+    """Return the first names, and how many more there are."""
+    names = sorted(run_ids)
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def _logs_of(store: Store, run_ids: Iterable[str]) -> str:
+    """Return what to give to `tcpipe ingest` for the logs of runs: their folder, where they have one in common."""
+    paths = [path for run_id in run_ids for path in _known(store, run_id).get("source", {}).get("paths", ())]
+    with suppress(ValueError):  # no path, or some relative and some not
+        folder = Path(os.path.commonpath(paths))
+        if folder.is_absolute() and folder != Path(folder.anchor):
+            return str(folder)
+    return "LOG..."
+
+
+def gone_runs(
+    known: Mapping[str, Any], chosen: Chosen, *, robot: str | None, tags: Mapping[str, str]
+) -> tuple[str, ...]:
+    """Return a line about the runs of the dataset that is replaced which the store no longer has, if any were not left out by choice."""
+    here = {run.run_id for run in chosen.runs} | chosen.left_out
+    before = [run for run in known.get("runs", ()) if misfit(run, {"run_id": str}) is None]
+    gone = [run["run_id"] for run in before if run["run_id"] not in here and _belongs(run, robot, tags)]
+    count = f"{len(gone)} of the {len(before)} runs of the dataset that is replaced"
+    return (f"{count} are no longer in the store: {_named(gone)}",) if gone else ()

@@ -1,0 +1,40 @@
+"""What an ingest loads: nothing heavy that it does not use, and nothing twice."""
+
+import subprocess
+import sys
+
+from simulated_streams import log_of
+
+from tcpipe.simulation import tiny
+
+UNUSED = {
+    "pandas", "filterpy", "zarr", "rasterio", "matplotlib", "polars", "pyproj", "shapely", "mcap", "keras", "torch",
+    "scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.special", "scipy.stats",
+}  # fmt: skip
+PROGRAM = """
+import sys
+if __name__ == "__main__":
+    from tcpipe.pipeline.ingest import ingest
+    summary = ingest(sys.argv[3:], store=sys.argv[1], jobs=int(sys.argv[2]))
+    assert summary.exit_code == (0 if sys.argv[2] == "1" else 1), summary
+    print(*sorted(sys.modules))
+"""
+
+
+def loaded(tmp_path, jobs, *logs):
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    command = [sys.executable, program, tmp_path / "store", str(jobs), *logs]
+    return set(subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout.split())
+
+
+def test_an_ingest_loads_nothing_that_it_does_not_use(tmp_path):
+    scenario = tiny()
+    assert not loaded(tmp_path, 1, log_of(scenario, scenario.drives[0], tmp_path / "site")) & UNUSED
+
+
+def test_where_workers_do_the_work_their_parent_loads_no_kernel(tmp_path):
+    logs = [tmp_path / name for name in ("a.mcap", "b.mcap")]
+    for log in logs:
+        log.write_bytes(log.name.encode())
+    assert not loaded(tmp_path, 2, *logs) & (UNUSED | {"numba", "scipy"})

@@ -1,0 +1,194 @@
+"""A run that is not as it was written is no part of a dataset, and a dataset of fewer runs than it should be is told."""
+
+import json
+import shutil
+
+import pytest
+from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import DatasetError, StoreError
+from tcpipe.formats.seals import write_sealed
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.report import report
+from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
+from tcpipe.store import Store
+from tcpipe.tables.levels import STREAMS, Sensor, Streams
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Four runs beside each other."""
+    directory = tmp_path_factory.mktemp("made")
+    store = Store(directory / "store")
+    store.root.mkdir()
+    add_world(store, directory / "rasters")
+    for number, run_id in enumerate("abcd"):
+        add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 10.0), start_ns=number * 10**15))
+    return store
+
+
+@pytest.fixture
+def store(made, tmp_path, monkeypatch):
+    monkeypatch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")  # nine tenths of the time
+    shutil.copytree(made.root, tmp_path / "store")
+    return Store(tmp_path / "store")
+
+
+def build(store, **how):
+    return build_dataset(store.root.parent / "out", store=store.root, recipe=Recipe(), holdout="sample", **how)
+
+
+def runs(store):
+    return [run["run_id"] for run in open_dataset(store.root.parent / "out").card["runs"]]
+
+
+def edit(path, change):
+    """Change a value without the seal, as an editor does."""
+    found = json.loads(path.read_text())
+    change(found)
+    path.write_text(json.dumps(found, indent=2, sort_keys=True) + "\n")
+
+
+def robot(found):
+    found["robot"] = "warthog"
+
+
+def ledger(found):
+    found["ledger_m"]["kept"] += 1.0
+
+
+def sha256(found):
+    found["source"]["sha256"] = "0" * 64
+
+
+def flip(path):
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+DAMAGE = {
+    "the robot in the manifest": lambda run: edit(run.path / "manifest.json", robot),
+    "the ledger": lambda run: edit(run.path / "manifest.json", ledger),
+    "the log's sha256": lambda run: edit(run.path.parent / "run.json", sha256),
+    "a flipped bit of the manifest": lambda run: flip(run.path / "manifest.json"),
+    "a flipped bit of the segments": lambda run: flip(run.path / "segments.parquet"),
+    "a flipped bit of the track": lambda run: flip(run.path / "track.parquet"),
+    "a lost track": lambda run: (run.path / "track.parquet").unlink(),
+    "a lost manifest": lambda run: (run.path / "manifest.json").unlink(),
+    "a lost run.json": lambda run: (run.path.parent / "run.json").unlink(),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGE)
+def test_a_run_that_is_not_as_it_was_written_is_named_and_left_out(store, damage):
+    DAMAGE[damage](store.recipes_of("b")[0])
+    result = build(store)
+    (line,) = result.problems
+    assert line.startswith(f"run b: left out: {store.runs_path / 'b'}/")
+    assert "ingest its log again" in line
+    assert (result.exit_code, runs(store)) == (3, ["a", "c", "d"])
+    again = build(store, min_runs=3)
+    assert (again.status, again.problems) == ("unchanged", (line,)), "damage is told until it is mended"
+
+
+def test_a_manifest_of_another_run_is_not_believed_though_its_seal_is_whole(store):
+    ours, theirs = (store.recipes_of(name)[0].path for name in "bc")
+    shutil.copy(theirs / "manifest.json", ours / "manifest.json")
+    assert f"is of c/{ours.name}, but lies in b/{ours.name}" in build(store).problems[0]
+
+
+def test_a_document_that_is_sealed_and_lacks_something_is_named(store):
+    path = store.recipes_of("b")[0].path / "manifest.json"
+    manifest = json.loads(path.read_text())
+    write_sealed(path, {**manifest, "counts": {}})
+    assert (
+        "is not what this version writes: counts.segments is missing, wanted a whole number" in build(store).problems[0]
+    )
+
+
+def test_damaged_runs_are_told_by_inspect_and_report(store):
+    flip(store.recipes_of("b")[0].path / "manifest.json")
+    found = inspect(store.root, recipe=Recipe())
+    assert [run["run_id"] for run in found["runs"]] == ["a", "c", "d"]
+    assert len(found["damaged_runs"]) == 1
+    assert found["unfinished"] == []
+    with pytest.raises(StoreError, match="is not as it was written"):
+        report(store.runs_path / "b")
+
+
+def under_another_recipe(store, *run_ids):
+    for run_id in run_ids:
+        shutil.rmtree(store.runs_path / run_id)
+        table = segments(run_id, *lanes(3.0 * ord(run_id), -10.0, 10.0))
+        add_run(store, run_id, table, recipe=Recipe(label=LabelConfig(velocity="fused")))
+
+
+def test_runs_that_have_to_be_ingested_again_are_told_each_time_unless_so_many_are_enough(store):
+    assert build(store).exit_code == 0
+    under_another_recipe(store, "b", "c", "d")
+    before = (store.root.parent / "out" / "dataset.json").read_bytes()
+    with pytest.raises(DatasetError, match=r"1 runs, wanted 2 or more \(--min-runs\); nothing is written"):
+        build(store, min_runs=2)
+    assert (store.root.parent / "out" / "dataset.json").read_bytes() == before
+    for status in ("done", "unchanged"):
+        result = build(store)
+        (line,) = result.problems
+        assert line.startswith("3 of 4 runs have no ingestion under this recipe (they have ")
+        assert line.endswith("): b, c, d; ingest their logs again: tcpipe ingest /logs")
+        assert (result.status, result.exit_code) == (status, 3)
+    assert build(store, min_runs=1).exit_code == 0
+    assert runs(store) == ["a"]
+
+
+def test_runs_of_the_dataset_before_that_are_gone_are_told_once(store):
+    build(store)
+    shutil.rmtree(store.runs_path / "c")
+    assert build(store).problems == ("1 of the 4 runs of the dataset that is replaced are no longer in the store: c",)
+    assert build(store).exit_code == 0
+    shutil.rmtree(store.runs_path / "d")
+    result = build(store, min_runs=2)
+    assert result.exit_code == 0
+    assert any("no longer in the store: d" in line for line in result.warnings)
+
+
+def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
+    store.tag_run("d", {"weather": "wet"})
+    build(store)
+    assert build(store, tags={"weather": "wet"}).exit_code == 0
+    add_run(store, "e", segments("e", *lanes(14.0, -10.0, 10.0), robot="warthog"))
+    under_another_recipe(store, "c")
+    assert build(store, robot="warthog").exit_code == 0
+    assert build(store, robot="husky").exit_code == 3
+
+
+@pytest.mark.parametrize(
+    ("x_m", "holdout", "said"), [(20, "sample", "no sample is unseen"), (0, "run", "no sample tests")]
+)
+def test_a_split_that_is_empty_is_told_each_time(store, tmp_path, x_m, holdout, said):
+    for run_id in "bcd":
+        shutil.rmtree(store.runs_path / run_id)
+    region = region_file(tmp_path / "region.geojson", box(-20, -20, x_m, 20))
+    for _ in range(2):
+        result = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), holdout=holdout, split=region)
+        assert said in result.problems[0]
+        assert result.exit_code == 3
+
+
+def test_no_test_is_no_problem_where_none_is_wanted(store, tmp_path):
+    recipe = Recipe(split=SplitConfig(test_fraction=0.0))
+    assert build_dataset(tmp_path / "out", store=store.root, recipe=recipe).exit_code == 0
+
+
+def test_streams_that_are_not_as_they_were_written_are_made_again(store):
+    """A lever arm stands in a footer that no page's checksum covers."""
+    sensor = Sensor("/fix", "sensor_msgs/msg/NavSatFix", "gps", "the only one", (0.1, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0))
+    store.write_streams("a", Streams({"gnss": STREAMS["gnss"].empty()}, {"gnss": sensor}, "husky"), key="k")
+    assert store.read_streams("a", key="k").sensors["gnss"].xyz_m == (0.1, 0.0, 0.3)
+    path = store.runs_path / "a" / "streams" / "gnss.parquet"
+    data = path.read_bytes()
+    assert data.count(b"0.3") == 1
+    path.write_bytes(data.replace(b"0.3", b"0.7"))
+    assert store.read_streams("a", key="k") is None

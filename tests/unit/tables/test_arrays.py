@@ -1,0 +1,70 @@
+"""Arrow columns and numpy arrays against pyarrow's own conversions."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tcpipe.tables.arrays import number_column, numbers, rows_where, text_column, texts
+
+KINDS = ("int8", "uint8", "int16", "uint32", "int64", "uint64", "float32", "float64", "bool")
+
+
+@given(st.sampled_from(KINDS), st.lists(st.integers(0, 100)), st.integers(0, 3))
+def test_numbers_there_and_back(kind, values, first):
+    array = np.array(values).astype(kind)
+    column = number_column(array)
+    assert column.equals(pa.array(array))
+    found = numbers(column.slice(min(first, len(array))))
+    assert found.dtype == array.dtype
+    np.testing.assert_array_equal(found, array[first:])
+    np.testing.assert_array_equal(numbers(pa.chunked_array([column, column])), np.tile(array, 2))
+
+
+@pytest.mark.parametrize("kind", [pa.float32(), pa.float64(), pa.int16(), pa.bool_()])
+@pytest.mark.parametrize("rows", [slice(0, None), slice(2, 5), slice(9, None)])
+def test_null_is_nan(kind, rows):
+    column = pa.array([None, 1, 0, None, 1, None, None, 1, 1, None, 0], pa.int8()).cast(kind)[rows]
+    found = numbers(column)
+    assert found.dtype == (np.float32 if kind == pa.float32() else np.float64)
+    np.testing.assert_array_equal(found, [np.nan if value is None else float(value) for value in column.to_pylist()])
+
+
+def test_nan_is_null_where_asked():
+    values = np.array([np.nan, 1.0, np.nan, 2.0] * 5, ">f4")
+    assert number_column(values, nan_is_null=True).equals(pa.array(values.astype("f4"), from_pandas=True))
+    assert number_column(values).null_count == 0
+
+
+@given(st.lists(st.text(st.characters(exclude_categories=["Cs"], exclude_characters="\0"))), st.integers(0, 3))
+def test_texts_there_and_back(values, first):
+    column = text_column(values)
+    column.validate(full=True)
+    assert column.equals(pa.array(values, pa.string()))
+    assert texts(column.slice(min(first, len(values)))).tolist() == values[first:]
+    assert texts(pa.chunked_array([column, column])).tolist() == values * 2
+
+
+def test_rows_where():
+    table = pa.table({"epoch": [0, 1, 0], "rail": ["a", "b", "b"]})
+    assert rows_where(table, "epoch", 0).to_pylist() == [table.to_pylist()[row] for row in (0, 2)]
+    assert rows_where(table, "rail", "b").to_pylist() == [table.to_pylist()[row] for row in (1, 2)]
+    assert rows_where(table, "rail", "c").num_rows == 0
+
+
+def test_pandas_stays_where_it_is():
+    pytest.importorskip("pandas")
+    program = """
+import sys
+import numpy as np, pyarrow as pa
+from tcpipe.tables.arrays import *
+column = number_column(np.array([1.0, np.nan]), nan_is_null=True)
+table = pa.Table.from_arrays([column, text_column(["a", "b"])], names=["x", "y"])
+numbers(table["x"]), texts(table["y"]), rows_where(table, "y", "b")
+assert "pandas" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
