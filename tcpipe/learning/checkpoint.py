@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError
-from tcpipe.formats.json_files import to_json
 from tcpipe.formats.weights import read_arrays, write_arrays
 
 Arrays = dict[str, NDArray[Any]]
@@ -35,7 +34,7 @@ class Progress:
 
 def write_checkpoint(path: Path, progress: Progress, parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
     """Write where training stands and its weights, whole or not at all."""
-    state = np.frombuffer(to_json(asdict(progress)).encode(), np.uint8)
+    state = np.frombuffer(json.dumps(asdict(progress)).encode(), np.uint8)  # keeps what is infinite or not a number
     arrays = {f"{part}/{name}": array for part, named in parts.items() for name, array in named.items()}
     write_arrays(path, {_STATE: state, **arrays})
 
@@ -51,8 +50,7 @@ def read_checkpoint(path: Path, key: str) -> tuple[Progress, dict[str, Arrays]]:
     """
     try:
         arrays = read_arrays(path)
-        found = json.loads(arrays.pop(_STATE).tobytes())
-        progress = Progress(**{**found, "history": [tuple(row) for row in found["history"]]})
+        progress = _progress(json.loads(arrays.pop(_STATE).tobytes()))
     except (ModelError, KeyError, TypeError, ValueError) as error:
         reason = error.problems[0].removeprefix(f"{path}: ") if isinstance(error, ModelError) else "not a checkpoint"
         raise ModelError(f"{path}: {reason}; remove it, or start anew with --fresh") from None
@@ -63,3 +61,12 @@ def read_checkpoint(path: Path, key: str) -> tuple[Progress, dict[str, Arrays]]:
         part, _, rest = name.partition("/")
         parts.setdefault(part, {})[rest] = array
     return progress, parts
+
+
+def _progress(found: Any) -> Progress:
+    """Return what was saved of a `Progress`; ValueError, TypeError or KeyError where it is none."""
+    history = [(int(epoch), float(loss), float(held)) for epoch, loss, held in found["history"]]
+    made = Progress(**{**found, "best_loss": float(found["best_loss"]), "history": history})
+    if [row[0] for row in history] != list(range(1, made.epoch + 1)) or made.best_epoch not in range(made.epoch + 1):
+        raise ValueError(made)
+    return made

@@ -112,7 +112,8 @@ def evaluate(
         place = out / NETWORKS / name
         few = len(training_task(data, fitting.fold, variant).fit)
         longer = min(_MORE_EPOCHS, fitted / few)
-        train(dataset, place, config=replace(fitting, epochs=round(longer * fitting.epochs)), variant=variant)
+        rules = replace(fitting, epochs=round(longer * fitting.epochs))
+        train(dataset, place, config=rules, variant=variant, disposable=True)
         return load_model(place)
 
     ablation = list(_ablation(ours, sets, config, trained))

@@ -192,15 +192,16 @@ def _state(network: Any, best: Arrays) -> dict[str, Arrays]:
     return {"now": named_weights(network), "best": best, "optimizer": _optimizer_arrays(network)}
 
 
+def _forms(arrays: Arrays) -> dict[str, tuple[Any, ...]]:
+    return {name: (array.dtype, array.shape) for name, array in arrays.items()}
+
+
 def _restore(network: Any, parts: dict[str, Arrays], checkpoint: Path) -> None:
     """Put weights and the optimiser's memory back."""
-    shapes = {name: value.shape for name, value in named_weights(network).items()}
-    optimizer = [tuple(value.shape) for value in network.optimizer.variables]
-    saved = [value.shape for value in parts.get("optimizer", {}).values()]
-    fits = all({name: value.shape for name, value in parts.get(part, {}).items()} == shapes for part in ("now", "best"))
-    if not fits or saved != optimizer:
+    there = _state(network, named_weights(network))
+    if {part: _forms(arrays) for part, arrays in parts.items()} != {part: _forms(there[part]) for part in there}:
         raise ModelError(f"{checkpoint}: holds the weights of another network; remove it, or start anew with --fresh")
-    network.set_weights([parts["now"][name] for name in shapes])
+    network.set_weights([parts["now"][name] for name in there["now"]])
     network.optimizer.load_own_variables(
         {str(number): value for number, value in enumerate(parts["optimizer"].values())}
     )

@@ -141,7 +141,7 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
 def _train_and_evaluate(place: Path, made: Scenario, plan: Plan, seed: int, result: Reproduction) -> dict[str, Any]:
     here, dataset = place / f"seed-{seed}", place / "dataset"
     with _timed(result, "train"):
-        train(dataset, here / "model", config=replace(plan.fitting, seed=seed))
+        train(dataset, here / "model", config=replace(plan.fitting, seed=seed), disposable=True)
     with _timed(result, "evaluate"):
         known: Callable[[Any], Any] = partial(plant_costs, made.world, made.drives[0].robot)
         config = replace(plan.evaluating, seed=seed)

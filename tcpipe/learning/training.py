@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from tcpipe.errors import DatasetError, ModelError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.class_table import table_from_json
 from tcpipe.formats.json_files import digest
-from tcpipe.learning.checkpoint import Progress
+from tcpipe.learning.checkpoint import Progress, read_checkpoint
 from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
 from tcpipe.learning.keras_backend import device_name
 from tcpipe.learning.model_card import KIND, ModelCard, Seen
@@ -77,6 +78,7 @@ def train(
     config: FitConfig | None = None,
     variant: Variant | None = None,
     fresh: bool = False,
+    disposable: bool = False,
 ) -> TrainResult:
     """Train the paper's network on a dataset and write the model folder ``out``, whole or not at all.
 
@@ -93,6 +95,8 @@ def train(
         On what, where it is not the paper's network.
     fresh
         Leave an earlier state aside.
+    disposable
+        Leave aside a state that is cut short or of another training, and say so: whoever asks for this network can make it again.
 
     Raises
     ------
@@ -103,14 +107,15 @@ def train(
     rules, other, place, data = config or FitConfig(), variant or Variant(), Path(out), open_dataset(dataset)
     clear_beside(place)
     key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
+    checkpoint = _checkpoint_of(place)
     if (known := _known(place)) is not None and known["training"].get("key") == key and not fresh and _is_whole(place):
+        _drop_what_is_done(checkpoint, key)
         return _unchanged(place, known)
     task = training_task(data, rules.fold, other)
     _refuse_strangers(place)
     if rules.weights and not other.energy_only:
         _refuse_without_deviations(task, data)
-    checkpoint = _checkpoint_of(place)
-    if fresh:
+    if fresh or (disposable and checkpoint.exists() and not _is_of(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
     logger.info("%s: %d samples to fit, %d to stop by, on %s", place, len(task.fit), len(task.held), device_name())
     fitted = fit(task, rules, name=str(place), key=key, checkpoint=checkpoint)
@@ -217,6 +222,23 @@ def _checkpoint_of(place: Path) -> Path:
     """Return where training keeps its state: beside the folder, also of one called ``.`` or ``..``."""
     named = place if place.name not in {"", ".."} else place.resolve()
     return named.with_name(f"{named.name}.checkpoint")
+
+
+def _is_of(checkpoint: Path, key: str) -> bool:
+    """Return whether a state can be gone on from, and say why not."""
+    try:
+        read_checkpoint(checkpoint, key)
+    except ModelError as error:
+        logger.warning("%s; it begins anew", error.problems[0].partition(";")[0])
+        return False
+    return True
+
+
+def _drop_what_is_done(checkpoint: Path, key: str) -> None:
+    """Remove the state of a training that was ended between writing its model and removing its state."""
+    with suppress(ModelError):
+        read_checkpoint(checkpoint, key)
+        checkpoint.unlink()
 
 
 def _is_whole(place: Path) -> bool:

@@ -73,30 +73,66 @@ def test_the_same_again_is_nothing_to_do(trained, dataset):
     assert train(dataset, place, config=CONFIG).status == "unchanged"
 
 
-def test_a_stopped_training_goes_on_as_if_nothing_had_happened(trained, dataset, tmp_path, monkeypatch):
-    whole, real, epochs = trained[0], fitting.write_checkpoint, []
+def _stopped(monkeypatch, at, dataset, place, config, **options):
+    """Train until the checkpoint after epoch ``at`` is written; return the epochs whose checkpoints were."""
+    real, epochs = fitting.write_checkpoint, []
 
     def write_and_stop(path, progress, parts):
         real(path, progress, parts)
         epochs.append(progress.epoch)
-        if progress.epoch == 2:
+        if progress.epoch == at:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(fitting, "write_checkpoint", write_and_stop)
     with pytest.raises(KeyboardInterrupt):
-        train(dataset, tmp_path / "model", config=CONFIG)
-    assert not (tmp_path / "model").exists()
+        train(dataset, place, config=config, **options)
     monkeypatch.setattr(fitting, "write_checkpoint", real)
-    train(dataset, tmp_path / "model", config=CONFIG)
-    assert epochs == [0, 1, 2]
-    assert _same(_weights(whole), _weights(tmp_path / "model"))
-    assert (whole / HISTORY).read_bytes() == (tmp_path / "model" / HISTORY).read_bytes()
+    assert not place.exists()
+    return epochs
 
+
+def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happened(
+    trained, dataset, tmp_path, monkeypatch
+):
+    whole, place = trained[0], tmp_path / "model"
+    assert _stopped(monkeypatch, 0, dataset, place, CONFIG) == [0]  # in the first epoch
+    for epoch in (1, 2, 3):  # the last of them: all is trained, nothing is written
+        assert _stopped(monkeypatch, epoch, dataset, place, CONFIG) == [epoch]
+    checkpoint = tmp_path / "model.checkpoint"
+    state = checkpoint.read_bytes()
+    assert train(dataset, place, config=CONFIG).status == "done"
+    assert _same(_weights(whole), _weights(place))
+    assert (whole / HISTORY).read_bytes() == (place / HISTORY).read_bytes()
+    checkpoint.write_bytes(state)  # ended before the state was removed
+    assert train(dataset, place, config=CONFIG).status == "unchanged"
+    assert not checkpoint.exists()
+
+
+def test_a_variant_goes_on_too(dataset, tmp_path, monkeypatch):
+    config, variant = replace(CONFIG, epochs=1), Variant(channels=("height",), energy_only=True)
+    train(dataset, tmp_path / "whole", config=config, variant=variant)
+    _stopped(monkeypatch, 0, dataset, tmp_path / "model", config, variant=variant)
+    train(dataset, tmp_path / "model", config=config, variant=variant)
+    assert _same(_weights(tmp_path / "whole"), _weights(tmp_path / "model"))
+
+
+def test_a_held_out_loss_that_is_no_number_is_gone_on_from(dataset, tmp_path, monkeypatch):
+    config = replace(CONFIG, epochs=2)
+    with monkeypatch.context() as patch:
+        patch.setattr(fitting, "held_loss", lambda *_, **__: float("nan"))
+        _stopped(monkeypatch, 1, dataset, tmp_path / "model", config)
+    assert train(dataset, tmp_path / "model", config=config).best_epoch == 2
+
+
+def test_what_evaluation_trains_begins_anew_where_the_state_is_of_another_training(dataset, tmp_path, monkeypatch):
+    config = replace(CONFIG, epochs=1)
+    _stopped(monkeypatch, 0, dataset, tmp_path / "model", replace(config, seed=1))
+    assert train(dataset, tmp_path / "model", config=config, disposable=True).status == "done"
+
+
+def test_a_state_of_another_training_or_cut_short_is_told(dataset, tmp_path, monkeypatch):
+    _stopped(monkeypatch, 0, dataset, tmp_path / "other", CONFIG)
     checkpoint = tmp_path / "other.checkpoint"
-    monkeypatch.setattr(fitting, "write_checkpoint", write_and_stop)
-    with pytest.raises(KeyboardInterrupt):
-        train(dataset, tmp_path / "other", config=CONFIG)
-    monkeypatch.setattr(fitting, "write_checkpoint", real)
     with pytest.raises(ModelError, match=r"other.checkpoint: of another dataset or other options; .* --fresh"):
         train(dataset, tmp_path / "other", config=replace(CONFIG, seed=1))
     checkpoint.write_bytes(checkpoint.read_bytes()[:-1000])
