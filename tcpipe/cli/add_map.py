@@ -5,14 +5,19 @@ from __future__ import annotations
 import click
 
 from tcpipe.cli.options import json_option, quiet_option, store_option
+from tcpipe.errors import UsageError
 
 
 @click.command("add-map", short_help="Rasters of a site into the store")
 @click.argument("name")
-@click.option("--height", required=True, metavar="FILE", help="Height raster (GeoTIFF), metres.")
-@click.option("--ortho", metavar="FILE", help="Orthophoto, grey or RGB.")
+@click.argument("strays", nargs=-1, metavar="")
+@click.option("--height", required=True, multiple=True, metavar="FILE", help="Height raster, metres.")
+@click.option("--ortho", multiple=True, metavar="FILE", help="Orthophoto, grey or RGB.")
 @click.option(
-    "--terrain", metavar="FILE", help="Terrain classes: one integer band, or GeoJSON polygons with a property 'class'."
+    "--terrain",
+    multiple=True,
+    metavar="FILE",
+    help="Terrain classes: one integer band, or GeoJSON polygons with a property 'class'.",
 )
 @click.option("--classes", metavar="FILE", help="What the terrain values mean: CSV value,id,name,traversable, or TOML.")
 @click.option(
@@ -25,9 +30,10 @@ from tcpipe.cli.options import json_option, quiet_option, store_option
 def add_map(
     name: str,
     *,
-    height: str,
-    ortho: str | None,
-    terrain: str | None,
+    strays: tuple[str, ...],
+    height: tuple[str, ...],
+    ortho: tuple[str, ...],
+    terrain: tuple[str, ...],
     classes: str | None,
     crs: str | None,
     force: bool,
@@ -35,10 +41,16 @@ def add_map(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Put rasters that need not share grid, resolution or CRS on one common grid, and add them to the store as NAME."""
+    """Put rasters that need not share grid, resolution or CRS on one common grid, and add them to the store as NAME.
+
+    A raster is a GeoTIFF, JPEG 2000, ERDAS Imagine or VRT. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
+    repeating the option; where tiles overlap, the last lies on top.
+    """
     from tcpipe.cli.output import print_json, progress
     from tcpipe.pipeline.maps import add_map as run
 
+    if strays:
+        raise UsageError(f"{strays[0]}: belongs to no option; is a pattern without quotes? wanted --height 'dem/*.tif'")
     with progress(f"map {name}", 1, quiet=quiet):
         added = run(
             name, height=height, ortho=ortho, terrain=terrain, classes=classes, crs=crs, store=store, force=force

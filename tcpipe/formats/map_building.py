@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,15 +13,18 @@ import numpy as np
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import PlaceState, atomic_directory
 from tcpipe.formats.class_table import read_class_scheme
-from tcpipe.formats.geotiff import Raster, open_raster
 from tcpipe.formats.map_files import SHARD_PX, MapFile, MapWriter, open_map
 from tcpipe.formats.map_layers import Layer, RasterLayer, shards_of
+from tcpipe.formats.mosaic import Raster, open_raster
 from tcpipe.formats.seals import write_checksums
-from tcpipe.formats.terrain_polygons import SUFFIXES, place_polygons
+from tcpipe.formats.terrain_polygons import is_drawn, place_polygons
 from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, ClassTable, named_scheme
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.placement import Footing, choose_crs, choose_grid, projection_to
 from tcpipe.terrain.projection import parse_crs
+
+Files = Path | Sequence[Path]
+"""One file of a layer, or all; the last lies on top."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +50,9 @@ def build_map(
     out_path: Path,
     *,
     name: str,
-    height: Path,
-    ortho: Path | None = None,
-    terrain: Path | None = None,
+    height: Files,
+    ortho: Files = (),
+    terrain: Files = (),
     classes: Path | None = None,
     agreed: ClassScheme | None = None,
     crs: str | None = None,
@@ -67,7 +70,8 @@ def build_map(
     name
         The map's name.
     height, ortho, terrain
-        Rasters in any CRS on the earth, grid and resolution; terrain also as GeoJSON polygons (`terrain_polygons`).
+        Rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid (`mosaic`); terrain also as
+        GeoJSON polygons (`terrain_polygons`).
     classes
         Class table (CSV or TOML); None takes ``agreed``, else the paper's seven classes, and where the terrain raster names its values,
         those names say which class each is.
@@ -91,10 +95,9 @@ def build_map(
     StoreError
         The map cannot be written, or another process has put something else there.
     """
-    paths = {
-        role: path for role, path in (("height", height), ("ortho", ortho), ("terrain", terrain)) if path is not None
-    }
-    drawn = paths.pop("terrain") if terrain is not None and terrain.suffix.lower() in SUFFIXES else None
+    given = {"height": height, "ortho": ortho, "terrain": terrain}
+    paths = {role: [files] if isinstance(files, Path) else list(files) for role, files in given.items() if files}
+    drawn = paths.pop("terrain") if "terrain" in paths and is_drawn(paths["terrain"]) else []
     with ExitStack() as stack:
         rasters = _open_all(stack, paths)
         scheme, origin = _choose_scheme(classes, agreed, rasters.get("terrain"))
@@ -107,7 +110,7 @@ def build_map(
             role: RasterLayer(raster, footings[role], projection_to(footings[role], map_crs), scheme)
             for role, raster in rasters.items()
         }
-        if drawn is not None:
+        if drawn:
             layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
         with atomic_directory(out_path, instead_of=instead_of) as half:
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=tuple(layers))
@@ -141,7 +144,7 @@ def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Ra
         theirs = ", ".join(dict.fromkeys(terrain.names.values()))
         ours = ", ".join(entry.name for entry in scheme.table.classes)
         raise MapError(
-            f"{terrain.path}: none of its class names ({theirs}) is in the class table ({ours}); "
+            f"{terrain.label}: none of its class names ({theirs}) is in the class table ({ours}); "
             "say with --classes what its values mean"
         )
     return named, "names"
@@ -158,12 +161,12 @@ def _scheme_of_file(classes: Path, agreed: ClassScheme | None) -> ClassScheme:
     return scheme
 
 
-def _open_all(stack: ExitStack, paths: dict[str, Path]) -> dict[str, Raster]:
+def _open_all(stack: ExitStack, paths: Mapping[str, Sequence[Path]]) -> dict[str, Raster]:
     rasters: dict[str, Raster] = {}
     problems: list[str] = []
-    for role, path in paths.items():
+    for role, files in paths.items():
         try:
-            rasters[role] = stack.enter_context(open_raster(path, role))
+            rasters[role] = stack.enter_context(open_raster(files, role))
         except MapError as error:
             problems += error.problems
     if problems:
@@ -177,14 +180,14 @@ def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Footing
     for role, raster in rasters.items():
         text = raster.crs or crs
         if text is None:
-            problems.append(f"{raster.path}: has no CRS; if you know which one it is in, say so with --crs EPSG:n")
+            problems.append(f"{raster.label}: has no CRS; if you know which one it is in, say so with --crs EPSG:n")
             continue
         try:
-            found = parse_crs(text, where=str(raster.path) if raster.crs else "--crs")
+            found = parse_crs(text, where=raster.label if raster.crs else "--crs")
         except MapError as error:
             problems += error.problems
             continue
-        footings[role] = Footing(found, raster.affine, raster.rows, raster.cols, str(raster.path))
+        footings[role] = Footing(found, raster.affine, raster.rows, raster.cols, raster.label)
     if problems:
         raise MapError(*dict.fromkeys(problems))
     return footings
@@ -196,10 +199,10 @@ def _refuse_empty(layers: Mapping[str, Layer]) -> None:
         if layer.tally.pixels:
             continue
         if role == "height":
-            problems.append(f"{layer.path}: every pixel is nodata")
+            problems.append(f"{layer.label}: every pixel is nodata")
         else:
-            over = layers["height"].path.name
-            problems.append(layer.nothing() or f"{layer.path}: has no data anywhere on the height raster {over}")
+            over = layers["height"].name
+            problems.append(layer.nothing() or f"{layer.label}: has no data anywhere on the height raster {over}")
     if problems:
         raise MapError(*problems)
 
@@ -209,7 +212,7 @@ def _notes(layers: Mapping[str, Layer], covered: Mapping[str, float]) -> tuple[s
     for role, layer in layers.items():
         notes += layer.notes()
         if covered[role] < 0.5 * covered["height"]:
-            notes.append(f"{layer.path.name}: covers {covered[role]:.0%} of the map; samples need every layer")
+            notes.append(f"{layer.name}: covers {covered[role]:.0%} of the map; samples need every layer")
     return tuple(notes)
 
 
@@ -233,7 +236,7 @@ def _summary(path: Path, name: str, grid: MapGrid, classes: ClassTable, layers: 
 
 def _facts(summary: MapSummary, layers: Mapping[str, Layer]) -> dict[str, Any]:
     return {
-        "sources": {role: layer.path.name for role, layer in layers.items()},
+        "sources": {role: layer.name for role, layer in layers.items()},
         "covered": summary.covered,
         "height_min_m": summary.height_min_m,
         "height_max_m": summary.height_max_m,

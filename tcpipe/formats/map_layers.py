@@ -5,14 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import MapError
-from tcpipe.formats.geotiff import Raster
+from tcpipe.formats.mosaic import Raster
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.placement import LATTICE_STEP_PX, Footing, source_lattice
@@ -53,7 +52,7 @@ class Tally:
             if self.high > _HIGHEST_M or self.low < _DEEPEST_M:
                 wrong = self.low if self.low < _DEEPEST_M else self.high
                 raise MapError(
-                    f"{layer.path}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
+                    f"{layer.label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
                     f"{wrong:.6g} is no data (gdal_edit -a_nodata {wrong:.9g}), or that they are centimetres (gdal_edit -scale 0.01)"
                 )
 
@@ -72,8 +71,12 @@ class Layer(Protocol):
         """``height``, ``ortho`` or ``terrain``."""
 
     @property
-    def path(self) -> Path:
-        """The file it comes from."""
+    def label(self) -> str:
+        """The files it comes from, for messages."""
+
+    @property
+    def name(self) -> str:
+        """The same without their folder."""
 
     @property
     def tally(self) -> Tally:
@@ -105,9 +108,14 @@ class RasterLayer:
         return self.raster.role
 
     @property
-    def path(self) -> Path:
-        """The raster's file."""
-        return self.raster.path
+    def label(self) -> str:
+        """The raster's files, for messages."""
+        return self.raster.label
+
+    @property
+    def name(self) -> str:
+        """The same without their folder."""
+        return self.raster.name
 
     def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
         """Resample a part of the map, block by block, so that the raster's window stays small."""
@@ -125,17 +133,17 @@ class RasterLayer:
         if not self.tally.unnamed:
             return None
         named = ", ".join(str(value) for value in list(self.scheme.id_by_value)[:_LISTED])
-        return f"{self.path}: none of its values {self._unnamed()} is in the class table (which names {named}); give one with --classes"
+        return f"{self.label}: none of its values {self._unnamed()} is in the class table (which names {named}); give one with --classes"
 
     def notes(self) -> list[str]:
         """Return the raster's warnings, doubts of its datum, and values that are no class."""
         notes = list(self.raster.warnings)
         doubt = self.projection.doubt() if self.projection else None
         if doubt:
-            notes.append(f"{self.path.name}: {doubt}; the map may be off by that")
+            notes.append(f"{self.name}: {doubt}; the map may be off by that")
         if self.tally.unnamed:
             notes.append(
-                f"{self.path.name}: values {self._unnamed()} are not in the class table; "
+                f"{self.name}: values {self._unnamed()} are not in the class table; "
                 f"about {self.tally.unnamed_pixels} pixels are nodata"
             )
         return notes

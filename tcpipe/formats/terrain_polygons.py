@@ -7,7 +7,7 @@ centre lies in; ground outside all polygons has no data.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,8 @@ _SEEN_OVERLAP_M2 = 1.0
 class PolygonLayer:
     """Polygons as the terrain layer: in the map's CRS, in the order they are drawn, with their class ids."""
 
-    path: Path
+    label: str
+    name: str
     polygons: NDArray[np.object_]
     ids: NDArray[np.uint8]
     warnings: tuple[str, ...]
@@ -71,15 +72,24 @@ class PolygonLayer:
         return list(self.warnings)
 
 
+def is_drawn(paths: Sequence[Path]) -> bool:
+    """Return whether terrain files are polygons; `MapError` if some are and some are not."""
+    drawn = [path for path in paths if path.suffix.lower() in SUFFIXES]
+    if drawn and len(drawn) != len(paths):
+        other = next(path for path in paths if path not in drawn)
+        raise MapError(f"terrain: {drawn[0]} holds polygons, {other} does not; wanted one kind")
+    return bool(drawn)
+
+
 def place_polygons(
-    path: Path, scheme: ClassScheme, crs: CRS, bounds_m: tuple[float, float, float, float]
+    paths: Sequence[Path], scheme: ClassScheme, crs: CRS, bounds_m: tuple[float, float, float, float]
 ) -> PolygonLayer:
     """Read terrain polygons and carry them into a map's CRS.
 
     Parameters
     ----------
-    path
-        The GeoJSON file.
+    paths
+        The GeoJSON files; the features of a later one lie on top.
     scheme
         The class table, and the values that stand for its ids.
     crs, bounds_m
@@ -90,25 +100,37 @@ def place_polygons(
     MapError
         Not GeoJSON, another CRS, unsound geometry, a class that the table does not have, or nothing on the map: all problems at once.
     """
-    try:
-        features, problems = read_polygons(path)
-    except RegionError as error:
-        raise MapError(*error.problems) from None
+    features, problems = _read_all(paths)
+    label = f"{paths[0]}" if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
+    name = label.removeprefix(f"{paths[0].parent}/")
     ids = [_class_id(feature, scheme, problems) for feature in features]
     if not features:
-        problems.append(f"{path}: no polygon in it; draw the terrain as polygons")
+        problems.append(f"{label}: no polygon in it; draw the terrain as polygons")
     if problems:
         raise MapError(*shortened(problems))
     flat = [polygon for feature in features for polygon in feature.polygons]
     id_of_each = np.repeat(np.array(ids, np.uint8), [len(feature.polygons) for feature in features])
     projection = Projection(CRS.from_epsg(4326), crs, area_of(crs, bounds_m))
-    polygons = _carried(path, np.array(flat, dtype=object), projection, bounds_m)
+    polygons = _carried(label, np.array(flat, dtype=object), projection, bounds_m)
     on_map = ~shapely.is_empty(polygons)
     polygons, id_of_each = polygons[on_map], id_of_each[on_map]
     doubt = projection.doubt()
-    warnings = [f"{path.name}: {doubt}; its polygons may be off by that"] if doubt else []
-    warnings += _overlaps(path, polygons, id_of_each, scheme)
-    return PolygonLayer(path, polygons, id_of_each, tuple(warnings), shapely.STRtree(polygons))
+    warnings = [f"{name}: {doubt}; its polygons may be off by that"] if doubt else []
+    warnings += _overlaps(name, polygons, id_of_each, scheme)
+    return PolygonLayer(label, name, polygons, id_of_each, tuple(warnings), shapely.STRtree(polygons))
+
+
+def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
+    features: list[PolygonFeature] = []
+    problems: list[str] = []
+    for path in paths:
+        try:
+            found, unsound = read_polygons(path)
+        except RegionError as error:
+            raise MapError(*error.problems) from None
+        features += found
+        problems += unsound
+    return features, problems
 
 
 def _class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
@@ -145,7 +167,7 @@ def _integer(given: Any) -> int | None:
 
 
 def _carried(
-    path: Path, polygons: NDArray[np.object_], projection: Projection, bounds_m: tuple[float, float, float, float]
+    label: str, polygons: NDArray[np.object_], projection: Projection, bounds_m: tuple[float, float, float, float]
 ) -> NDArray[np.object_]:
     """Return the polygons in the map's CRS, empty where they are not on the map; `MapError` if none is."""
     west, south, east, north = projection.area_deg
@@ -160,15 +182,15 @@ def _carried(
     swapped = shapely.transform(polygons, lambda lonlat: lonlat[:, ::-1])
     if shapely.intersects(swapped, shapely.box(west, south, east, north)).any():
         raise MapError(
-            f"{path}: none of its polygons is on the map, but would be with the axes swapped: GeoJSON is lon before lat (RFC 7946)"
+            f"{label}: none of its polygons is on the map, but would be with the axes swapped: GeoJSON is lon before lat (RFC 7946)"
         )
     raise MapError(
-        f"{path}: none of its polygons is on the map: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
+        f"{label}: none of its polygons is on the map: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
         f"the map covers {west:.5f} to {east:.5f}, {south:.5f} to {north:.5f}"
     )
 
 
-def _overlaps(path: Path, polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> Iterator[str]:
+def _overlaps(name: str, polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> Iterator[str]:
     """Say how much ground polygons of different classes share."""
     below, above = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     pairs = (below < above) & (ids[below] != ids[above])
@@ -178,6 +200,6 @@ def _overlaps(path: Path, polygons: NDArray[np.object_], ids: NDArray[np.uint8],
         worst = int(np.argmax(shared_m2))
         names = [scheme.table.name(int(ids[part[worst]])) for part in (above, below)]
         yield (
-            f"{path.name}: polygons of different classes overlap by {shared_m2.sum():.0f} m² (most of it {names[0]} over {names[1]}); "
+            f"{name}: polygons of different classes overlap by {shared_m2.sum():.0f} m² (most of it {names[0]} over {names[1]}); "
             "the later in the file lies on top"
         )

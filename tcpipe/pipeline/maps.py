@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import glob
 import logging
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,12 +17,15 @@ from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import MapFile, open_map
 from tcpipe.formats.map_text import map_text
 from tcpipe.formats.seals import file_checksum, seal_of
-from tcpipe.formats.terrain_polygons import SUFFIXES
+from tcpipe.formats.terrain_polygons import is_drawn
 from tcpipe.report.overview import quick_look, shows_map, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.terrain.classes import ClassScheme
 
 logger = logging.getLogger("tcpipe")
+
+Files = str | Path | Sequence[str | Path]
+"""A file, a pattern of files, or several of both."""
 
 _ROLES = ("height", "ortho", "terrain", "classes")
 
@@ -48,9 +53,9 @@ class AddedMap:
 def add_map(
     name: str,
     *,
-    height: str | Path,
-    ortho: str | Path | None = None,
-    terrain: str | Path | None = None,
+    height: Files,
+    ortho: Files | None = None,
+    terrain: Files | None = None,
     classes: str | Path | None = None,
     crs: str | None = None,
     store: str | Path = "tcpipe-store",
@@ -63,8 +68,9 @@ def add_map(
     Parameters
     ----------
     height, ortho, terrain
-        Rasters GDAL can read; they need not share grid, resolution or CRS. Terrain may also be GeoJSON polygons whose property ``class`` is
-        a class name, value or id.
+        GeoTIFF, JPEG 2000, ERDAS Imagine or VRT; the three need not share grid, resolution or CRS. Each is one file, a pattern such as
+        ``dem/*.tif`` (its files by name), or several of both: tiles of one grid, the last on top where they overlap. Terrain may also be
+        GeoJSON polygons whose property ``class`` is a class name, value or id.
     classes
         CSV ``value,id,name,traversable`` or the same as TOML; None takes the store's, else the paper's seven classes. The first map with
         terrain or classes sets the store's table; the others must have the same.
@@ -82,7 +88,7 @@ def add_map(
     house = open_store(store, create=True)
     path = house.map_path(name)
     given = {"height": height, "ortho": ortho, "terrain": terrain, "classes": classes}
-    files = {role: Path(file) for role, file in given.items() if file is not None}
+    files = _found({role: value for role, value in given.items() if value})
     inputs = _inputs(files, crs)
     before = place_state(path)
     if path.exists() and not force:
@@ -94,9 +100,9 @@ def add_map(
             path,
             name=name,
             height=files["height"],
-            ortho=files.get("ortho"),
-            terrain=files.get("terrain"),
-            classes=files.get("classes"),
+            ortho=files.get("ortho", ()),
+            terrain=files.get("terrain", ()),
+            classes=files["classes"][0] if "classes" in files else None,
             agreed=_agreed(house, name),
             crs=crs,
             inputs=inputs,
@@ -121,19 +127,52 @@ def _unchanged(name: str, path: Path, inputs: Mapping[str, Any]) -> AddedMap:
     return AddedMap(path, "unchanged", found.summary(), picture)
 
 
-def _inputs(files: Mapping[str, Path], crs: str | None) -> dict[str, Any]:
-    """Return what a map is made from: a checksum for every file of every role, and the options."""
+def _found(given: Mapping[str, Files]) -> dict[str, list[Path]]:
+    """Return the files of every role: patterns become the files that match, by name; of one that comes twice the last counts."""
+    files: dict[str, list[Path]] = {}
+    problems: list[str] = []
+    for role, value in given.items():
+        texts = [str(item) for item in ([value] if isinstance(value, str | Path) else value)]
+        matches = [_matches(text) for text in texts]
+        problems += [_no_file(text) for text, found in zip(texts, matches, strict=True) if not found]
+        every = [Path(name) for found in matches for name in found]
+        files[role] = list(reversed({path.absolute(): path for path in reversed(every)}.values()))
+    if problems:
+        raise MapError(*problems)
+    return files
+
+
+def _matches(text: str) -> list[str]:
+    """Return the file of that name, or the files that match it, by name."""
+    if os.path.lexists(text):
+        return [] if Path(text).is_dir() else [text]
+    return sorted(glob.glob(text, recursive=True))  # noqa: PTH207  a pattern may begin at the root
+
+
+def _no_file(text: str) -> str:
+    """Say why a text names no file."""
+    if "://" in text or text.startswith("/vsi"):
+        return f"{text}: is an address, wanted a file on this machine: gdal_translate {text} local.tif"
+    if Path(text).is_dir():
+        return f"{text}: is a directory, wanted its files: '{text.rstrip('/')}/*.tif'"
+    return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
+
+
+def _inputs(files: Mapping[str, Sequence[Path]], crs: str | None) -> dict[str, Any]:
+    """Return what a map is made from: a checksum for every file of every role, in their order, and the options."""
     checksums: dict[str, dict[str, str]] = {}
     problems: list[str] = []
-    for role, path in files.items():
+    for role, paths in files.items():
+        checksums[role] = {}
+        folder = os.path.commonpath([path.absolute().parent for path in paths])
         try:
-            drawn = role == "terrain" and path.suffix.lower() in SUFFIXES
-            parts = [path] if role == "classes" or drawn else raster_files(path)
-            checksums[role] = {part.name: file_checksum(part)[1] for part in parts}
+            plain = role == "classes" or (role == "terrain" and is_drawn(paths))
+            for part in dict.fromkeys(part for path in paths for part in ([path] if plain else raster_files(path))):
+                checksums[role][os.path.relpath(part, folder)] = file_checksum(part)[1]
         except MapError as error:
             problems += error.problems
         except OSError as error:
-            problems.append(f"{path}: cannot be read ({error.strerror})")
+            problems.append(f"{error.filename}: cannot be read ({error.strerror})")
     if problems:
         raise MapError(*problems)
     return {"files": checksums, "crs": crs}
@@ -160,8 +199,10 @@ def _same(name: str, path: Path, inputs: Mapping[str, Any]) -> MapFile:
 
 def _change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
     """Say how the files of a role, name to checksum, differ; nothing where their contents are the same."""
-    if sorted(before.values()) == sorted(now.values()):
+    if list(before.values()) == list(now.values()):
         return ""
+    if sorted(before.values()) == sorted(now.values()):
+        return f"the files of {role} come in another order"
     if not before or not now:
         return f"--{role} was not given then, but is now" if now else f"--{role} was given then, but is not now"
     names = [name for name in now if now[name] not in before.values()]

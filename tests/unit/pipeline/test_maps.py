@@ -6,12 +6,13 @@ import resource
 import matplotlib.image
 import numpy as np
 import pytest
+import rasterio
 from click.testing import CliRunner
 from map_worlds import World, write_tif
 from rasterio import Affine
 
 from tcpipe.cli import cli
-from tcpipe.errors import MapError, StoreError
+from tcpipe.errors import MapError, StoreError, UsageError
 from tcpipe.formats.map_files import open_map
 from tcpipe.pipeline import maps
 from tcpipe.pipeline.maps import add_map
@@ -148,7 +149,7 @@ def test_everything_wrong_with_the_files_is_said_at_once(site, store, tmp_path):
     problems = refused(store, "m", height=tmp_path / "no.tif", terrain=site["terrain"], classes=tmp_path / "no.csv")
     assert [line.rpartition("/")[2] for line in problems] == [
         "no.tif: there is no such file",
-        "no.csv: cannot be read (No such file or directory)",
+        "no.csv: there is no such file",
     ]
 
 
@@ -252,3 +253,55 @@ def test_the_same_map_added_twice_at_one_time_is_there_once(site, store, monkeyp
 
     monkeypatch.setattr(maps, "build_map", slow)
     assert add(store, "m", **site).status == "unchanged"
+
+
+def halves(site, directory):
+    """West and east half of the site's height, each in a folder of its own under one name, and the map that they make."""
+    with rasterio.open(site["height"]) as dataset:
+        values, affine = dataset.read(), dataset.transform
+    for name, first in (("east", 30), ("west", 0)):
+        (directory / name).mkdir()
+        at = Affine(0.2, 0, affine.c + 0.2 * first, 0, -0.2, affine.f)
+        write_tif(directory / name / "dem.tif", values[:, :, first : first + 30], WORLD.crs, at)
+
+
+def test_tiles_come_as_patterns_and_each_is_known_by_its_content(site, store, tmp_path):
+    halves(site, tmp_path)
+    added = add(store, "m", height=str(tmp_path / "*/dem.tif"))
+    add(store, "whole", height=site["height"])
+    tiled, whole = (open_map(store / f"maps/{name}.zarr") for name in ("m", "whole"))
+    np.testing.assert_array_equal(tiled.read("height", 0, 60, 0, 60), whole.read("height", 0, 60, 0, 60))
+    files = [tmp_path / "east/dem.tif", tmp_path / "west/dem.tif"]
+    hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
+    assert tiled.facts["inputs"]["files"]["height"] == dict(zip(("east/dem.tif", "west/dem.tif"), hashes, strict=True))
+    assert "from dem.tif … dem.tif (2 files): 6" in str(added)
+    assert add(store, "m", height=files).status == "unchanged"
+    assert "the files of height come in another order" in refused(store, "m", height=files[::-1])[0]
+    assert "height has another content" in refused(store, "m", height=files[0])[0]
+
+
+def test_a_tile_that_a_pattern_names_once_more_lies_where_it_is_named_last(site, store, tmp_path):
+    halves(site, tmp_path)
+    add(store, "m", height=[str(tmp_path / "*/dem.tif"), tmp_path / "east/dem.tif"])
+    assert list(open_map(store / "maps/m.zarr").facts["inputs"]["files"]["height"]) == ["west/dem.tif", "east/dem.tif"]
+
+
+def test_what_names_no_file_is_said(site, store, tmp_path):
+    given = {"height": [tmp_path, "https://x.org/dem.tif", "/vsicurl/x.tif"], "ortho": str(tmp_path / "*.jpg")}
+    assert refused(store, "m", **given) == (
+        f"{tmp_path}: is a directory, wanted its files: '{tmp_path}/*.tif'",
+        "https://x.org/dem.tif: is an address, wanted a file on this machine: gdal_translate https://x.org/dem.tif local.tif",
+        "/vsicurl/x.tif: is an address, wanted a file on this machine: gdal_translate /vsicurl/x.tif local.tif",
+        f"{tmp_path}/*.jpg: no file matches",
+    )
+
+
+def test_the_command_takes_patterns_and_repeated_options_and_knows_a_pattern_without_quotes(site, store, tmp_path):
+    halves(site, tmp_path)
+    east, west = (str(tmp_path / side / "dem.tif") for side in ("east", "west"))
+    whole = ["add-map", "m", "--store", str(store), "--quiet", "--height"]
+    assert CliRunner().invoke(cli, [*whole, str(tmp_path / "*/dem.tif")], catch_exceptions=False).exit_code == 0
+    again = CliRunner().invoke(cli, [*whole, east, "--height", west], catch_exceptions=False)
+    assert "nothing to do" in again.stdout
+    with pytest.raises(UsageError, match="is a pattern without quotes"):
+        CliRunner().invoke(cli, [*whole, east, west], standalone_mode=False, catch_exceptions=False)
