@@ -119,22 +119,28 @@ def exclusive(directory: Path) -> Iterator[None]:
 
 @contextmanager
 def _told(path: Path) -> Iterator[None]:
-    """Turn what the operating system says while ``path`` is written into one line about ``path`` itself."""
+    """Turn what the operating system says while ``path`` is written into one line about ``path`` itself.
+
+    An error that names another file is of that file: what is read for ``path``. One that names none is of writing, whatever its number,
+    as readers turn theirs into errors of their own.
+    """
     try:
         yield
     except (OSError, StoreError) as error:
         cause = error.__cause__ if isinstance(error, StoreError) else error
         if not isinstance(cause, OSError):
             raise
-        where = str(cause.filename)
-        if (
-            cause.errno in _UNWRITABLE
-            or TEMPORARY_PREFIX in where
-            or Path(where) in Path(os.path.realpath(path)).parents
-        ):
+        if _is_of_writing(cause, Path(os.path.realpath(path))):
             reason = os.strerror(cause.errno) if cause.errno else str(cause)
             raise StoreError(f"{path}: cannot be written ({reason})") from cause
         raise
+
+
+def _is_of_writing(error: OSError, place: Path) -> bool:
+    if error.filename is None:
+        return not isinstance(error, ConnectionError)  # nobody reads any more what is printed
+    named = Path(os.path.realpath(os.fsdecode(error.filename)))
+    return error.errno in _UNWRITABLE or TEMPORARY_PREFIX in str(named) or named in (place, *place.parents)
 
 
 @contextmanager

@@ -176,11 +176,8 @@ def build_dataset(
     inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
     if proved and known is not None and known["inputs"] == inputs.digest and is_whole(place, known):
         return _result(place, "unchanged", known, problems)
-    try:
-        with atomic_directory(place.absolute()) as directory:
-            card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
-    except OSError as error:
-        raise DatasetError(f"{place}: the dataset cannot be written ({error.strerror or error})") from None
+    with atomic_directory(place.absolute()) as directory:
+        card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
     return _result(place, "done", card, problems)
 
 

@@ -111,8 +111,6 @@ def add_map(
         )
         write_quick_look(picture, *looks[0])
         return AddedMap(path, "done", open_map(path).summary(), picture)
-    except OSError as error:
-        raise StoreError(f"{path}: the map cannot be written ({error.strerror or error})") from None
     except StoreError:
         if force or place_state(path) == before:
             raise

@@ -1,6 +1,7 @@
 """Outputs appear whole or not at all."""
 
 import errno
+import os
 import re
 import shutil
 import subprocess
@@ -92,9 +93,52 @@ def test_a_full_disk_is_told_by_the_place_and_new_directories_go(tmp_path: Path,
     assert not any(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+@pytest.mark.parametrize(
+    "number", [errno.EACCES, errno.EPERM, errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.ESTALE, errno.ENXIO]
+)
+@pytest.mark.parametrize("named", [None, "temporary", "place", "parent"])
+def test_whatever_fails_in_writing_names_the_place(
+    tmp_path: Path, write: Callable[..., Any], number: int, named: str | None
+) -> None:
+    path = tmp_path / "it"
+    wanted = f"{path}: cannot be written ({os.strerror(number)})"
+    of = {"place": os.fsencode(path), "parent": str(tmp_path), None: None}
+    with pytest.raises(StoreError, match=f"^{re.escape(wanted)}$"), write(path) as temporary:
+        raise OSError(number, "what a library says", {**of, "temporary": str(temporary)}[named])
+    assert not any(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("failing", ["fsync", "rename"])
+@pytest.mark.parametrize("write", [atomic_file, atomic_directory])
+def test_a_disk_that_fails_at_the_end_names_the_place(
+    tmp_path: Path, write: Callable[..., Any], failing: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    for name in ("replace", "rename", "_exchanged") if failing == "rename" else ("fsync",):
+        target: object = "tcpipe.formats.atomic._exchanged" if name == "_exchanged" else f"os.{name}"
+        monkeypatch.setattr(target, fail)
+    path = tmp_path / "it"
+    with (
+        pytest.raises(StoreError, match=f"^{re.escape(str(path))}: cannot be written .Input/output error.$"),
+        write(path) as temporary,
+    ):
+        (temporary / "a" if temporary.is_dir() else temporary).write_text("new")
+    monkeypatch.undo()
+    assert not any(tmp_path.iterdir())
+
+
 def test_an_unreadable_source_is_not_told_as_an_unwritable_place(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), atomic_file(tmp_path / "f"):
         (tmp_path / "source").read_text()
+    with pytest.raises(PermissionError, match="source"), atomic_file(tmp_path / "f"):
+        raise PermissionError(errno.EACCES, "Permission denied", str(tmp_path / "source"))
+    with pytest.raises(StoreError, match=r"^source is damaged$"), atomic_file(tmp_path / "f"):
+        raise StoreError("source is damaged")
+    with pytest.raises(BrokenPipeError), atomic_file(tmp_path / "f"):
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
 
 def test_a_link_to_a_directory_stays_a_link(tmp_path: Path) -> None:
