@@ -13,7 +13,7 @@ from typing import Any
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats.atomic import write_text
+from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.claims import Claim, checked_claims
 from tcpipe.learning.evaluation import EvaluateConfig
@@ -103,6 +103,7 @@ def reproduce(directory: str | Path, *, quick: bool = False, seeds: int = 1, job
 
     """
     place, plan = Path(directory), QUICK if quick else FULL
+    clear(place)
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
         raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
     made, result = scenario(plan.scenario), Reproduction(place, plan.scenario)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.atomic import clear
 from tcpipe.pipeline.build import BuildResult, build_dataset
 from tcpipe.pipeline.ingest import IngestSummary, ingest
 from tcpipe.pipeline.maps import add_map
@@ -60,6 +61,7 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
 
     """
     site_path, store_path, dataset_path = directory / "site", directory / "store", directory / "dataset"
+    clear(directory)
     if directory.exists() and not directory.is_dir():
         raise UsageError(f"{directory}: is a file, wanted a directory for the demo")
     if directory.exists() and any(directory.iterdir()) and not site_path.exists():
