@@ -200,8 +200,8 @@ class Store:
     def tag_run(self, run_id: str, tags: Mapping[str, str]) -> None:
         """Set the tags of a run, under every recipe."""
         for path in (
-            self.runs_path / run_id / "run.json",
             *(run.path / "manifest.json" for run in self.recipes_of(run_id)),
+            self.runs_path / run_id / "run.json",  # the last: who finds the tags here finds them everywhere
         ):
             if path.exists():
                 write_sealed(path, {**read_sealed(path), "tags": dict(tags)})

@@ -13,10 +13,11 @@ def init(directory: str) -> None:
     """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out."""
     from tcpipe.cli.output import say
     from tcpipe.errors import UsageError
-    from tcpipe.formats.atomic import write_text
+    from tcpipe.formats.atomic import clear_beside, write_text
     from tcpipe.formats.recipe_toml import FILE_NAME, commented_toml
 
     path = Path(directory) / FILE_NAME
+    clear_beside(path)
     if not path.exists():
         write_text(path, commented_toml())
         say(f"wrote {path}")

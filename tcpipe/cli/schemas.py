@@ -12,9 +12,10 @@ import click
 def schemas(out: str) -> None:
     """Write the contract of every table and of the recipe as JSON Schema, one file each, to OUT."""
     from tcpipe.cli.output import say
-    from tcpipe.formats.atomic import write_text
+    from tcpipe.formats.atomic import clear, write_text
     from tcpipe.formats.contracts import contracts
 
+    clear(Path(out))
     wanted = {Path(out) / name: text for name, text in contracts().items()}
     missing = {path: text for path, text in wanted.items() if not path.is_file() or path.read_bytes() != text.encode()}
     for path, text in missing.items():

@@ -176,14 +176,18 @@ def _holder_beside(place: Path) -> Iterator[Path]:
 def _locked_directory(parent: Path, prefix: str) -> tuple[Path, int]:
     while True:
         holder = parent / f"{prefix}{uuid.uuid4().hex[:8]}"
-        holder.mkdir()
-        with suppress(FileNotFoundError):  # another process took it for abandoned before it was locked
-            lock = os.open(holder, os.O_RDONLY)
-            with suppress(OSError):  # a file system without locks
-                fcntl.flock(lock, fcntl.LOCK_EX)
-            if holder.exists():
-                return holder, lock
-            os.close(lock)
+        try:
+            holder.mkdir()
+            with suppress(FileNotFoundError):  # another process took it for abandoned before it was locked
+                lock = os.open(holder, os.O_RDONLY)
+                with suppress(OSError):  # a file system without locks
+                    fcntl.flock(lock, fcntl.LOCK_EX)
+                if holder.exists():
+                    return holder, lock
+                os.close(lock)
+        except BaseException:  # a signal comes here, too
+            shutil.rmtree(holder, ignore_errors=True)
+            raise
 
 
 def _prefix(name: str) -> str:

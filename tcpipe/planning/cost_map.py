@@ -124,6 +124,7 @@ def make_cost_map(
     with _claimed(out) as place:
         found = read_cost_map_card(out)  # another process may have been first
         if found is not None and found["key"] == key and not any(broken_checksums(out, found["checksums"])):
+            rmtree(place)
             return CostMapResult(out, "unchanged", found)
         spool = _spool(place, key, grid)
         _fill(model, source, spool, step)
