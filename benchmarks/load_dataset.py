@@ -122,7 +122,7 @@ def contestants_of(zstd, lz4, path, order):
         "epoch from memory": (lambda: epoch(zstd.batches(SIZE, shuffle=True, from_disk=False)), count),
     }
     if importlib.util.find_spec("torch"):
-        import torch  # noqa: PLC0415  where it is installed
+        import torch
 
         torch.set_num_threads(1)
         loader = torch.utils.data.DataLoader

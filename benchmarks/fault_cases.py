@@ -1,0 +1,170 @@
+"""The writing commands on the smallest inputs that make each of them do all it does, and the protocol below them."""
+
+import json
+import shutil
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from pkgutil import walk_packages
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from fault_children import INPUTS, command
+
+import tcpipe
+from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
+
+Run = Callable[[], object]
+
+STORE = ("--store", f"{INPUTS}/store")
+LAYERS = tuple(word for name in ("height", "ortho", "terrain") for word in (f"--{name}", f"{INPUTS}/{name}.tif"))
+LOG = f"{INPUTS}/logs/tiny.mcap"
+MODEL, DATASET = f"{INPUTS}/model", f"{INPUTS}/dataset"
+FROM, TO = "15.434471784,47.069643821", "15.434788601,47.069732605"
+
+
+@dataclass(frozen=True)
+class Case:
+    """One call, what was called before it, and which inputs it wants: ``log``, ``world`` (rasters and a store), ``model``."""
+
+    name: str
+    run: Run
+    before: tuple[Run, ...] = ()
+    wants: frozenset[str] = frozenset()
+
+
+def _as_command(run: Run) -> Run:
+    """Return a call of something by the command line, which tells errors and signals."""
+
+    def called() -> None:
+        from click import Command
+
+        from tcpipe.cli import cli
+
+        cli.add_command(Command("write", callback=run))
+        command("write")()
+
+    return called
+
+
+def _file(name: str, text: str) -> Run:
+    """Return a command that writes a file by the protocol alone, or finds the same there."""
+
+    def write() -> None:
+        place = Path(name)
+        clear_beside(place)
+        if not place.is_file() or place.read_text() != text:
+            write_text(place, text)
+
+    return _as_command(write)
+
+
+def _directory(name: str, **files: str) -> Run:
+    """Return a command that writes a directory by the protocol alone, or finds the same there."""
+
+    def write() -> None:
+        place = Path(name)
+        clear_beside(place)
+        if not place.is_dir() or {path.name: path.read_text() for path in place.iterdir()} != files:
+            with atomic_directory(place) as half:
+                for file, content in files.items():
+                    write_text(half / file, content)
+
+    return _as_command(write)
+
+
+_RUN = command("ingest", LOG, "--quiet")
+_BUILD = ("build-dataset", *STORE, "--split", f"{INPUTS}/region.geojson", "--quiet")
+_MAP = ("add-map", "site", *LAYERS, "--quiet")
+_LOG, _WORLD, _MODEL = (frozenset({name}) for name in ("log", "world", "model"))
+
+CASES = (
+    Case("a file", _file("one", "1")),
+    Case("a file over another", _file("one", "1"), (_file("one", "0"),)),
+    Case("a directory", _directory("dataset", one="1")),
+    Case("a directory over another", _directory("dataset", one="1", two="2"), (_directory("dataset", one="0"),)),
+    Case("init", command("init")),
+    Case("schemas", command("schemas", "schemas")),
+    Case("simulate", command("simulate", "site", "--scenario", "tiny"), wants=_LOG),
+    Case("export", command("export", LOG, "table"), wants=_LOG),
+    Case("ingest", _RUN, wants=_LOG),
+    Case("ingest --force", command("ingest", LOG, "--force", "--quiet"), (_RUN,), _LOG),
+    Case("ingest, another recipe", command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q"), (_RUN,), _LOG),
+    Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
+    Case("ingest --jobs 2", command("ingest", f"{INPUTS}/logs", "--jobs", "2", "--quiet"), wants=_LOG),
+    Case("report", command("report", "tcpipe-store"), (_RUN,), _LOG),
+    Case("add-map", command(*_MAP), wants=_WORLD),
+    Case("add-map --force", command(*_MAP, "--force"), (command("add-map", "site", *LAYERS[:2], "-q"),), _WORLD),
+    Case("build-dataset", command(*_BUILD), wants=_WORLD),
+    Case("build-dataset over another", command(*_BUILD), (command(*_BUILD, "--seed", "5"),), _WORLD),
+    Case("build-dataset --format parquet", command(*_BUILD, "--format", "parquet"), wants=_WORLD),
+    Case("build-dataset --jobs 2", command(*_BUILD, "--jobs", "2"), wants=_WORLD),
+    Case("train", command("train", DATASET, "--epochs", "2", "--width", "16", "-q"), wants=_MODEL),
+    Case("evaluate", command("evaluate", MODEL, DATASET, "--no-baselines", "--draws", "1", "-q"), wants=_MODEL),
+    Case("cost-map", command("cost-map", MODEL, "costs", "--step", "4", *STORE, "--quiet"), wants=_MODEL),
+    Case(
+        "predict-path",
+        command("predict-path", MODEL, "--path", f"{INPUTS}/path.geojson", "--out", "pieces.csv", *STORE, "--quiet"),
+        wants=_MODEL,
+    ),
+    Case(
+        "plan-path",
+        command("plan-path", MODEL, "--from", FROM, "--to", TO, "--step", "2", "--picture", "plan.png", *STORE, "-q"),
+        wants=_MODEL,
+    ),
+)
+
+
+def make_inputs(place: Path, wanted: set[str]) -> None:
+    """Write the inputs that cases want, and warm what children share: modules, and compiled kernels."""
+    place.mkdir(parents=True)
+    (place.parent / "tmp").mkdir()
+    learning = () if "model" in wanted else ("tcpipe.learning", "tcpipe.dataset.torch")
+    for module in walk_packages(tcpipe.__path__, "tcpipe.") if wanted else ():
+        if not module.name.startswith(("tcpipe.__main__", *learning)):
+            import_module(module.name)
+    if "log" in wanted:
+        _make_logs(place)
+    if wanted & {"world", "model"}:
+        _make_world(place)
+    if "model" in wanted:
+        _make_model(place)
+
+
+def _make_logs(place: Path) -> None:
+    from tcpipe import ingest
+    from tcpipe.simulation import simulate
+
+    (place / "logs").mkdir()
+    for seed, name in ((3, "tiny"), (4, "second")):
+        site = simulate(place / "simulated", scenario="tiny", seed=seed)
+        shutil.copyfile(site.logs[0], place / "logs" / f"{name}.mcap")
+        shutil.rmtree(place / "simulated")
+    (place / "other.toml").write_text("[gate]\nmax_acceleration_mps2 = 0.31\n")
+    ingest([place / "logs" / "tiny.mcap"], store=place / "warm")
+    shutil.rmtree(place / "warm")
+
+
+def _make_world(place: Path) -> None:
+    from synthetic_store import WORLD, box, region_file, small_store
+
+    from tcpipe import build_dataset
+
+    WORLD.write(place, 0.1)
+    region_file(place / "region.geojson", box(-18, -18, 6, 18))
+    small_store(place)
+    build_dataset(place / "dataset", store=place / "store", split=place / "region.geojson")
+
+
+def _make_model(place: Path) -> None:
+    from made_models import CARD, made_model
+
+    from tcpipe.learning.model_card import Seen
+
+    ranges = {"slope_rad": (-0.5, 0.5), "cross_slope_rad": (-0.5, 0.5), "relief_m": (0.0, 1.0)}
+    training = {"config": {"epochs": 1, "width": 16}, "samples": {"fitted": 100, "held out": 20}}
+    made_model(place / "model", seen=Seen(CARD.seen.class_counts | {5: 10}, (4, 5, 6, 7), ranges), training=training)
+    ends = [[float(value) for value in end.split(",")] for end in (FROM, TO)]
+    (place / "path.geojson").write_text(json.dumps({"type": "LineString", "coordinates": ends}))

@@ -1,0 +1,256 @@
+"""One call in a forked child, broken at a chosen step or moment, and what it left on disk.
+
+A step is a moment at which Python is about to change the disk: it opens a file to write (or a directory, to lock or sync it), makes,
+renames or removes something. An audit hook counts them, so every state that a kill can leave between two of them is met once.
+"""
+
+import atexit
+import errno
+import hashlib
+import mmap
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from pathlib import Path
+
+INPUTS = "in"
+"""Directory of a workplace that no call changes."""
+
+LONGEST_S, LATEST_S = 180.0, 5.0
+"""A call that takes longer hangs; one that is asked to end ends as fast."""
+
+WHOLE = (
+    "dataset*", "site", "model", "costs", "tcpipe-store/maps/*.zarr", "tcpipe-store/runs/*/streams",
+    "tcpipe-store/runs/*/[0-9a-f]*",
+)  # fmt: skip
+"""Directories that appear and change as one."""
+
+UNFINISHED = (".tmp-*", "*/.tmp-*", ".*.partial", "*.checkpoint")
+"""What a killed call may leave for the next one: temporaries, and where a cost map and a training stand."""
+
+_CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate"}
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What befalls a call: a signal, or a disk that is full from then on (0), at a step, from 1, or after a time [s]."""
+
+    signal: int
+    step: int = 0
+    after_s: float = 0.0
+
+    def __str__(self) -> str:
+        what = signal.Signals(self.signal).name if self.signal else "disk full"
+        return f"{what} at step {self.step}" if self.step else f"{what} after {self.after_s:.3f} s"
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a call ended; ``code`` as a shell tells it (137 for SIGKILL), ``late_s`` from the fault to the end."""
+
+    code: int
+    said: str
+    steps: int
+    seconds: float
+    late_s: float
+    left_running: bool
+
+
+def call(run: Callable[[], object], work: Path, fault: Fault | None = None) -> Ended:
+    """Run something in ``work`` in a forked child. Import what it needs before: children share it."""
+    counted = memoryview(mmap.mmap(-1, 8)).cast("q")
+    begun = struck = time.monotonic()
+    with tempfile.TemporaryFile() as output:
+        sys.stdout.flush()
+        child = os.fork()
+        if child == 0:
+            _be_the_child(run, work, output.fileno(), counted, fault)
+        if fault and fault.after_s:
+            time.sleep(fault.after_s)
+            os.kill(child, fault.signal)
+            struck = time.monotonic()
+        code = _waited(child, time.monotonic() + LONGEST_S)
+        ended = time.monotonic()
+        left_running = _outlived(child)
+        output.seek(0)
+        said = output.read().decode(errors="replace")
+    return Ended(code, said, counted[0], ended - begun, ended - struck, left_running)
+
+
+def command(*arguments: str) -> Callable[[], object]:
+    """Return the command line with these arguments, to be called."""
+
+    def run() -> None:
+        from tcpipe.cli import main
+
+        sys.argv = ["tcpipe", *arguments]
+        main()
+
+    return run
+
+
+def _be_the_child(
+    run: Callable[[], object], work: Path, output: int, counted: "memoryview[int]", fault: Fault | None
+) -> None:
+    """Become the child: never returns."""
+    code = 70
+    try:
+        os.setsid()
+        os.chdir(work)
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        tempfile.tempdir = os.environ["TMPDIR"] = str(work / "tmp")
+        sys.addaudithook(_hook(work, counted, fault))
+        run()
+        code = 0
+    except SystemExit as done:
+        code = done.code if isinstance(done.code, int) else int(done.code is not None)
+    except BaseException as error:  # noqa: BLE001  a traceback is a finding
+        os.write(2, f"Traceback: {error!r}".encode())
+    finally:
+        atexit._run_exitfuncs()  # noqa: SLF001  os._exit does not
+        with suppress(OSError):
+            sys.stdout.flush()
+        os._exit(code)
+
+
+def _hook(work: Path, counted: "memoryview[int]", fault: Fault | None):
+    """Count steps, and let the fault come at its own."""
+    inside = f"{work}{os.sep}"
+
+    def hook(event: str, args: tuple[object, ...]) -> None:
+        if event in _CHANGES or (event == "open" and _is_change(args, inside)):
+            counted[0] += 1
+            if fault and fault.step and counted[0] >= fault.step:
+                if fault.signal and counted[0] == fault.step:
+                    os.kill(os.getpid(), fault.signal)
+                elif not fault.signal and _takes_room(event, args):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), args[0])
+
+    return hook
+
+
+def _takes_room(event: str, args: tuple[object, ...]) -> bool:
+    return (
+        bool(args[2] & (os.O_WRONLY | os.O_RDWR)) if event == "open" else event in ("os.mkdir", "os.link", "os.symlink")
+    )
+
+
+def _is_change(args: tuple[object, ...], inside: str) -> bool:
+    """Whether an opening is one to write into the workplace, or one of a directory in it."""
+    path, mode, _ = args
+    if not isinstance(path, str | bytes):
+        return False
+    writes = not isinstance(mode, str) or bool(set("wax+") & set(mode))
+    return writes and os.path.join(inside, os.fsdecode(path)).startswith(inside)  # noqa: PTH118
+
+
+def _waited(child: int, deadline: float) -> int:
+    """Return the exit code of a child, as a shell tells it; 124 where it had to be killed for taking too long."""
+    late = False
+    while True:
+        found, status = os.waitpid(child, os.WNOHANG)
+        if found:
+            code = os.waitstatus_to_exitcode(status)
+            return 124 if late else code if code >= 0 else 128 - code
+        if time.monotonic() > deadline and not late:
+            late = True
+            os.killpg(child, signal.SIGKILL)
+        time.sleep(0.002)
+
+
+def _outlived(session: int) -> bool:
+    """Whether processes of a session are there `LATEST_S` after its leader; they are killed then."""
+    deadline = time.monotonic() + LATEST_S
+    while members := _members(session):
+        if time.monotonic() > deadline:
+            for member in members:
+                with suppress(ProcessLookupError):
+                    os.kill(member, signal.SIGKILL)
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def _members(session: int) -> list[int]:
+    found = []
+    for entry in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _, _, of = entry.read_text().rpartition(")")[2].split()[:4]
+            if int(of) == session and state != "Z":
+                found.append(int(entry.parent.name))
+    return found
+
+
+# ---------------------------------------------------------------- what is on disk
+Tree = dict[str, str]
+"""Path below a directory → sha256 of the file, or what else it is."""
+
+
+def tree(root: Path, besides: str = INPUTS) -> Tree:
+    """Return everything below a directory but the inputs."""
+    found: Tree = {}
+    for directory, names, files in os.walk(root):
+        here = Path(directory).relative_to(root)
+        if here == Path():
+            names[:] = [name for name in names if name != besides]
+        found |= {str(here / name): "directory" for name in names}
+        found |= {str(here / name): hashlib.sha256((root / here / name).read_bytes()).hexdigest() for name in files}
+    return found
+
+
+def without_unfinished(found: Tree) -> Tree:
+    """Leave out what waits for the next call."""
+    return {path: what for path, what in found.items() if not _is_unfinished(path)}
+
+
+def _is_unfinished(path: str) -> bool:
+    return any(fnmatch(above, pattern) for above in _with_parents(path) for pattern in UNFINISHED)
+
+
+def _with_parents(path: str) -> list[str]:
+    """Return a path and all above it, from the top."""
+    return [*(str(above) for above in reversed(Path(path).parents) if above != Path()), path]
+
+
+def half_written(before: Tree, after: Tree, now: Tree) -> list[str]:
+    """Name each final path that is neither as before nor as after: a directory of `WHOLE` as one, any other file by itself."""
+    now = without_unfinished(now)
+    states = [_by_unit(found) for found in (before, after, now)]
+    bad = []
+    for unit in sorted(set().union(*states)):
+        old, new, found = (state.get(unit, {}) for state in states)
+        if found not in (old, new) and not _only_a_directory(found):
+            bad.append(f"{unit}: neither as before nor as after")
+        if old and new and not found:
+            bad.append(f"{unit}: gone")
+    return bad
+
+
+def _only_a_directory(found: Tree) -> bool:
+    return set(found.values()) <= {"directory"} and len(found) <= 1
+
+
+def _by_unit(found: Tree) -> dict[str, Tree]:
+    units: dict[str, Tree] = {}
+    for path, what in found.items():
+        units.setdefault(_unit_of(path), {})[path] = what
+    return units
+
+
+def _unit_of(path: str) -> str:
+    for above in _with_parents(path):
+        if any(fnmatch(above, pattern) and above.count(os.sep) == pattern.count(os.sep) for pattern in WHOLE):
+            return above
+    return path
+
+
+def different(one: Tree, other: Tree) -> list[str]:
+    """Name the paths at which two trees differ."""
+    return sorted(path for path in one.keys() | other.keys() if one.get(path) != other.get(path))

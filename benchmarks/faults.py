@@ -1,0 +1,184 @@
+"""What faults leave behind: ``python benchmarks/faults.py kills|signals|full-disk|all``; docs/explanation/faults.md says what is promised.
+
+Every command that writes is broken at its steps (`fault_children`) and at random moments. Then everything it left is looked at, and it is
+called again. The exit code is 1 where something is not as promised. ``--only``, ``--steps`` and ``--times`` make it shorter.
+"""
+
+import argparse
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+os.environ |= {"OMP_NUM_THREADS": "1", "KERAS_BACKEND": "torch"}  # forked children have one thread
+
+from fault_cases import CASES, Case, make_inputs
+from fault_children import INPUTS, LATEST_S, Ended, Fault, Tree, call, different, half_written, tree, without_unfinished
+
+FULL = 0
+STRIKES = {"kills": (signal.SIGKILL,), "signals": (signal.SIGTERM, signal.SIGINT, signal.SIGHUP), "full-disk": (FULL,)}
+PROMISES = """
+false if: a final path is neither whole as before nor whole as after, at the moment of the fault or later; the next identical call does not
+complete, or leaves other bytes than an undisturbed one, or any temporary; a process outlives its command; a command that is asked to end
+(SIGTERM, SIGINT, SIGHUP) takes more than 5 s, exits with another code than 128 + signal, or leaves a temporary; a full disk is told in
+more than plain lines, or leaves a temporary."""
+
+
+@dataclass(frozen=True)
+class Undisturbed:
+    """A case without a fault: what was before and after, how it ends, and how an identical second call does."""
+
+    case: Case
+    state: Path
+    before: Tree
+    after: Tree
+    ended: Ended
+    again: int
+
+
+def undisturbed(case: Case, work: Path) -> Undisturbed:
+    """Run a case twice from the same state: the same bytes, or no comparison means anything."""
+    state = work.parent / "state"
+    _clear(work)
+    for run in case.before:
+        _assert_done(case, call(run, work))
+    shutil.rmtree(state, ignore_errors=True)
+    shutil.copytree(work, state, ignore=lambda at, _: {INPUTS} if at == str(work) else set())
+    before = tree(work)
+    _assert_done(case, call(case.run, work))
+    after = tree(work)
+    again = call(case.run, work)
+    assert not different(after, tree(work)), f"{case.name}: a second call changes {different(after, tree(work))}"
+    _restore(state, work)
+    ended = call(case.run, work)
+    assert not different(after, tree(work)), f"{case.name}: not the same twice: {different(after, tree(work))}"
+    return Undisturbed(case, state, before, after, ended, again.code)
+
+
+def _assert_done(case: Case, ended: Ended) -> None:
+    assert ended.code in (0, 3), f"{case.name}: {ended.code}: {ended.said}"
+
+
+def _clear(work: Path) -> None:
+    for entry in work.iterdir():
+        if entry.name != INPUTS:
+            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
+    (work / "tmp").mkdir()
+
+
+def _restore(state: Path, work: Path) -> None:
+    _clear(work)
+    shutil.copytree(state, work, dirs_exist_ok=True, symlinks=True)
+
+
+def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
+    """Let a fault befall a case, look, call it again, look; return what is not as promised."""
+    _restore(plain.state, work)
+    ended = call(plain.case.run, work, fault)
+    now = tree(work)
+    bad = half_written(plain.before, plain.after, now)
+    bad += ["processes outlive it"] if ended.left_running else []
+    if fault.signal != signal.SIGKILL:
+        bad += _untrue(plain, fault, ended, now)
+        left = [path for path in now.keys() - without_unfinished(now).keys() if ".tmp-" in path]
+        if different(without_unfinished(now), plain.after):  # else it was done, and what it replaced is half gone
+            bad += [f"left: {path}" for path in sorted(left)]
+    again = call(plain.case.run, work)
+    if again.code not in (plain.ended.code, plain.again):
+        bad.append(f"the next call ends with {again.code}: {again.said.strip()[-300:]}")
+    bad += [f"the next call leaves other bytes: {path}" for path in different(plain.after, tree(work))[:3]]
+    return [f"{plain.case.name}, {fault}: {line}" for line in bad]
+
+
+def _untrue(plain: Undisturbed, fault: Fault, ended: Ended, now: Tree) -> Iterator[str]:
+    """Yield what is wrong with how a command ended that was asked to, or met a full disk."""
+    if ended.code == plain.ended.code and (fault.after_s or not fault.signal):  # it was done before
+        yield from ("said to be done, and is not" for _ in different(plain.after, now)[:1])
+        return
+    if "internal error" in ended.said:
+        yield f"not plain: {ended.said.strip()[-300:]}"
+    if fault.signal:
+        if ended.late_s > LATEST_S and fault.after_s:
+            yield f"took {ended.late_s:.1f} s to end"
+        if ended.code != 128 + fault.signal:
+            yield f"ends with {ended.code}, wanted {128 + fault.signal}: {ended.said.strip()[-200:]}"
+    elif ended.code not in (1, 3) or "No space left" not in ended.said:
+        yield f"ends with {ended.code}: {ended.said.strip()[-200:]}"
+
+
+def faults_of(plain: Undisturbed, campaign: str, options: argparse.Namespace) -> Iterator[Fault]:
+    """Yield every step of a case, or ``--steps`` of them, and ``--times`` random moments."""
+    strikes, count, rng = STRIKES[campaign], plain.ended.steps, random.Random(f"{options.seed} {plain.case.name}")
+    every = max(1.0, count / options.steps) if options.steps else 1.0
+    for at in range(int(count / every)):
+        yield Fault(strikes[at % len(strikes)], step=1 + int(at * every))
+    for at in range(options.times if campaign != "full-disk" else 0):
+        yield Fault(strikes[at % len(strikes)], after_s=rng.uniform(0.001, 1.05 * plain.ended.seconds))
+
+
+@contextmanager
+def workplace(wanted: set[str]) -> Iterator[Path]:
+    """Yield a directory in memory, if the system has one, with inputs in it."""
+    memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
+    place = Path(tempfile.mkdtemp(dir=memory, prefix="faults-")).resolve()  # no finalizer: children would run it
+    try:
+        make_inputs(place / "work" / INPUTS, wanted)
+        yield place / "work"
+    finally:
+        shutil.rmtree(place)
+
+
+def run(campaigns: list[str], cases: list[Case], options: argparse.Namespace) -> bool:
+    """Strike every case; print a line for each; return whether all is as promised."""
+    print(
+        f"{'':32} {'steps':>6} {'seconds':>8}" + "".join(f" {name:>10}" for name in campaigns) + "   findings",
+        flush=True,
+    )
+    total = dict.fromkeys(campaigns, 0)
+    findings = 0
+    with workplace(set().union(*(case.wants for case in cases))) as work:
+        inputs = tree(work / INPUTS)
+        for case in cases:
+            plain, wrong = undisturbed(case, work), []
+            counts = dict.fromkeys(campaigns, 0)
+            for name in campaigns:
+                for fault in faults_of(plain, name, options):
+                    counts[name] += 1
+                    wrong += [lines] if (lines := struck(plain, work, fault)) else []
+            columns = "".join(f" {count:10}" for count in counts.values())
+            print(
+                f"{case.name:32} {plain.ended.steps:6} {plain.ended.seconds:8.2f}{columns} {len(wrong):10}", flush=True
+            )
+            for line in [line for lines in wrong for line in lines][: options.shown]:
+                print(f"    {line}", flush=True)
+            total = {name: total[name] + counts[name] for name in campaigns}
+            findings += len(wrong)
+        changed = different(inputs, tree(work / INPUTS))
+    print(f"{'together':32} {'':6} {'':8}" + "".join(f" {count:10}" for count in total.values()) + f" {findings:10}")
+    print(*(f"an input was changed: {path}" for path in changed), PROMISES, sep="\n")
+    return not findings and not changed
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("campaign", choices=[*STRIKES, "all"])
+    parser.add_argument("--only", default="", help="these calls alone, by commas")
+    parser.add_argument("--steps", type=int, default=0, help="at most so many steps of each call (0: every one)")
+    parser.add_argument("--times", type=int, default=15, help="so many random moments of each call")
+    parser.add_argument("--seed", type=int, default=1, help="of the random moments")
+    parser.add_argument("--shown", type=int, default=5, help="findings shown of each call")
+    options = parser.parse_args()
+    only = options.only.split(",") if options.only else [case.name for case in CASES]
+    cases = [case for case in CASES if case.name in only]
+    campaigns = list(STRIKES) if options.campaign == "all" else [options.campaign]
+    return 0 if run(campaigns, cases, options) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
