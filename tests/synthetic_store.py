@@ -82,7 +82,7 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
     return LABELLED_SEGMENTS.table(**given, **rest)
 
 
-def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None):
+def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None):
     """Put a run with these segments into the store, as ingestion would."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
@@ -91,7 +91,11 @@ def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None):
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
     ledger_m = ledger_m or {"kept": metres, "standing": 0.0, "accelerating": 2.5}
     store.write_run_json(
-        run_id, {"source": {"paths": [f"/logs/{run_id}.mcap"], "size_bytes": 1, "sha256": sha256 or run_id}}
+        run_id,
+        {
+            "source": {"paths": [f"/logs/{run_id}.mcap"], "size_bytes": 1, "sha256": sha256 or run_id},
+            "sensors": sensors or {},
+        },
     )
     store.write_run(
         run_id,
