@@ -3,7 +3,8 @@
 ::
 
     <root>/
-      sources.json                             sha256 of every log seen, by path, size and modification time
+      records/logs/<path>/<fact>.json          logs seen: sizes, times, sha256
+      records/<kind>/<fact>.json               what else is remembered: failed, damaged, accepted, superseded
       maps/<name>.zarr
       runs/<run_id>/run.json                   source, robot, tags, topics, damage
       runs/<run_id>/streams/<role>.parquet     L1, and checksums.json
@@ -18,7 +19,7 @@ import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +27,9 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
-from tcpipe.formats.json_files import read_json
+from tcpipe.formats.json_files import digest
 from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.record_files import put_record, read_record, read_records, record_name
 from tcpipe.formats.seals import CHECKSUMS, checksums_to_json, prove_files, read_sealed, write_checksums, write_sealed
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -51,6 +53,12 @@ _MANIFEST = {
 }  # fmt: skip
 _RUN = {"source": {"paths": [str], "sha256": str}}
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
+_SIGNS = ("runs/*/run.json", "maps/*.zarr", "records/logs/*/*.json", "records/failed/*.json")
+"""Of these a store has at least one."""
+
+_NAME_HEX = 8
+"""So many digits of its log's sha256 stand in a run's name, more where two recordings of one name share them."""
+
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -110,6 +118,8 @@ class Ingestions:
     """By run, of those that are finished in other data-model versions only: the last."""
     damaged: Mapping[Path, str]
     """By directory of an ingestion: what is not as it was written."""
+    superseded: Mapping[str, str] = field(default_factory=dict)
+    """Runs whose log was completed or repaired, which are in none of the others, and the run that took their place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +130,7 @@ class Store:
 
     def clear(self) -> None:
         """Put in order what killed commands left anywhere in the store."""
-        for directory in (self.root, self.root / "maps", self.runs_path):
+        for directory in (self.root, self.root / "maps", self.runs_path, self.records_path):
             clear(directory)
         for run_id in self.run_ids():
             clear(self.runs_path / run_id)
@@ -143,7 +153,7 @@ class Store:
         return sorted(path.stem for path in self.root.glob("maps/*.zarr") if not path.name.startswith(TEMPORARY_PREFIX))
 
     def runs(self) -> list[RunDirectory]:
-        """Return every finished ingestion of this data-model version, by run and recipe."""
+        """Return every finished ingestion of this data-model version, by run and recipe, that is not superseded."""
         return list(self.ingestions().finished)
 
     def recipes_of(self, run_id: str) -> list[RunDirectory]:
@@ -152,8 +162,11 @@ class Store:
 
     def ingestions(self, run_id: str | None = None) -> Ingestions:
         """Return what there is of all runs, or of one; every manifest is read once, and proved."""
+        superseded = self.superseded() if run_id is None else {}
         finished, others, damaged = list[RunDirectory](), dict[str, RunDirectory](), dict[Path, str]()
-        for name in self.run_ids() if run_id is None else [run_id]:
+        for name in [run_id] if run_id is not None else self.run_ids():
+            if name in superseded:
+                continue
             for path in sorted((self.runs_path / name).glob("*/")):
                 if path.name == "streams" or path.name.startswith(TEMPORARY_PREFIX):
                     continue
@@ -167,7 +180,21 @@ class Store:
                 else:
                     others[name] = run
         current = {run.run_id for run in finished}
-        return Ingestions(tuple(finished), {name: run for name, run in others.items() if name not in current}, damaged)
+        outdated = {name: run for name, run in others.items() if name not in current}
+        return Ingestions(tuple(finished), outdated, damaged, superseded)
+
+    def superseded(self) -> dict[str, str]:
+        """Return the runs whose log was completed or repaired, and by which run."""
+        latest: dict[str, Mapping[str, Any]] = {}
+        for record in sorted(self.records("superseded"), key=lambda record: (record["number"], record["by"] is None)):
+            latest[record["run_id"]] = record
+        return {run_id: record["by"] for run_id, record in latest.items() if record["by"] is not None}
+
+    def supersede(self, run_id: str, by: str | None) -> None:
+        """Remember that another run takes this one's place, or, without ``by``, that it counts again."""
+        number = sum(record["run_id"] == run_id for record in self.records("superseded"))
+        fact = {"run_id": run_id, "by": by, "number": number}
+        self.remember(f"superseded/{record_name(digest(fact))}", fact)
 
     def run_ids(self) -> list[str]:
         """Return the names of all runs, finished or not."""
@@ -182,7 +209,7 @@ class Store:
         """
         self.runs_path.mkdir(parents=True, exist_ok=True)
         with exclusive(self.runs_path):
-            run_id = next(self._runs_of(sha256), f"{stem}-{sha256[:8]}")
+            run_id = next(self._runs_of(sha256), None) or self._free_name(stem, sha256)
             (self.runs_path / run_id).mkdir(exist_ok=True)
         try:
             yield run_id
@@ -192,10 +219,30 @@ class Store:
             raise
 
     def _runs_of(self, sha256: str) -> Iterator[str]:
-        for path in sorted(self.runs_path.glob(f"*-{sha256[:8]}")):
-            known = self.run_json(path.name)
-            if known is None or known["source"]["sha256"] == sha256:
+        for path in sorted(self.runs_path.glob(f"*-{sha256[:_NAME_HEX]}*")):
+            known, end = self.run_json(path.name), f"-{sha256[:_NAME_HEX]}"
+            if path.name.endswith(end) if known is None else known["source"]["sha256"] == sha256:
                 yield path.name
+
+    def _free_name(self, stem: str, sha256: str) -> str:
+        """Return a new run's name: as much of its hash as tells it from another recording of the same name."""
+        names = [f"{stem}-{sha256[:length]}" for length in range(_NAME_HEX, len(sha256), 4)]
+        return next((name for name in names if not (self.runs_path / name).exists()), f"{stem}-{sha256}")
+
+    def run_ids_by_hash(self) -> dict[str, list[str]]:
+        """Return the names of all runs by what of their log's sha256 stands in them."""
+        found: dict[str, list[str]] = {}
+        for run_id in self.run_ids():
+            add_by_hash(found, run_id)
+        return found
+
+    def run_of(self, sha256: str, among: Mapping[str, Sequence[str]]) -> str | None:
+        """Return the run of a recording, among `run_ids_by_hash`; None where there is none."""
+        for run_id in among.get(sha256[:_NAME_HEX], ()):
+            known = self.run_json(run_id)
+            if known is not None and known["source"]["sha256"] == sha256:
+                return run_id
+        return None
 
     def tag_run(self, run_id: str, tags: Mapping[str, str]) -> None:
         """Set the tags of a run, under every recipe."""
@@ -220,17 +267,22 @@ class Store:
         """Write what is known of a run's log."""
         write_sealed(self.runs_path / run_id / "run.json", values)
 
-    def sources(self) -> dict[str, Any]:
-        """Return the logs seen so far: path → size, modification time, sha256."""
-        path = self.root / "sources.json"
-        return read_json(path) if path.exists() else {}
+    @property
+    def records_path(self) -> Path:
+        """Directory of what is remembered."""
+        return self.root / "records"
 
-    def remember_source(self, key: str, source: Mapping[str, Any]) -> None:
-        """Remember a log, beside those that other processes remember meanwhile."""
-        with exclusive(self.root):
-            known = self.sources()
-            if known.get(key) != source:
-                write_sealed(self.root / "sources.json", {**known, key: source})
+    def remember(self, name: str, fact: Mapping[str, Any]) -> bool:
+        """Remember a fact under ``<kind>/<name>`` for good; return whether it was new."""
+        return put_record(self.records_path, name, fact)
+
+    def recall(self, name: str) -> dict[str, Any] | None:
+        """Return what is remembered under ``<kind>/<name>``, None where nothing is."""
+        return read_record(self.records_path, name)
+
+    def records(self, kind: str) -> list[dict[str, Any]]:
+        """Return everything of a kind that is remembered, by name."""
+        return list(read_records(self.records_path, kind))
 
     def write_streams(self, run_id: str, streams: Streams, *, key: str) -> None:
         """Write L1 whole or not at all; ``key`` names the read settings they were made with."""
@@ -321,9 +373,14 @@ def _ingestion(path: Path) -> RunDirectory:
     return run
 
 
+def add_by_hash(runs: dict[str, list[str]], run_id: str) -> None:
+    """Add a new run to `Store.run_ids_by_hash`."""
+    runs.setdefault(run_id.rpartition("-")[2][:_NAME_HEX], []).append(run_id)
+
+
 def is_store(path: Path) -> bool:
-    """Tell whether a directory is a store: it holds runs or maps."""
-    return any(path.glob("runs/*/run.json")) or any(path.glob("maps/*.zarr")) or (path / "sources.json").is_file()
+    """Tell whether a directory is a store: it holds runs, maps or records."""
+    return any(next(path.glob(pattern), None) for pattern in _SIGNS)
 
 
 def run_at(path: Path) -> tuple[Store, list[RunDirectory]] | None:

@@ -14,6 +14,7 @@ from typing import NoReturn
 import click
 
 from tcpipe import __version__
+from tcpipe.cli.accept import accept
 from tcpipe.cli.add_map import add_map
 from tcpipe.cli.build_dataset import build_dataset
 from tcpipe.cli.cost_map import cost_map
@@ -66,6 +67,7 @@ for command in (
     init,
     inspect,
     ingest,
+    accept,
     add_map,
     build_dataset,
     train,

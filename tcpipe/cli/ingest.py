@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import json_option, msgdef_option, quiet_option, recipe_option, store_option, tag_values
+from tcpipe.cli.options import (
+    duration_value,
+    msgdef_option,
+    quiet_option,
+    recipe_option,
+    shard_value,
+    store_option,
+    tag_values,
+)
 from tcpipe.errors import plain_line
 
 if TYPE_CHECKING:
@@ -29,8 +38,24 @@ if TYPE_CHECKING:
 @click.option("--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help="Logs side by side.")
 @click.option("--as-one", is_flag=True, help="All logs are parts of one drive (splits; power logged apart).")
 @msgdef_option
-@click.option("--force", is_flag=True, help="Do again what is there already.")
-@json_option
+@click.option(
+    "--shard",
+    metavar="I/N",
+    callback=shard_value,
+    help="Only the I-th of N shares of the logs: one for each task of an array.",
+)
+@click.option(
+    "--min-age",
+    "min_age_s",
+    default="0",
+    show_default=True,
+    metavar="T",
+    callback=duration_value,
+    help="A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.",
+)
+@click.option("--retry-failed", is_flag=True, help="Try again what is known to fail.")
+@click.option("--force", is_flag=True, help="Do again what is there already, and what is known to fail.")
+@click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
 @quiet_option
 def ingest(
     logs: tuple[str, ...],
@@ -42,6 +67,9 @@ def ingest(
     jobs: int,
     as_one: bool,
     msgdef: str | None,
+    shard: tuple[int, int] | None,
+    min_age_s: float,
+    retry_failed: bool,
     force: bool,
     as_json: bool,
     quiet: bool,
@@ -49,9 +77,13 @@ def ingest(
     """Read logs, fuse the sensors, gate, cut into 1 m segments, and label each with power, velocity, time and energy.
 
     A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, or a folder of such, searched downward, or the s3:// URL of
-    one. What is in the store already (same content, same recipe) is left alone.
+    one. What is in the store already (same content, same recipe) is left alone, and what failed for its content is not
+    tried again. A line is printed as each log ends.
+
+    Exit code 3: some logs failed or are damaged, and that is news: it was not told before, and not accepted (tcpipe
+    accept).
     """
-    from tcpipe.cli.output import print_json, progress, ruling_recipe, say
+    from tcpipe.cli.output import print_json_line, progress, ruling_recipe, say
     from tcpipe.pipeline.ingest import ingest as run
 
     ruling, source = ruling_recipe(recipe)
@@ -61,7 +93,11 @@ def ingest(
 
         def on_result(result: IngestResult) -> None:
             shown.step()
-            for problem in result.problems:
+            if as_json:
+                print_json_line({**asdict(result), "kind": "log", "is_news": result.is_news})
+            else:
+                _print_one(result)
+            for problem in result.problems if result.is_news else ():
                 shown.problem(problem)
             if result.traceback and click.get_current_context().find_root().params["debug"]:
                 shown.problem(*result.traceback.splitlines())
@@ -74,49 +110,76 @@ def ingest(
             tags=tags,
             jobs=jobs,
             force=force,
+            retry_failed=retry_failed,
             as_one=as_one,
+            shard=shard,
+            min_age_s=min_age_s,
             message_definitions=Path(msgdef) if msgdef else None,
             on_found=shown.expect,
             on_result=on_result,
         )
     if as_json:
         made = str(summary.store) if summary.store.is_dir() else None
-        print_json({"recipe": source, "store": made, "exit_code": summary.exit_code, "results": summary.results})
+        of_all = {"recipe": source, "store": made, "exit_code": summary.exit_code, "results": summary.results}
+        print_json_line({**of_all, "kind": "summary"})
     else:
-        _print(summary)
+        _print_sum(summary)
     return summary.exit_code
 
 
-def _print(summary: IngestSummary) -> None:
+def _print_one(result: IngestResult) -> None:
     from tcpipe.cost.budget import in_words
 
-    for result in summary.results:
-        if result.status == "failed":
-            click.echo(f"failed     {result.log}")
-            continue
+    aside = " (accepted)" if result.accepted else ""
+    if result.status in ("failed", "waiting"):
+        known = " (known, not tried again)" if result.known else ""
+        click.echo(f"{result.status:<10} {plain_line(result.log)}{aside or known}")
+    else:
+        known = " (damaged, known)" if result.damage and not result.is_news else ""
         click.echo(
             f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
-            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}"
+            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{aside or known}"
         )
-        if result.same_as:
-            click.echo(f"  {result.log} is the same recording as {plain_line(result.same_as)}: one run")
-        if result.energy_budget is not None and result.status != "unchanged":
-            click.echo(f"  {in_words(result.energy_budget)}")
-        for damage in result.damage:
-            click.echo(f"  damage:  {plain_line(damage)}")
-        if result.status != "unchanged":
-            for warning in result.warnings:
-                click.echo(f"  warning: {plain_line(warning)}")
-    count = {
-        status: sum(r.status == status for r in summary.results)
-        for status in ("done", "unchanged", "damaged", "failed")
-    }
+    if result.same_as:
+        click.echo(f"  {plain_line(result.log)} is the same recording as {plain_line(result.same_as)}: one run")
+    if result.energy_budget is not None and result.status != "unchanged":
+        click.echo(f"  {in_words(result.energy_budget)}")
+    for note in result.notes:
+        click.echo(f"  {plain_line(note)}")
+    for damage in result.damage if result.is_news or result.status == "damaged" else ():
+        click.echo(f"  damage:  {plain_line(damage)}")
+    for warning in result.warnings if result.status != "unchanged" else ():
+        click.echo(f"  warning: {plain_line(warning)}")
+
+
+def _print_sum(summary: IngestSummary) -> None:
     number = len(summary.results)
-    if count["unchanged"] == number:
-        click.echo(f"nothing to do: {number} of {number} logs are in {summary.store} already")
-        return
-    if count["failed"] == number:
+    old = [result for result in summary.results if result.status == "failed" and not result.is_news]
+    count = {
+        status: sum(r.status == status for r in summary.results) - (len(old) if status == "failed" else 0)
+        for status in ("done", "unchanged", "damaged", "failed", "waiting")
+    }
+    if not number:
+        click.echo("nothing to do: this shard holds none of the logs")
+    elif count["unchanged"] + len(old) == number:
+        click.echo(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
+    elif count["failed"] == number:
         click.echo(f"no run came into {summary.store}: {number} of {number} logs failed")
-        return
-    said = ", ".join(f"{of} {status}" for status, of in count.items() if of)
-    click.echo(f"{summary.store}: {said}")
+    else:
+        said = ", ".join(f"{of} {status}" for status, of in count.items() if of)
+        click.echo(f"{summary.store}: {said}")
+    _print_known(summary)
+
+
+def _print_known(summary: IngestSummary) -> None:
+    """Count what is wrong and no news."""
+    accepted = sum(result.accepted for result in summary.results)
+    known = [result for result in summary.results if result.known and not result.accepted]
+    failed = sum(result.status == "failed" for result in known)
+    if failed:
+        tried = "tries them" if failed > 1 else "tries it"
+        click.echo(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
+    if len(known) > failed:
+        click.echo(f"{len(known) - failed} with known damage; 'tcpipe accept RUN' when it has been looked at")
+    if accepted:
+        click.echo(f"{accepted} with accepted trouble")

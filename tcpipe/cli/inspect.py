@@ -169,6 +169,8 @@ def _print_store(found: Mapping[str, Any]) -> None:
         say(f"of another data model ({version}): {run_id}; ingest its log again")
     for line in found["damaged_runs"].values():
         say(f"damaged: {line}")
+    for run_id, by in found["superseded"].items():
+        say(f"superseded by {by}: {run_id}; its log was completed or repaired")
     for run_id in found["unfinished"]:
         say(f"not finished: {run_id}; ingest its log again")
 

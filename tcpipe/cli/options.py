@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -57,6 +58,33 @@ def map_option(function: Command) -> Command:
     return click.option(
         "--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store)."
     )(function)
+
+
+_SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
+_MOST_SHARDS = 100_000
+
+
+def duration_value(context: click.Context, parameter: click.Parameter, value: str) -> float:
+    """Turn ``90``, ``90s``, ``10m``, ``2h``, ``1d`` into seconds."""
+    found = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*([smhd]?)", value.strip())
+    if found is None:
+        raise click.BadParameter(f"{value!r}: wanted a time: 90 or 90s, 10m, 2h, 1d", ctx=context, param=parameter)
+    return float(found[1]) * _SECONDS[found[2]]
+
+
+def shard_value(context: click.Context, parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    """Turn ``I/N`` into two numbers, I from 1 to N."""
+    if value is None:
+        return None
+    found = re.fullmatch(r"(\d{1,6})/(\d{1,6})", value.strip())
+    index, count = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not 1 <= index <= count <= _MOST_SHARDS:
+        raise click.BadParameter(
+            f"{value!r}: wanted I/N, I from 1 to N, N at most {_MOST_SHARDS}, for example 1/8",
+            ctx=context,
+            param=parameter,
+        )
+    return index, count
 
 
 def tag_values(context: click.Context, parameter: click.Parameter, values: tuple[str, ...]) -> dict[str, str]:

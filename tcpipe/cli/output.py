@@ -51,7 +51,7 @@ class Progress:
             from rich.console import Console
             from rich.progress import Progress as Bar
 
-            self._bar = Bar(console=Console(stderr=True), transient=True)
+            self._bar = Bar(console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
             self._task = self._bar.add_task(what, total=total)
 
     def __enter__(self) -> Self:
@@ -127,3 +127,10 @@ def print_json(value: Any) -> None:
     from tcpipe.formats.json_files import to_json
 
     click.echo(to_json(value), nl=False)
+
+
+def print_json_line(value: Any) -> None:
+    """Print one JSON object on one line of stdout."""
+    from tcpipe.formats.json_files import to_json_line
+
+    click.echo(to_json_line(value))

@@ -105,6 +105,36 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+def put_file(path: Path, text: str, *, staging: Path) -> bool:
+    """Write a text file where there is none; of several writers the first wins. Return whether this one did.
+
+    ``staging`` is a directory of the same file system, above ``path``: what a killed process leaves behind lies there, and goes with the
+    next call.
+    """
+    with _told(path), _parents_of(path) as place, _holder_beside(Path(os.path.realpath(staging), "new")) as holder:
+        temporary = holder / "new"
+        _write_synced(os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666), text)
+        try:
+            os.link(temporary, place)
+        except FileExistsError:
+            return False
+        except OSError:  # a file system without hard links: whoever creates it
+            try:
+                descriptor = os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+            except FileExistsError:
+                return False
+            _write_synced(descriptor, text)
+        _sync_directory(place.parent)
+    return True
+
+
+def _write_synced(descriptor: int, text: str) -> None:
+    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
 @contextmanager
 def exclusive(directory: Path) -> Iterator[None]:
     """Let one process at a time through, by a lock on ``directory``; where the file system has no locks, all."""

@@ -41,6 +41,12 @@ def to_json(value: Any) -> str:
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
+def to_json_line(value: Any) -> str:
+    """Return the same on one line, without an end."""
+    text = json.dumps(plain(value), sort_keys=True, ensure_ascii=False, allow_nan=False)
+    return text.encode("utf-8", "backslashreplace").decode("utf-8")
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write ``value`` as canonical JSON, whole or not at all; `StoreError` where it is too large to be read again."""
     text = to_json(value)

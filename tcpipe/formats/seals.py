@@ -33,8 +33,13 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 
 def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
     """Write a JSON object with a seal, whole or not at all."""
+    write_json(path, sealed(value))
+
+
+def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a JSON object with its seal."""
     bare = {key: item for key, item in plain(value).items() if key != SEAL}
-    write_json(path, {**bare, SEAL: digest(bare)})
+    return {**bare, SEAL: digest(bare)}
 
 
 def read_sealed(

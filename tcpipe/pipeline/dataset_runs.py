@@ -57,12 +57,18 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     others = [run for run in others if _belongs(run.manifest, robot, tags)]
     left_out = {*damaged, *(run.run_id for run in others)}
     total = len({run.run_id for run in runs} | left_out)
-    seen = {run.run_id for run in (*found.finished, *found.outdated.values())} | {
-        path.parent.name for path in found.damaged
-    }
+    seen = (
+        found.superseded.keys()
+        | {run.run_id for run in (*found.finished, *found.outdated.values())}
+        | {path.parent.name for path in found.damaged}
+    )
     unfinished = set(store.run_ids()) - seen
-    warnings = (f"no ingestion of {_named(unfinished)} has finished; ingest again",) if unfinished else ()
-    return Chosen(tuple(runs), logs, tuple(_missing(store, others, total)), lines, frozenset(left_out), warnings)
+    warnings = [f"no ingestion of {_named(unfinished)} has finished; ingest again"] if unfinished else []
+    if found.superseded:
+        warnings.append(
+            f"superseded, since their logs were completed or repaired: {_named(found.superseded)}; left out"
+        )
+    return Chosen(tuple(runs), logs, tuple(_missing(store, others, total)), lines, frozenset(left_out), tuple(warnings))
 
 
 def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:

@@ -3,30 +3,51 @@
 from __future__ import annotations
 
 import logging
+import shutil
 import tempfile
+import time
 import traceback
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, TcpipeError, UsageError, plain_line
+from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.joined_log import open_logs
-from tcpipe.formats.json_files import plain
+from tcpipe.formats.json_files import digest, plain
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, read_key, recipe_id
+from tcpipe.formats.record_files import record_name
 from tcpipe.logs.profiles import ROBOTS, Robot
-from tcpipe.pipeline.log_sources import LogSource, definitions_key, find_sources, in_turns, on_this_machine, with_hashes
+from tcpipe.pipeline.known_trouble import Trouble, failure_name, failure_record
+from tcpipe.pipeline.log_sources import (
+    FoundLogs,
+    LogSource,
+    definitions_key,
+    find_sources,
+    in_shard,
+    in_turns,
+    on_this_machine,
+    with_hashes,
+)
+from tcpipe.pipeline.supersession import remember_earlier, superseded_by
+from tcpipe.pipeline.transience import is_transient
 from tcpipe.recipe import IngestSections, Recipe
-from tcpipe.store import RunDirectory, Store, open_store
+from tcpipe.store import RunDirectory, Store, add_by_hash, open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GatedTrack, LabelledSegments, Streams, Track
+
+R = TypeVar("R")
 
 logger = logging.getLogger("tcpipe")
 
-Status = Literal["done", "unchanged", "damaged", "failed"]
+_NO_LOGS = "no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them"
+
+Status = Literal["done", "unchanged", "damaged", "failed", "waiting"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +62,16 @@ class IngestTask:
     force: bool
     message_definitions: Path | None = None
     """A directory of .msg files for types that the log does not define."""
+    definitions: str = ""
+    """Their `definitions_key`."""
+    retry_failed: bool = False
+    min_age_s: float = 0.0
+
+    @property
+    def failure(self) -> str:
+        """The name of the record that this fails, should it fail for what the log's content is."""
+        key, content = ingest_key(self.recipe), self.source.sha256 or self.source.files_digest
+        return failure_name(content, ingest_key=key, robot=self.robot, definitions=self.definitions)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +94,21 @@ class IngestResult:
     same_as: str | None = None
     """The log from which the same recording was ingested before, under another path; it is one run."""
     sha256: str | None = None
+    notes: tuple[str, ...] = ()
+    """What else is to be said: why it waits, which runs it supersedes."""
+    transient: bool = False
+    """Whether it failed for what may pass: a full disk, a killed worker."""
+    known: bool = False
+    """Whether it failed before and was not tried again, or its damage was told before."""
+    accepted: bool = False
+    """Whether a person has accepted what is wrong with it (`tcpipe accept`)."""
     traceback: str | None = None
     """Where an internal error comes from."""
+
+    @property
+    def is_news(self) -> bool:
+        """Whether something is wrong that nobody was told before, or accepted."""
+        return (self.status == "failed" or bool(self.damage)) and not self.known and not self.accepted
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +120,8 @@ class IngestSummary:
 
     @property
     def exit_code(self) -> int:
-        """0 all whole, 1 all failed, 3 some failed or are damaged; the same for a second call that finds everything done."""
-        if not any(result.status == "failed" or result.damage for result in self.results):
+        """0 nothing is wrong, or nothing that is news; 1 all failed; 3 some failed or are damaged."""
+        if not any(result.is_news for result in self.results):
             return 0
         return 1 if all(result.status == "failed" for result in self.results) else 3
 
@@ -91,7 +135,10 @@ def ingest(
     tags: Mapping[str, str] | None = None,
     jobs: int = 1,
     force: bool = False,
+    retry_failed: bool = False,
     as_one: bool = False,
+    shard: tuple[int, int] | None = None,
+    min_age_s: float = 0.0,
     message_definitions: Path | None = None,
     on_found: Callable[[int], None] | None = None,
     on_result: Callable[[IngestResult], None] | None = None,
@@ -107,8 +154,16 @@ def ingest(
         A `Recipe`, a path to one, or None for the one that rules here (``TCPIPE_RECIPE``, nearest tcpipe.toml, defaults).
     robot
         Profile; None takes the recipe's, or finds it by message types.
+    force
+        Do again what is there already, and what is known to fail.
+    retry_failed
+        Try again what is known to fail.
     as_one
         All logs are parts of one drive.
+    shard
+        ``(i, n)``: only the i-th of n shares of the logs, i from 1.
+    min_age_s
+        A log that was written since so many seconds waits for another call.
     message_definitions
         A directory of .msg or .idl files for types that the logs do not define.
     on_found
@@ -119,7 +174,7 @@ def ingest(
     Raises
     ------
     LogError, StoreError, RecipeError, UsageError
-        When nothing can be begun; what goes wrong with one log stands in its result.
+        When nothing can be begun; what goes wrong with one log or path stands in its result.
 
     """
     ruling = recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(_as_path(recipe), Path.cwd()))
@@ -128,26 +183,109 @@ def ingest(
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(ROBOTS))}")
     with _place_for_stand_ins(logs := list(logs)) as staging, _gone_if_empty(Path(store)):
         found = find_sources(logs, as_one=as_one, staging=Path(staging))
+        if not found.sources:
+            raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         house = open_store(store, create=True)
+        remember_earlier(house)
+        mine = found.sources if shard is None else in_shard(found.sources, shard)
+        common = (house.root, ruling, robot, dict(tags or {}), force, message_definitions)
+        how = (definitions_key(message_definitions), retry_failed, min_age_s)
+        sources = with_hashes(mine, (lambda _: []) if force else house.records)
+        tasks = [IngestTask(source, *common, *how) for source in sources]
         if on_found:
-            on_found(len(found))
-        sources = with_hashes(found, house.sources())
-        results: dict[int, IngestResult] = {}
-        for turn in in_turns(sources):
-            tasks = [
-                IngestTask(sources[index], house.root, ruling, robot, dict(tags or {}), force, message_definitions)
-                for index in turn
-            ]
-            with closing(run_all(ingest_one, tasks, jobs=jobs)) as outcomes:
-                for outcome in outcomes:
-                    task = tasks[outcome.index]
-                    result = results[turn[outcome.index]] = outcome.result or _died(task.source)
-                    if result.sha256:
-                        files = [list(file) for file in task.source.files]
-                        house.remember_source(task.source.key, {"size_and_time": files, "sha256": result.sha256})
-                    if on_result:
-                        on_result(result)
-        return IngestSummary(house.root, tuple(results[index] for index in range(len(sources))))
+            on_found(len(tasks) + len(found.problems))
+        results = {}
+        for index, source, result in _results(house, tasks, found, jobs):
+            results[index] = result
+            if on_result:
+                on_result(result)
+            if source is not None:
+                _remember(house, tasks[index], source, result)
+        return IngestSummary(house.root, tuple(results[index] for index in sorted(results)))
+
+
+def _results(
+    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, jobs: int
+) -> Iterator[tuple[int, LogSource | None, IngestResult]]:
+    """Yield what became of each path that holds no log, and of each log as it ends, by its place; what needs no work is told first."""
+    for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
+        yield index, None, IngestResult(plain_line(path), "failed", problems=lines, transient=True)
+    runs = store.run_ids_by_hash()
+    for turn in in_turns([task.source for task in tasks]):
+        todo = []
+        for index in turn:
+            result = _told(tasks[index], partial(_without_work, runs=runs))
+            if result is None:
+                todo.append(index)
+            else:
+                yield index, tasks[index].source, _judged(store, tasks[index].source, result, runs)
+        with closing(run_all(ingest_one, [tasks[index] for index in todo], jobs=jobs)) as outcomes:
+            for outcome in outcomes:
+                task = tasks[todo[outcome.index]]
+                source, result = outcome.result or (task.source, _died(task.source))
+                yield todo[outcome.index], source, _judged(store, source, result, runs)
+
+
+def _without_work(task: IngestTask, *, runs: Mapping[str, Sequence[str]]) -> IngestResult | None:
+    """Return the result of a log that is in the store, is known to fail, or has to wait; None where there is something to do."""
+    store, source = Store(task.store), task.source
+    run_id = store.run_of(source.sha256, runs) if source.sha256 and not task.force else None
+    finished = _finished(store, run_id, task) if run_id else None
+    if run_id and finished:
+        same_as = _twin(store, run_id, source)
+        return _result(source, _retagged(store, run_id, task), finished, str(source.sha256), same_as=same_as)
+    failed = None if task.force or task.retry_failed else store.recall(task.failure)
+    if failed is not None:
+        return IngestResult(source.name, "failed", problems=tuple(failed["lines"]), sha256=source.sha256, known=True)
+    return _too_young(task)
+
+
+def _too_young(task: IngestTask) -> IngestResult | None:
+    age_s = (time.time_ns() - task.source.youngest_ns) / 1e9
+    if not task.source.files or age_s >= task.min_age_s or not task.min_age_s:
+        return None
+    note = f"it was written {max(age_s, 0.0):.0f} s ago; it is ingested when it is {task.min_age_s:g} s old"
+    return IngestResult(task.source.name, "waiting", notes=(note,))
+
+
+def _judged(store: Store, source: LogSource, result: IngestResult, runs: dict[str, list[str]]) -> IngestResult:
+    """Return a result with what the store says of it: whether its trouble is news, and which runs it supersedes."""
+    notes = result.notes
+    if result.run_id and result.sha256:
+        if store.run_of(result.sha256, runs) is None:
+            add_by_hash(runs, result.run_id)
+        try:
+            notes += tuple(superseded_by(store, source, result.run_id, result.sha256, runs))
+        except StoreError as error:
+            notes += error.problems
+    trouble = _trouble(source, result)
+    if trouble is None:
+        return replace(result, notes=notes)
+    known = result.known or (trouble.kind == "damaged" and trouble.is_told(store))
+    return replace(result, notes=notes, known=known, accepted=trouble.is_accepted(store))
+
+
+def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
+    content = result.sha256 or source.files_digest
+    if result.status == "failed":
+        return Trouble("failed", content, result.problems, source.origins)
+    return Trouble("damaged", content, result.damage, source.origins, result.run_id) if result.damage else None
+
+
+def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult) -> None:
+    """Remember what a log holds, and what is wrong with that; where it cannot be written it is told again the next time."""
+    trouble = _trouble(source, result)
+    try:
+        if result.sha256 and source.files:
+            sighting = source.sighting(result.sha256)
+            store.remember(f"{source.lineage}/{record_name(digest(sighting))}", sighting)
+        if trouble is not None and trouble.kind == "damaged":
+            trouble.told(store)
+        elif trouble is not None and not result.transient and not result.known:
+            task = replace(task, source=replace(source, sha256=result.sha256))
+            store.remember(task.failure, failure_record(trouble))
+    except StoreError as error:
+        logger.error("%s", error)  # noqa: TRY400  one line
 
 
 def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[str]:
@@ -158,33 +296,53 @@ def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[s
 
 @contextmanager
 def _gone_if_empty(store: Path) -> Iterator[None]:
-    """Remove directories that were made for the store when nothing came into it."""
+    """Remove what was made for the store when no run came into it, what is remembered of failures too."""
     made = [path for path in (store, *store.absolute().parents) if not path.exists()]
     try:
         yield
     finally:
-        for path in (store / "runs", *made) if made else ():
-            with suppress(OSError):
-                path.rmdir()
+        if made and not any(store.glob("runs/*")):
+            shutil.rmtree(store / "records", ignore_errors=True)
+            for path in (store / "runs", *made):
+                with suppress(OSError):
+                    path.rmdir()
 
 
-def ingest_one(task: IngestTask) -> IngestResult:
-    """Ingest one run; every error becomes its result, so that one log never costs the others."""
-    name = task.source.name
+def ingest_one(task: IngestTask) -> tuple[LogSource, IngestResult]:
+    """Ingest one run from its log as that is now; every error becomes its result, so that one log never costs the others."""
+    task = replace(task, source=task.source.now())
+    hashed: list[str] = []
+    young = _too_young(task)
+    if young is not None:
+        return task.source, young
+    result = _told(task, partial(_ingest, hashed=hashed))
+    if task.source.has_changed():
+        note = "it changed while it was looked at; it is ingested when its recording has ended"
+        return task.source, IngestResult(task.source.name, "waiting", notes=(note,))
+    return task.source, replace(result, sha256=hashed[0]) if hashed else result
+
+
+def _told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
+    """Do something with a log; an error becomes its result."""
     try:
-        return _ingest(task)
-    except TcpipeError as error:
-        return IngestResult(name, "failed", problems=_naming(task.source, error.problems))
-    except OSError as error:
+        return act(task)
+    except Exception as error:  # noqa: BLE001  at last a bug that one log meets
+        problems, trace = _in_words(error, task.source)
+        transient = is_transient(error) or not task.source.files
+        return IngestResult(task.source.name, "failed", problems=problems, transient=transient, traceback=trace)
+
+
+def _in_words(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str | None]:
+    """Return lines about what went wrong with a log, and where an internal error comes from."""
+    if isinstance(error, TcpipeError):
+        return _naming(source, error.problems), None
+    if isinstance(error, OSError):
         where = f" ({error.filename})" if error.filename else ""
-        return IngestResult(name, "failed", problems=(f"{name}: {error.strerror or error}{where}",))
-    except MemoryError:
-        return IngestResult(name, "failed", problems=(f"{name}: not enough memory; fewer --jobs need less",))
-    except Exception as error:  # noqa: BLE001  a bug that one log meets
-        problem = (
-            f"{name}: internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"
-        )
-        return IngestResult(name, "failed", problems=(plain_line(problem),), traceback=traceback.format_exc())
+        return (f"{source.name}: {error.strerror or error}{where}",), None
+    if isinstance(error, MemoryError):
+        return (f"{source.name}: not enough memory; fewer --jobs need less",), None
+    what = f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"
+    return (plain_line(f"{source.name}: {what}"),), "".join(traceback.format_exception(error))
 
 
 def _naming(source: LogSource, problems: tuple[str, ...]) -> tuple[str, ...]:
@@ -194,11 +352,13 @@ def _naming(source: LogSource, problems: tuple[str, ...]) -> tuple[str, ...]:
     return (f"{source.name}: {problems[0]}", *problems[1:])
 
 
-def _ingest(task: IngestTask) -> IngestResult:
+def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
+    """Ingest one run; what its log hashes to is left in ``hashed``, also on failure."""
     store, source = Store(task.store), task.source
     with ExitStack() as stack:
         opened = None if source.sha256 else _opened(task, stack)
         sha256 = str(opened[1].sha256() if opened else source.sha256)
+        hashed.append(sha256)
         run_id = stack.enter_context(store.claimed_run(source.stem, sha256))
         same_as = _twin(store, run_id, source)
         finished = None if task.force else _finished(store, run_id, task)
@@ -208,7 +368,7 @@ def _ingest(task: IngestTask) -> IngestResult:
         logger.info("%s: reading", source.name)
         streams, damage, remarks = _streams(store, run_id, log, task)
         known = {"sha256": sha256, "damage": damage, "remarks": remarks, "tags": _tags(store, run_id, task)}
-        known["message_definitions"] = definitions_key(task.message_definitions)
+        known["message_definitions"] = task.definitions
         store.write_run_json(run_id, _run_json(log, streams, source, known))
         run = _fuse_and_label(store, run_id, streams, known, task)
     return _result(source, "done", run, sha256, same_as=same_as)
@@ -281,16 +441,15 @@ def _streams(store: Store, run_id: str, log: Any, task: IngestTask) -> tuple[Str
     """Return L1, from the store when it was made with the same read settings, the log's damage, and remarks on it."""
     from tcpipe.stages.read import read_run  # noqa: PLC0415
 
-    definitions = definitions_key(task.message_definitions)
-    key = f"{read_key(task.recipe, task.robot, definitions=definitions)}-{__version__}"
+    key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
     known = store.run_json(run_id)
-    same = known is not None and known.get("message_definitions", "") == definitions
+    same = known is not None and known.get("message_definitions", "") == task.definitions
     cached = store.read_streams(run_id, key=key) if same and not task.force else None
     if cached is not None and known is not None:
         return cached, list(known["damage"]), list(known.get("remarks", ()))
     streams = read_run(log, task.recipe.read, robot=task.robot)
     if task.source.has_changed():
-        raise LogError(f"{task.source.name}: changed while it was read; ingest it when its recording has ended")
+        raise LogError(f"{task.source.name}: changed while it was read")
     store.write_streams(run_id, streams, key=key)
     return streams, [str(damage) for damage in log.damage if damage.is_loss], log.remarks
 
@@ -300,7 +459,7 @@ def _finished(store: Store, run_id: str, task: IngestTask) -> RunDirectory | Non
     for run in store.recipes_of(run_id):
         manifest = run.manifest
         same_robot = manifest["robot_requested"] == task.robot or (task.robot and manifest["robot"] == task.robot)
-        same_definitions = manifest.get("message_definitions", "") == definitions_key(task.message_definitions)
+        same_definitions = manifest.get("message_definitions", "") == task.definitions
         same_version = manifest["tcpipe_version"] == __version__
         if manifest["ingest_key"] == key and same_version and same_robot and same_definitions:
             return run
@@ -334,7 +493,7 @@ def _manifest(task: IngestTask, streams: Streams, track: Track, labelled: Labell
         "recipe": plain(task.recipe.ingest),
         "robot": streams.robot,
         "robot_requested": task.robot,
-        "message_definitions": definitions_key(task.message_definitions),
+        "message_definitions": task.definitions,
         "counts": {
             **{f"{role}_messages": table.num_rows for role, table in streams.tables.items()},
             "track_rows": track.table.num_rows,
@@ -368,7 +527,7 @@ def _result(source: LogSource, status: Status, run: RunDirectory, sha256: str, *
 
 def _died(source: LogSource) -> IngestResult:
     problem = f"{source.name}: its worker process died (killed, or out of memory); run it again"
-    return IngestResult(source.name, "failed", problems=(problem,))
+    return IngestResult(source.name, "failed", problems=(problem,), transient=True)
 
 
 def _as_path(value: str | Path | None) -> Path | None:

@@ -120,7 +120,7 @@ def _store(store: Store) -> dict[str, Any]:
     found = store.ingestions()
     runs, outdated = found.finished, {run_id: run.version for run_id, run in found.outdated.items()}
     damaged = {str(path): line for path, line in found.damaged.items()}
-    seen = {*outdated, *(run.run_id for run in runs), *(path.parent.name for path in found.damaged)}
+    seen = {*outdated, *found.superseded, *(run.run_id for run in runs), *(path.parent.name for path in found.damaged)}
     return {
         "kind": "store",
         "path": str(store.root),
@@ -131,6 +131,7 @@ def _store(store: Store) -> dict[str, Any]:
         ],
         "outdated": outdated,
         "damaged_runs": damaged,
+        "superseded": dict(found.superseded),
         "unfinished": sorted(set(store.run_ids()) - seen),
     }
 

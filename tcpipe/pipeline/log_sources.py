@@ -1,11 +1,11 @@
-"""Logs as they lie on disk: which files are one run, what they are called, and which hold the same recording."""
+"""Logs as they lie on disk: which files are one run, what they are called, whose turn they are, and which hold the same recording."""
 
 from __future__ import annotations
 
 import hashlib
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -13,15 +13,24 @@ from typing import Any
 
 from tcpipe.errors import LogError, TcpipeError, plain_line
 from tcpipe.formats.joined_log import open_logs
+from tcpipe.formats.json_files import digest
 from tcpipe.formats.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs
 from tcpipe.formats.object_storage import copied, is_url, stand_ins
+from tcpipe.formats.record_files import record_name
+from tcpipe.pipeline.transience import is_transient
 
 _LONGEST_STEM_BYTES = 200
+
+_UNFINISHED = ".active"
+"""Ending of a ROS 1 bag that is still recorded, or was when its recorder died."""
 
 
 @dataclass(frozen=True, slots=True)
 class LogSource:
-    """One log (several files of one drive with ``--as-one``): real paths, and size [byte] and modification time [ns] of every file."""
+    """One log (several files of one drive with ``--as-one``): paths, and size [byte] and modification time [ns] of every file.
+
+    A link is called what the user calls it: names, and what they say, are those of the link, not of what it leads to.
+    """
 
     paths: tuple[Path, ...]
     files: tuple[tuple[int, int], ...]
@@ -29,6 +38,8 @@ class LogSource:
     """None where it has yet to be computed."""
     urls: tuple[str, ...] = ()
     """Where the files lie, if one lies in object storage; ``paths`` then are stand-ins until `on_this_machine` has copied them."""
+    place: str = ""
+    """Where the log lies in the folder that was given: the same wherever that is mounted."""
 
     @property
     def name(self) -> str:
@@ -49,42 +60,84 @@ class LogSource:
         return plain_line(stem).encode()[:_LONGEST_STEM_BYTES].decode(errors="ignore")
 
     @property
-    def key(self) -> str:
-        """What the log is remembered by, with ``files``."""
-        return "|".join(self.origins)
+    def files_digest(self) -> str:
+        """What stands for the log's content where that cannot be had: a hash (hex) over names, sizes and times."""
+        return digest({"log": self.origins, "files": self.files})
+
+    @property
+    def lineage(self) -> str:
+        """Where the sightings of the log are remembered; a recording that is ended (``.active`` goes) lies where it did."""
+        return f"logs/{record_name(digest([origin.removesuffix(_UNFINISHED) for origin in self.origins]))}"
+
+    def sighting(self, sha256: str) -> dict[str, Any]:
+        """Return what is remembered of the log as it is now."""
+        return {"log": self.origins, "size_and_time": self.files, "sha256": sha256}
+
+    @property
+    def youngest_ns(self) -> int:
+        """When a file of the log was last written [ns since 1970]."""
+        return max((time_ns for _, time_ns in self.files), default=0)
+
+    def now(self) -> LogSource:
+        """Return the log as it is now: what was written since is another content."""
+        files = _files(self.paths)
+        return self if files == self.files else replace(self, files=files, sha256=None)
 
     def has_changed(self) -> bool:
         """Tell whether a file was written since."""
         return _files(self.paths) != self.files
 
 
-def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> list[LogSource]:
-    """Return the logs at or below the given paths, each once, in the order given; `LogError` where there is none.
+@dataclass(frozen=True, slots=True)
+class FoundLogs:
+    """The logs at or below the paths given, each once, in the order given, and a line for each path that holds none."""
+
+    sources: tuple[LogSource, ...]
+    problems: Mapping[str, tuple[str, ...]]
+    """By path as it was given."""
+    transient: bool = False
+    """Whether what is in the way of a path may pass: a network that is down."""
+
+
+def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> FoundLogs:
+    """Return the logs at or below the given paths.
 
     With ``as_one`` they are all parts of one. For what lies in object storage there are stand-ins in ``staging``.
     """
-    paths: dict[Path, None] = {}
+    paths: dict[Path, tuple[Path, str]] = {}
     urls: dict[Path, str] = {}
-    problems: list[str] = []
+    problems: dict[str, tuple[str, ...]] = {}
+    transient = False
     for number, entry in enumerate(logs):
         try:
             if is_url(entry):
                 remote = _remote(str(entry), staging / str(number))
                 urls.update(remote)
-                paths.update(dict.fromkeys(remote))
+                for path, url in remote.items():
+                    paths.setdefault(path, (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
             else:
-                paths.update(dict.fromkeys(_real(path) for path in find_logs(Path(entry))))
+                for path in find_logs(Path(entry)):
+                    paths.setdefault(_real(path), (_as_named(path), _place_in(path, Path(entry))))
         except LogError as error:
-            problems += error.problems
-    if problems:
-        raise LogError(*problems)
-    if not paths:
-        raise LogError("no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them")
-    groups = [tuple(sorted(paths))] if as_one else [(path,) for path in paths]
-    return [
-        LogSource(group, _files(group), urls=tuple(urls.get(path, str(path)) for path in group if urls))
+            problems[str(entry)] = error.problems
+            transient |= is_transient(error)
+    groups = [tuple(sorted(paths.values()))] if as_one and paths else [(found,) for found in paths.values()]
+    sources = tuple(
+        LogSource(
+            tuple(path for path, _ in group),
+            _files([path for path, _ in group]),
+            urls=tuple(urls.get(path, str(path)) for path, _ in group if urls),
+            place="|".join(place for _, place in group),
+        )
         for group in groups
-    ]
+    )
+    return FoundLogs(sources, problems, transient)
+
+
+def in_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSource]:
+    """Return the logs of share ``(i, n)``, i from 1: whose turn a log is depends on where it lies in the folder given, on no other log."""
+    index, count = shard
+    return [source for source in sources if int(digest(source.place), 16) % count == index - 1]
 
 
 def definitions_key(directory: Path | None) -> str:
@@ -118,9 +171,12 @@ def on_this_machine(source: LogSource) -> Iterator[LogSource]:
         yield replace(source, paths=tuple(paths))
 
 
-def with_hashes(sources: Sequence[LogSource], remembered: Mapping[str, Any]) -> list[LogSource]:
-    """Return the sources with the hashes that are remembered, and computed where two of one size may be the same recording."""
-    known = [_remembered(source, remembered) for source in sources]
+def with_hashes(sources: Sequence[LogSource], seen: Callable[[str], Sequence[Mapping[str, Any]]]) -> list[LogSource]:
+    """Return the sources with the hashes that are remembered, and computed where two of one size may be the same recording.
+
+    ``seen`` returns what is remembered of a log by its `lineage`.
+    """
+    known = [_remembered(source, seen(source.lineage)) for source in sources]
     sizes = Counter(_size(source) for source in known)
     return [source if source.sha256 or sizes[_size(source)] == 1 else _hashed(source) for source in known]
 
@@ -136,8 +192,19 @@ def in_turns(sources: Sequence[LogSource]) -> list[list[int]]:
 
 
 def _real(path: Path) -> Path:
-    """Return where a log really lies; a link that leads nowhere is named itself."""
+    """Return where a log really lies; a link that leads nowhere is where it is."""
     return path.resolve() if path.exists() else path.absolute()
+
+
+def _as_named(path: Path) -> Path:
+    """Return a log's path in full, as the user names it; what lies above a ``..`` may be a link, and is followed."""
+    if path.name == "..":
+        return path.resolve()
+    return path.parent.resolve() / path.name if ".." in path.parts else path.absolute()
+
+
+def _place_in(path: Path, entry: Path) -> str:
+    return path.relative_to(entry).as_posix() if path != entry else path.name or path.resolve().name
 
 
 def _files(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
@@ -146,14 +213,26 @@ def _files(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
     return tuple((stat.st_size, stat.st_mtime_ns) for stat in found)
 
 
+def _as_json(files: Iterable[tuple[int, int]]) -> list[list[int]]:
+    return [list(file) for file in files]
+
+
+def is_there(sighting: Mapping[str, Any]) -> bool:
+    """Tell whether a log that was seen lies where it was, unchanged; in object storage nobody looks, and it is taken to be there."""
+    if any(is_url(origin) for origin in sighting["log"]):
+        return True
+    return bool(_as_json(_files([Path(origin) for origin in sighting["log"]])) == sighting["size_and_time"])
+
+
 def _size(source: LogSource) -> int:
     return sum(size for size, _ in source.files)
 
 
-def _remembered(source: LogSource, remembered: Mapping[str, Any]) -> LogSource:
-    entry = remembered.get(source.key)
-    same = entry is not None and entry["size_and_time"] == [list(file) for file in source.files]
-    return replace(source, sha256=entry["sha256"]) if entry is not None and same else source
+def _remembered(source: LogSource, seen: Sequence[Mapping[str, Any]]) -> LogSource:
+    """Return the source with its hash; where nothing is known of these sizes and times, or two different things, without."""
+    files = _as_json(source.files)
+    found = {sighting["sha256"] for sighting in seen if files and sighting["size_and_time"] == files}
+    return replace(source, sha256=found.pop()) if len(found) == 1 else source
 
 
 def _hashed(source: LogSource) -> LogSource:

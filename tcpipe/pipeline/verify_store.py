@@ -26,13 +26,16 @@ Finding = tuple[str, int] | str
 
 _TABLES = {"track": GATED_TRACK, "segments": LABELLED_SEGMENTS, "rejections": REJECTIONS}
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
-_RUN, _MANIFEST, _REPORT, _STREAMS, _SOURCES = "run.json", "manifest.json", "report.html", "streams", "sources.json"
+_RUN, _MANIFEST, _REPORT, _STREAMS = "run.json", "manifest.json", "report.html", "streams"
 
 
 def verify_store(store: Store) -> Iterator[Finding]:
     """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
-    if (store.root / _SOURCES).exists():
-        yield broken_seal(store.root / _SOURCES) or ("files", 1)
+    for path in sorted(store.records_path.rglob("*")):
+        if path.suffix == ".json" and TEMPORARY_PREFIX not in str(path.relative_to(store.root)):
+            yield broken_seal(path) or ("records", 1)
+        elif not path.is_dir() or path.name.startswith(TEMPORARY_PREFIX):
+            yield from _stranger(path)
     for path in _entries(store.root / "maps"):
         if path.suffix == ".zarr":
             yield from _isolated(verify_map(path))

@@ -79,7 +79,7 @@ def dress(store):
         write_checksums(streams)
 
 
-SEALED = ("dataset.json", "report.html", "run.json", "manifest.json", "sources.json", "checksums.json")
+SEALED = ("dataset.json", "report.html", "run.json", "manifest.json", "checksums.json")
 
 
 @pytest.mark.parametrize("name", ["zarr", "parquet", "store"])

@@ -1,0 +1,147 @@
+"""Trouble with logs that is known: what failed or is damaged and was told before, and what a person has accepted (ADR 50)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcpipe import __version__
+from tcpipe.errors import UsageError
+from tcpipe.formats.json_files import digest
+from tcpipe.formats.record_files import record_name
+from tcpipe.store import Store, open_store
+
+_MOST_CANDIDATES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """What is wrong with a content, wherever that lies: lines of damage, or why it failed."""
+
+    kind: str
+    """``damaged`` or ``failed``."""
+    content: str
+    """The sha256 of the log; where nothing could be read, a hash of where it lies, sizes and times."""
+    lines: tuple[str, ...]
+    log: tuple[str, ...]
+    """Where it lay when it was told."""
+    run_id: str | None = None
+
+    @property
+    def called(self) -> str:
+        """What a person calls it: the run, or the log that gave none."""
+        return self.run_id or " + ".join(self.log)
+
+    @property
+    def _name(self) -> str:
+        return record_name(digest([self.content, self.lines]))
+
+    def is_accepted(self, store: Store) -> bool:
+        """Tell whether a person has said that this is no news."""
+        return store.recall(f"accepted/{self._name}") is not None
+
+    def accept(self, store: Store) -> bool:
+        """Remember that a person has looked at it; return whether that is new."""
+        fact = {"kind": self.kind, "content": self.content, "lines": self.lines, "log": self.log, "run_id": self.run_id}
+        return store.remember(f"accepted/{self._name}", fact)
+
+    def is_told(self, store: Store) -> bool:
+        """Tell whether this damage was told before."""
+        return store.recall(f"damaged/{self._name}") is not None
+
+    def told(self, store: Store) -> None:
+        """Remember that this damage was told."""
+        fact = {"content": self.content, "lines": self.lines, "log": self.log, "run_id": self.run_id}
+        store.remember(f"damaged/{self._name}", fact)
+
+
+def failure_name(content: str, *, ingest_key: str, robot: str | None, definitions: str) -> str:
+    """Return the name of the record of a failure: the same content, treated in the same way, fails again."""
+    how = {"version": __version__, "ingest_key": ingest_key, "robot": robot, "message_definitions": definitions}
+    return f"failed/{record_name(digest({'content': content, **how}))}"
+
+
+def failure_record(trouble: Trouble) -> dict[str, Any]:
+    """Return what is remembered of a failure."""
+    return {"content": trouble.content, "lines": trouble.lines, "log": trouble.log, "version": __version__}
+
+
+def trouble_of(kind: str, record: Mapping[str, Any]) -> Trouble:
+    """Return the trouble that a record holds."""
+    return Trouble(kind, record["content"], tuple(record["lines"]), tuple(record["log"]), record.get("run_id"))
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """What was accepted now, and what was before."""
+
+    accepted: tuple[Trouble, ...]
+    before: tuple[Trouble, ...]
+
+
+def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accepted:
+    """Accept the known trouble of runs and logs: it is counted no more, until it is another.
+
+    Parameters
+    ----------
+    names
+        Runs by their id, logs by path, URL or, where that is enough, file name.
+    store
+        The store that knows of the trouble.
+
+    Raises
+    ------
+    StoreError
+        There is no store.
+    UsageError
+        A name is none of a run or log with known trouble, or of several logs; nothing was accepted then.
+
+    """
+    house = open_store(store)
+    known = _known(house)
+    chosen: list[Trouble] = []
+    problems: list[str] = []
+    for name in dict.fromkeys(names):
+        found = _named(name, known)
+        if len({trouble.called for trouble in found}) == 1:
+            chosen += found
+        else:
+            problems.append(_not_one(name, found, [of for of in known if not of.is_accepted(house)], house))
+    if problems:
+        raise UsageError(*problems)
+    now = [trouble for trouble in chosen if trouble.accept(house)]
+    return Accepted(tuple(now), tuple(trouble for trouble in chosen if trouble not in now))
+
+
+def _known(store: Store) -> list[Trouble]:
+    """Return all trouble that was told, and the damage of runs that were made before that was remembered."""
+    known = [trouble_of(kind, record) for kind in ("failed", "damaged") for record in store.records(kind)]
+    for run in store.runs():
+        source = (store.run_json(run.run_id) or {}).get("source", {})
+        if run.manifest["damage"] and source:
+            lines, log = tuple(run.manifest["damage"]), tuple(source["paths"])
+            known.append(Trouble("damaged", source["sha256"], lines, log, run.run_id))
+    return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
+
+
+def _named(name: str, known: Sequence[Trouble]) -> list[Trouble]:
+    forms = {name, str(Path(name).absolute()), str(Path(name).resolve())}
+    exact = [trouble for trouble in known if forms & {trouble.run_id, " + ".join(trouble.log), *trouble.log}]
+    return exact or [trouble for trouble in known if name in {Path(origin).name for origin in trouble.log}]
+
+
+def _not_one(name: str, found: Sequence[Trouble], candidates: Sequence[Trouble], store: Store) -> str:
+    if found:
+        return f"{name}: {len(found)} logs are called so; give the path of one: {_listed(found)}"
+    if name in store.run_ids():
+        return f"{name}: no trouble is known of this run; there is nothing to accept"
+    listed = f"trouble is known of {_listed(candidates)}" if candidates else "no trouble is known here"
+    return f"{name}: no run or log with known trouble is called so in {store.root}; {listed}"
+
+
+def _listed(troubles: Sequence[Trouble]) -> str:
+    names = sorted({trouble.called for trouble in troubles})
+    more = f" and {len(names) - _MOST_CANDIDATES} more" if len(names) > _MOST_CANDIDATES else ""
+    return ", ".join(names[:_MOST_CANDIDATES]) + more
