@@ -1,10 +1,12 @@
 """The installed ``tcpipe`` command, run as a user runs it."""
 
+import json
 import os
 import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 COMMAND = Path(sys.executable).parent / "tcpipe"
 
@@ -23,6 +25,15 @@ def tcpipe(
         timeout=timeout_s,
         check=False,
     )
+
+
+def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    """Return the last JSON object of ``ingest --json``, that of all logs; those before are of the same logs, one each."""
+    *each, of_all = [json.loads(line) for line in done.stdout.splitlines()]
+    assert {line["kind"] for line in each} <= {"log"}
+    assert of_all["kind"] == "summary"
+    assert sorted(line["log"] for line in each) == sorted(result["log"] for result in of_all["results"])
+    return of_all
 
 
 def plain_lines(done: subprocess.CompletedProcess[str], code: int, most: int = 3) -> str:

@@ -82,10 +82,16 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
 
 
 def _refuse_what_is_no_file(path: Path) -> None:
-    if not path.exists():
-        raise LogError(f"{path}: there is no such file or directory")
+    _refuse_what_is_not_there(path)
     if not path.is_file() and not path.is_dir():
         raise LogError(f"{path}: it is a pipe or a device; {_WANTED}")
+
+
+def _refuse_what_is_not_there(path: Path) -> None:
+    if path.is_symlink() and not path.exists():
+        raise LogError(f"{path}: is a link to {path.readlink()}, which is not there")
+    if not path.exists():
+        raise LogError(f"{path}: there is no such file or directory")
 
 
 def belongs_to_a_log(name: str) -> bool:
@@ -104,8 +110,7 @@ def find_logs(path: Path) -> list[Path]:
         There is no log.
     """
     path = Path(path)
-    if not path.exists():
-        raise LogError(f"{path}: there is no such file or directory")
+    _refuse_what_is_not_there(path)
     if not path.is_dir():
         return [path]
     found = logs_below(path)

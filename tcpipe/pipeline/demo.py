@@ -71,8 +71,9 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     for path in site.logs:
         say(f"$ tcpipe ingest {path}")
     ingested = ingest(site.logs, store=store_path, recipe=Recipe())
-    if ingested.exit_code:
-        raise DatasetError(*(problem for result in ingested.results for problem in result.problems))
+    problems = [problem for result in ingested.results for problem in (*result.problems, *result.damage)]
+    if problems:
+        raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
     say(f"$ tcpipe add-map site --height {height} --ortho {ortho} --terrain {terrain} --classes {classes}")
     added = add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store_path)

@@ -11,6 +11,7 @@ from tcpipe import __version__
 from tcpipe.errors import UsageError
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.record_files import record_name
+from tcpipe.pipeline.log_sources import lineage_of
 from tcpipe.store import Store, open_store
 
 _MOST_CANDIDATES = 10
@@ -104,7 +105,7 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
     chosen: list[Trouble] = []
     problems: list[str] = []
     for name in dict.fromkeys(names):
-        found = _named(name, known)
+        found = _named(name, known, house)
         if len({trouble.called for trouble in found}) == 1:
             chosen += found
         else:
@@ -126,9 +127,15 @@ def _known(store: Store) -> list[Trouble]:
     return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
 
 
-def _named(name: str, known: Sequence[Trouble]) -> list[Trouble]:
-    forms = {name, str(Path(name).absolute()), str(Path(name).resolve())}
-    exact = [trouble for trouble in known if forms & {trouble.run_id, " + ".join(trouble.log), *trouble.log}]
+def _named(name: str, known: Sequence[Trouble], store: Store) -> list[Trouble]:
+    paths = {name, str(Path(name).absolute()), str(Path(name).resolve())}
+    sightings = [record for path in paths for record in store.records(lineage_of([path]))]
+    contents = {record["sha256"] for record in sightings}
+    exact = [
+        trouble
+        for trouble in known
+        if trouble.content in contents or paths & {trouble.run_id, " + ".join(trouble.log), *trouble.log}
+    ]
     return exact or [trouble for trouble in known if name in {Path(origin).name for origin in trouble.log}]
 
 

@@ -17,6 +17,7 @@ from tcpipe.formats.json_files import digest
 from tcpipe.formats.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs
 from tcpipe.formats.object_storage import copied, is_url, stand_ins
 from tcpipe.formats.record_files import record_name
+from tcpipe.formats.rosbag2_log import STORAGE_SUFFIXES, is_one_bag, storage_files
 from tcpipe.pipeline.transience import is_transient
 
 _LONGEST_STEM_BYTES = 200
@@ -66,8 +67,8 @@ class LogSource:
 
     @property
     def lineage(self) -> str:
-        """Where the sightings of the log are remembered; a recording that is ended (``.active`` goes) lies where it did."""
-        return f"logs/{record_name(digest([origin.removesuffix(_UNFINISHED) for origin in self.origins]))}"
+        """Where the sightings of the log are remembered."""
+        return lineage_of(self.origins)
 
     def sighting(self, sha256: str) -> dict[str, Any]:
         """Return what is remembered of the log as it is now."""
@@ -121,6 +122,9 @@ def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> 
         except LogError as error:
             problems[str(entry)] = error.problems
             transient |= is_transient(error)
+    for part, line in _parts_alone({path for path, _ in paths.values()}, together=as_one):
+        problems[str(part)] = (line,)
+        paths = {real: found for real, found in paths.items() if found[0] != part}
     groups = [tuple(sorted(paths.values()))] if as_one and paths else [(found,) for found in paths.values()]
     sources = tuple(
         LogSource(
@@ -134,10 +138,28 @@ def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> 
     return FoundLogs(sources, problems, transient)
 
 
+def _parts_alone(paths: set[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
+    """Yield the files that are parts of a ROS 2 bag, given without the others: what does not change stands in the first part only."""
+    bags: dict[Path, frozenset[Path]] = {}
+    for path in sorted(paths):
+        if path.name.endswith(STORAGE_SUFFIXES) and path.is_file():
+            bag = path.parent
+            if bag not in bags:
+                bags[bag] = frozenset(storage_files(bag) if is_one_bag(bag) else ())
+            if path in bags[bag] and len(bags[bag]) > 1 and not (together and bags[bag] <= paths):
+                what = f"{path}: is one of the {len(bags[bag])} parts of the ROS 2 bag {bag}"
+                yield path, f"{what}, and static transforms stand in the first of them only; give the directory"
+
+
 def in_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSource]:
     """Return the logs of share ``(i, n)``, i from 1: whose turn a log is depends on where it lies in the folder given, on no other log."""
     index, count = shard
     return [source for source in sources if int(digest(source.place), 16) % count == index - 1]
+
+
+def lineage_of(origins: Sequence[str]) -> str:
+    """Return where the sightings of what lies there are remembered; a recording that is ended (``.active`` goes) lies where it did."""
+    return f"logs/{record_name(digest([origin.removesuffix(_UNFINISHED) for origin in origins]))}"
 
 
 def definitions_key(directory: Path | None) -> str:

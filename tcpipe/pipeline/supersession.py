@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -14,6 +15,10 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.parquet import read_table
 from tcpipe.pipeline.log_sources import LogSource, is_there
 from tcpipe.store import Store
+
+logger = logging.getLogger("tcpipe")
+
+_BEFORE = "sources.json"
 
 _CONTAINED = 0.9
 """Where so large a share of an older run's measurements is in the newer one, it is the same recording, and loses nothing."""
@@ -49,7 +54,12 @@ def superseded_by(
 
 
 def remember_earlier(store: Store) -> None:
-    """Write down where the runs of a store came from that was made before that was remembered."""
+    """Write down where the runs of a store came from that was made before that was remembered; what it had instead goes."""
+    outdated = store.root / _BEFORE
+    if outdated.is_file():
+        with suppress(OSError):
+            outdated.unlink()
+        logger.info("%s: is of an earlier version and goes; logs are hashed again", outdated)
     if not (store.records_path / "logs").is_dir():
         for run_id in store.run_ids():
             with suppress(StoreError):  # told where it matters

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import rasterio
-from installed_command import COMMAND, plain_lines, tcpipe
+from installed_command import COMMAND, plain_lines, tcpipe, told
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -128,23 +128,22 @@ def _bad_input(kind: str, here: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    "kind",
+    ("kind", "code"),
     [
-        "there is no such file",
-        "it is empty",
-        "not a log",
-        "no log in this directory",
-        "a pipe or a device",
-        "nothing in the log tells motion",
+        ("there is no such file", 2),
+        ("it is empty", 1),
+        ("not a log", 1),
+        ("no log in this directory", 2),
+        ("a pipe or a device", 1),
+        ("nothing in the log tells motion", 1),
     ],
 )
-def test_what_is_no_log_is_said_in_plain_lines(kind: str, tmp_path: Path) -> None:
+def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: Path) -> None:
     path = _bad_input(kind, tmp_path)
-    told = plain_lines(tcpipe("ingest", path, "--quiet", cwd=tmp_path), 1)
-    assert kind in told
-    assert path.name in told
-    assert not (tmp_path / "tcpipe-store" / "sources.json").exists()
-    assert not list(tmp_path.glob("tcpipe-store/runs/*"))
+    said = plain_lines(tcpipe("ingest", path, "--quiet", cwd=tmp_path), code)
+    assert kind in said
+    assert path.name in said
+    assert not (tmp_path / "tcpipe-store").exists()
 
 
 @pytest.mark.parametrize(
@@ -183,9 +182,9 @@ def test_what_cannot_be_done_is_one_line_and_an_exit_code(
     done = tcpipe(*arguments, *(["--json"] if as_json else []), cwd=here)
     assert said in plain_lines(done, code, most=1)
     if as_json:
-        told = json.loads(done.stdout)
-        assert told["exit_code"] == code
-        assert said in told["problems"][0]
+        answer = json.loads(done.stdout)
+        assert answer["exit_code"] == code
+        assert said in answer["problems"][0]
     assert not any(path.is_file() for path in here.rglob("*"))
 
 
@@ -214,22 +213,24 @@ def test_a_raster_without_crs_and_a_map_that_is_there(sites: list[SimulatedSite]
 # --- what is printed ------------------------------------------------------------------------------------------------
 
 
-def test_json_is_one_object_and_nothing_else_and_quiet_says_only_what_went_wrong(
+def test_json_is_an_object_a_log_and_one_of_all_and_quiet_says_only_what_is_news(
     logs: list[Path], tmp_path: Path
 ) -> None:
     damaged, junk = tmp_path / "cut.mcap", tmp_path / "junk.bag"
     damaged.write_bytes(logs[1].read_bytes()[:-200_000])
     junk.write_bytes(b"junk" * 100)
-    for status in (["damaged", "failed", "done"], ["unchanged", "failed", "unchanged"]):
+    statuses = ["damaged", "failed", "done"], ["unchanged", "failed", "unchanged"]
+    for status, code in zip(statuses, (3, 0), strict=True):
         done = tcpipe("ingest", damaged, junk, logs[2], "--json", "--quiet", cwd=tmp_path)
-        assert done.returncode == 3
-        told = json.loads(done.stdout)
-        assert [result["status"] for result in told["results"]] == status
-        assert (told["exit_code"], told["recipe"]) == (3, "built-in defaults")
-        assert told["results"][0]["damage"]
-        assert "junk.bag" in told["results"][1]["problems"][0]
-        (line,) = done.stderr.splitlines()
-        assert line.startswith(f"tcpipe: {junk}: not a log")
+        assert done.returncode == code
+        of_all = told(done)
+        assert [result["status"] for result in of_all["results"]] == status
+        assert (of_all["exit_code"], of_all["recipe"]) == (code, "built-in defaults")
+        assert of_all["results"][0]["damage"]
+        assert "junk.bag" in of_all["results"][1]["problems"][0]
+        assert [result["known"] for result in of_all["results"]] == [code == 0, code == 0, False]
+        lines = done.stderr.splitlines()
+        assert [line.startswith(f"tcpipe: {junk}: not a log") for line in lines] == [True] * (code == 3)
 
 
 def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path) -> None:
@@ -279,11 +280,11 @@ def test_one_recording_is_one_run_under_any_name(log: Path, tmp_path: Path) -> N
     (tmp_path / "logs" / "loop").symlink_to(tmp_path / "logs")
     (tmp_path / "logs" / "dangling.mcap").symlink_to(tmp_path / "nowhere.mcap")
     done = tcpipe("ingest", "logs", log, log, "--jobs", "2", "--json", cwd=tmp_path)
-    results = json.loads(done.stdout)["results"]
+    results = told(done)["results"]
     assert Counter(result["status"] for result in results) == {"done": 1, "unchanged": 4, "failed": 1}
     assert {result["run_id"] for result in results if result["status"] != "failed"} == {results[0]["run_id"]}
     assert sum(result["same_as"] is not None for result in results) == 4
-    assert "dangling.mcap" in done.stderr
+    assert f"dangling.mcap: is a link to {tmp_path / 'nowhere.mcap'}, which is not there" in done.stderr
     assert done.returncode == 3
     again = tcpipe("ingest", "logs/below", cwd=tmp_path)
     assert again.returncode == 0
@@ -312,7 +313,11 @@ def test_a_log_that_is_still_written_is_not_taken_for_whole(log: Path, tmp_path:
     grow = "import tcpipe.stages.read as read\nfirst = read.read_run\n"
     grow += f"def later(*a, **k):\n    open({str(growing)!r}, 'ab').write(b'more')\n    return first(*a, **k)\n"
     env = _patched(tmp_path, f"{grow}read.read_run = later\n")
-    assert "changed while it was read" in plain_lines(tcpipe("ingest", growing, cwd=tmp_path, env=env), 1, most=1)
+    done = tcpipe("ingest", growing, "--json", "--quiet", cwd=tmp_path, env=env)
+    assert (done.returncode, done.stderr) == (0, "")
+    (result,) = told(done)["results"]
+    assert result["status"] == "waiting"
+    assert "changed while it was looked at" in result["notes"][0]
     assert not list(tmp_path.glob("tcpipe-store/runs/*"))
 
 
@@ -362,7 +367,7 @@ def test_a_full_disk_leaves_nothing_half_written(log: Path, tmp_path: Path) -> N
     told = plain_lines(done, 1, most=1)
     assert "cannot be written (File too large)" in told
     assert str(log) in told
-    assert _files(tmp_path) <= {"tcpipe-store/sources.json"}
+    assert _files(tmp_path) == set()
 
 
 # --- looking at what is there ---------------------------------------------------------------------------------------
@@ -461,8 +466,8 @@ def test_a_worker_that_is_killed_costs_only_its_own_log(logs: list[Path], tmp_pa
     again = _run("ingest", *logs, cwd=tmp_path)
     assert [line.split()[0] for line in again.splitlines() if "robot husky" in line] == [
         "unchanged",
-        "done",
         "unchanged",
+        "done",
     ]
 
 
@@ -474,7 +479,6 @@ def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_p
         _, told = process.communicate(timeout=120)
         assert process.returncode == 0, told
     assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest.json"))) == 2
-    sources = json.loads((tmp_path / "tcpipe-store" / "sources.json").read_text())
-    assert len(sources.keys() - {"document_sha256"}) == 3
+    assert len(list(tmp_path.glob("tcpipe-store/records/logs/*/*.json"))) == 3
     assert not list(tmp_path.rglob(".tmp-*"))
     assert "nothing to do: 3 of 3" in _run("ingest", *batches[0], *batches[1], cwd=tmp_path)

@@ -1,14 +1,18 @@
 """Logs of every kind and state, through the installed command."""
 
 import json
+import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from installed_command import plain_lines, tcpipe
+from installed_command import COMMAND, plain_lines, tcpipe, told
 from mcap.writer import Writer
 from storage_server import FORBIDDEN, object_store
+from wheel_drives import drive_at
 
 from tcpipe.formats.log_writing import MessageStream, write_mcap, write_rosbag2
 
@@ -43,8 +47,8 @@ def test_what_cannot_be_ingested_leaves_no_store(tmp_path, content, store):
     plain_lines(done, 1)
     assert done.stdout.splitlines()[-1] == f"no run came into {store}: 1 of 1 logs failed"
     assert [path.name for path in tmp_path.iterdir()] == ["a.bag"]
-    told = json.loads(tcpipe("ingest", "a.bag", "--store", store, "--json", cwd=tmp_path).stdout)
-    assert (told["store"], told["exit_code"], told["results"][0]["status"]) == (None, 1, "failed")
+    found = told(tcpipe("ingest", "a.bag", "--store", store, "--json", cwd=tmp_path))
+    assert (found["store"], found["exit_code"], found["results"][0]["status"]) == (None, 1, "failed")
     (tmp_path / store).mkdir(parents=True)
     plain_lines(tcpipe("ingest", "a.bag", "--store", store, cwd=tmp_path), 1)
     assert (tmp_path / store).is_dir()
@@ -87,6 +91,88 @@ def test_what_plays_no_role_is_said_and_kept(tmp_path):
     assert line in " ".join((done.stdout + done.stderr).split())
     (manifest,) = (tmp_path / "tcpipe-store").glob("runs/*/*/manifest.json")
     assert line in json.loads(manifest.read_text())["warnings"]
+
+
+def test_the_good_are_done_and_the_bad_are_named(tmp_path):
+    drive_at(tmp_path / "good" / "run.mcap")
+    (tmp_path / "empty").mkdir()
+    bad = ["empty", "gone.mcap", "s3://bucket-that-is-none/x.mcap"]
+    environment = {"AWS_SKIP_SIGNATURE": "true", "AWS_ENDPOINT_URL": "http://127.0.0.1:9", "AWS_ALLOW_HTTP": "true"}
+    done = tcpipe("ingest", bad[0], "good", bad[1], "--json", cwd=tmp_path)
+    assert "empty: no log in this directory" in plain_lines(done, 3, most=2)
+    assert "gone.mcap: there is no such file" in done.stderr
+    assert [(result["log"], result["status"]) for result in told(done)["results"]] == [
+        ("empty", "failed"),
+        ("gone.mcap", "failed"),
+        (str(tmp_path / "good" / "run.mcap"), "done"),
+    ]
+    plain_lines(tcpipe("ingest", *bad[:2], "--store", "none", cwd=tmp_path), 2, most=2)
+    plain_lines(tcpipe("ingest", bad[2], "--store", "none", cwd=tmp_path, env=environment), 1, most=1)  # it may pass
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
+    drive_at(tmp_path / "logs" / "run.mcap")
+    cut, junk = tmp_path / "logs" / "cut.mcap", tmp_path / "logs" / "junk.bag"
+    cut.write_bytes(drive_at(tmp_path / "whole.mcap", seed=1).read_bytes()[:-20_000])
+    junk.write_bytes(b"junk" * 100)
+    assert "logs/junk.bag: not a log" in plain_lines(tcpipe("ingest", "logs", cwd=tmp_path), 3)
+    again = tcpipe("ingest", "logs", "--jobs", "8", cwd=tmp_path)
+    assert (again.returncode, again.stderr) == (0, "")
+    assert again.stdout.splitlines()[-3:] == [
+        "nothing to do: 2 of 3 logs are in tcpipe-store already",
+        "1 known failure, not tried again; --retry-failed tries it",
+        "1 with known damage; 'tcpipe accept RUN' when it has been looked at",
+    ]
+    (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
+    refused = plain_lines(tcpipe("accept", run_id, "nosuch", cwd=tmp_path), 2, most=1)
+    assert (
+        f"nosuch: no run or log with known trouble is called so in tcpipe-store; trouble is known of {junk}, {run_id}"
+        in refused
+    )
+    accepted = tcpipe("accept", run_id, "logs/junk.bag", cwd=tmp_path)
+    assert (accepted.returncode, f"accepted: {run_id} (damaged)" in accepted.stdout) == (0, True)
+    retried = tcpipe("ingest", "logs", "--retry-failed", cwd=tmp_path)
+    assert (retried.returncode, retried.stdout.splitlines()[-1]) == (0, "2 with accepted trouble")
+
+
+def test_each_log_is_told_as_it_ends(tmp_path):
+    """The second log cannot end before the first has been told."""
+    drive_at(tmp_path / "a.mcap")
+    stuck = "import tcpipe.stages.gate as gate, time, os\nfirst = gate.gate_track\n"
+    stuck += "def waiting(track, *a, **k):\n    while 'b-' in track.info.run_id and not os.path.exists('go'): time.sleep(0.02)\n"
+    (tmp_path / "patch").mkdir()
+    (tmp_path / "patch" / "sitecustomize.py").write_text(
+        stuck + "    return first(track, *a, **k)\ngate.gate_track = waiting\n"
+    )
+    drive_at(tmp_path / "b.mcap", seed=1)
+    running = subprocess.Popen(
+        [COMMAND, "ingest", "a.mcap", "b.mcap", "--json", "--quiet"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path / "patch"), os.environ.get("PYTHONPATH", "")])},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert running.stdout is not None
+    first = json.loads(running.stdout.readline())
+    assert (first["kind"], first["log"], running.poll()) == ("log", str(tmp_path / "a.mcap"), None)
+    (tmp_path / "go").touch()
+    rest, _ = running.communicate(timeout=120)
+    assert [json.loads(line)["kind"] for line in rest.splitlines()] == ["log", "summary"]
+
+
+def test_shares_of_a_folder_and_parts_of_a_bag(tmp_path):
+    for number in range(2):
+        drive_at(tmp_path / "logs" / f"run{number}.mcap", seed=number)
+    write_rosbag2(tmp_path / "logs" / "bag", drive(), storage="sqlite3")
+    shutil.copy(tmp_path / "logs" / "run0.mcap", tmp_path / "logs" / "bag" / "bag_1.mcap")
+    shares = [tcpipe("ingest", "logs", "--shard", f"{index}/2", "--json", cwd=tmp_path) for index in (1, 2)]
+    assert [share.returncode for share in shares] == [0, 0]
+    logs = [{result["log"] for result in told(share)["results"]} for share in shares]
+    assert not logs[0] & logs[1]
+    assert {log.rsplit("/", 1)[1] for log in logs[0] | logs[1]} == {"run0.mcap", "run1.mcap", "bag"}
+    part = tcpipe("ingest", "logs/bag/bag_1.mcap", cwd=tmp_path)
+    assert f"is one of the 2 parts of the ROS 2 bag {tmp_path / 'logs' / 'bag'}" in plain_lines(part, 2, most=1)
 
 
 def test_logs_in_object_storage(tmp_path):

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 import pytest
-from installed_command import tcpipe
+from installed_command import tcpipe, told
 from scipy.interpolate import CubicHermiteSpline
 
 import tcpipe as package
@@ -238,9 +238,9 @@ def test_two_runs_and_any_number_of_workers_give_the_same_bytes(tmp_path: Path) 
 
 def test_a_second_call_does_nothing_and_picks_up_only_what_is_missing(tmp_path: Path) -> None:
     site = simulate(tmp_path / "site", scenario="demo", seed=5)
-    first = json.loads(_run("ingest", site.logs[0], "--json", "--quiet", cwd=tmp_path).stdout)
+    first = told(_run("ingest", site.logs[0], "--json", "--quiet", cwd=tmp_path))
     assert [result["status"] for result in first["results"]] == ["done"]
-    both = json.loads(_run("ingest", *site.logs, "--json", "--quiet", cwd=tmp_path).stdout)
+    both = told(_run("ingest", *site.logs, "--json", "--quiet", cwd=tmp_path))
     assert [result["status"] for result in both["results"]] == ["unchanged", "done"]
     again = _run("ingest", *site.logs, cwd=tmp_path)
     assert "nothing to do: 2 of 2 logs" in again.stdout
@@ -254,7 +254,7 @@ def test_a_damaged_log_costs_only_itself(tmp_path: Path) -> None:
     garbage.write_bytes(b"not a bag at all" * 100)
     done = tcpipe("ingest", broken, garbage, site.logs[1], "--json", "--quiet", "--jobs", "2", cwd=tmp_path)
     assert done.returncode == 3, done.stderr
-    results = json.loads(done.stdout)["results"]
+    results = told(done)["results"]
     assert [result["status"] for result in results] == ["damaged", "failed", "done"]
     assert results[0]["segments"] > 50
     assert "broken.mcap" in results[0]["damage"][0]

@@ -10,6 +10,7 @@ from random_messages import ROS1, Message, random_messages, write_bag, write_mca
 
 from tcpipe.errors import LogError
 from tcpipe.pipeline.export import export
+from tcpipe.store import Store
 
 TYPES = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/BatteryState", "nav_msgs/msg/Path")
 
@@ -65,7 +66,6 @@ def test_a_bare_number_is_told_by_the_name_of_its_topic(tmp_path):
     ("sign", "kind"),
     [
         ("dataset.json", "dataset"),
-        ("sources.json", "store"),
         ("run.json", "run"),
         ("manifest.json", "run's recipe"),
         ("zarr.json", "map"),
@@ -80,6 +80,12 @@ def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, sign, 
     with pytest.raises(LogError, match=f"out: is a {kind}; give another directory"):
         export(log, out)
     assert [path.name for path in out.iterdir()] == [sign]
+
+
+def test_nothing_is_written_into_a_store(tmp_path, log):
+    Store(tmp_path / "out").remember("logs/where/what", {"log": ["/a.bag"]})
+    with pytest.raises(LogError, match="out: is a store; give another directory"):
+        export(log, tmp_path / "out")
 
 
 def test_commas_alone_name_no_topic(tmp_path, log):

@@ -69,7 +69,7 @@ def test_a_store_its_runs_and_its_map_verify(made):
 
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
-    store.remember_source("/logs/north.mcap", {"sha256": "north"})
+    store.remember("logs/where/what", {"log": ["/logs/north.mcap"], "sha256": "north", "size_and_time": []})
     path = store.map_path("site")
     write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
     for run in store.runs():

@@ -1,0 +1,66 @@
+"""Records: a fact is one file, whoever writes it; the first wins; what is broken is named and written again."""
+
+import errno
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from tcpipe.formats.atomic import put_file
+from tcpipe.formats.record_files import put_record, read_record, read_records
+
+
+def test_a_fact_is_written_once_and_never_changed(tmp_path):
+    assert put_record(tmp_path, "kind/fact", {"a": 1})
+    written = (tmp_path / "kind" / "fact.json").stat()
+    assert not put_record(tmp_path, "kind/fact", {"a": 2})
+    assert (tmp_path / "kind" / "fact.json").stat() == written
+    assert read_record(tmp_path, "kind/fact")["a"] == 1
+    assert read_record(tmp_path, "kind/other") is None
+    assert [path.name for path in tmp_path.iterdir()] == ["kind"]
+
+
+@pytest.mark.parametrize("broken", ["", "{", "[]", '{"a": 1}'])
+def test_a_broken_record_is_named_left_out_and_written_again(tmp_path, caplog, broken):
+    put_record(tmp_path, "kind/one", {"a": 1})
+    put_record(tmp_path, "kind/two", {"a": 2})
+    (tmp_path / "kind" / "one.json").write_text(broken)
+    assert [record["a"] for record in read_records(tmp_path, "kind")] == [2]
+    assert "one.json" in caplog.text
+    assert put_record(tmp_path, "kind/one", {"a": 1})
+    assert [record["a"] for record in read_records(tmp_path, "kind")] == [1, 2]
+
+
+def test_of_many_writers_one_wins(tmp_path):
+    program = (
+        "import sys; from pathlib import Path; from tcpipe.formats.record_files import put_record\n"
+        "won = [put_record(Path(sys.argv[1]), f'kind/{n}', {'by': sys.argv[2], 'n': n}) for n in range(30)]\n"
+        "import json; print(json.dumps(won))"
+    )
+    writers = [
+        subprocess.Popen([sys.executable, "-c", program, str(tmp_path), str(by)], stdout=subprocess.PIPE)
+        for by in range(3)
+    ]
+    won = [json.loads(writer.communicate(timeout=60)[0]) for writer in writers]
+    assert [sum(each) for each in zip(*won, strict=True)] == [1] * 30
+    for n in range(30):
+        assert won[int(read_record(tmp_path, f"kind/{n}")["by"])][n]
+
+
+def test_a_file_system_without_hard_links(tmp_path, monkeypatch):
+    def refused(*_, **__):
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+    path = tmp_path / "kind" / "fact.json"
+    assert [put_file(path, text, staging=tmp_path) for text in ("first", "second")] == [True, False]
+    assert path.read_text() == "first"
+
+
+def test_what_a_killed_writer_left_goes_with_the_next_fact(tmp_path):
+    put_record(tmp_path, "kind/one", {"a": 1})
+    (tmp_path / ".tmp-new-0123abcd").mkdir()
+    put_record(tmp_path, "other/two", {"a": 2})
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["kind", "other"]

@@ -1,0 +1,274 @@
+"""Ingest night after night: logs that are still copied, known trouble, files that change, and what it costs to do nothing."""
+
+import errno
+import os
+import shutil
+
+import pytest
+from wheel_drives import START_NS, drive_at
+
+import tcpipe.pipeline.ingest as ingestion
+from tcpipe.errors import UsageError
+from tcpipe.pipeline import known_trouble
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.known_trouble import accept
+from tcpipe.pipeline.verify import verify
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+
+JUNK = b"junk" * 100
+
+
+@pytest.fixture
+def night(tmp_path):
+    """Ingest the folder ``logs`` into one store; return status, news and notes by name, and the exit code."""
+
+    def run(**how):
+        summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe(), **how)
+        return {result.log.rsplit("/", 1)[-1]: result for result in summary.results}, summary.exit_code
+
+    drive_at(tmp_path / "logs" / "other.mcap", seed=99, start_ns=START_NS + 10**13)
+    return run
+
+
+def counted(tmp_path):
+    """Return the runs that a dataset would be made from."""
+    return {run.run_id for run in Store(tmp_path / "store").runs()}
+
+
+# --- half-copied logs -----------------------------------------------------------------------------------------------
+
+
+def copy_part(whole, to, share):
+    data = whole.read_bytes()
+    to.write_bytes(data[: int(len(data) * share)])
+
+
+@pytest.mark.parametrize("name", ["run.mcap", "run.mcap.active"])
+def test_a_half_copied_log_is_superseded_when_it_is_complete_and_counts_when_it_is_back(tmp_path, night, name):
+    whole, log, first = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap", tmp_path / "logs" / name
+    copy_part(whole, first, 0.6)
+    half = (
+        night()[0][name].run_id if name == "run.mcap" else ingest([first], store=tmp_path / "store").results[0].run_id
+    )
+    first.unlink()
+    shutil.copy(whole, log)
+    found, code = night()
+    assert (code, found["run.mcap"].status) == (0, "done")
+    assert found["run.mcap"].notes == (
+        f"run {half}, made from this path before, is superseded: this log holds what it held",
+    )
+    assert half not in counted(tmp_path)
+    assert inspect(tmp_path / "store", recipe=Recipe())["superseded"] == {half: found["run.mcap"].run_id}
+    assert night()[0]["run.mcap"].notes == ()  # said once
+    for place in ("run.mcap", "elsewhere.mcap"):  # back where it was, then under another name
+        copy_part(whole, tmp_path / "logs" / place, 0.6)
+        assert f"run {half} counts again: its recording is back" in night()[0][place].notes
+        assert half in counted(tmp_path)
+        (tmp_path / "logs" / place).unlink()
+        shutil.copy(whole, log)
+        night()
+        assert half not in counted(tmp_path)
+
+
+def test_a_half_copied_log_that_lies_elsewhere_too_still_counts(tmp_path, night):
+    whole, log = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap"
+    copy_part(whole, log, 0.6)
+    shutil.copy(log, tmp_path / "logs" / "twin.mcap")
+    half = night()[0]["run.mcap"].run_id
+    shutil.copy(whole, log)
+    (note,) = night()[0]["run.mcap"].notes
+    assert note.endswith(f"stays: its recording lies at {tmp_path}/logs/twin.mcap")
+    assert half in counted(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("later", "why"),
+    [
+        ({"seed": 1, "start_ns": START_NS + 10**12}, "that was another recording"),
+        ({"seed": 1}, "that was another recording"),  # no battery behind the clock: each drive begins at one instant
+        ({"rows": 700}, "this log holds 47% of it"),
+    ],
+)
+def test_a_name_used_again_and_a_log_that_lost_something_supersede_nothing(tmp_path, night, later, why):
+    log = drive_at(tmp_path / "logs" / "latest.mcap")
+    before = night()[0]["latest.mcap"].run_id
+    drive_at(log, **later)
+    found, code = night()
+    assert (code, found["latest.mcap"].notes) == (0, (f"run {before}, made from this path before, stays: {why}",))
+    assert {before, found["latest.mcap"].run_id} <= counted(tmp_path)
+
+
+def test_a_store_made_before_this_was_remembered_knows_where_its_runs_came_from(tmp_path, night):
+    whole, log = drive_at(tmp_path / "whole.mcap"), tmp_path / "logs" / "run.mcap"
+    copy_part(whole, log, 0.6)
+    half = night()[0]["run.mcap"].run_id
+    shutil.rmtree(tmp_path / "store" / "records")
+    (tmp_path / "store" / "sources.json").write_text("{cut")
+    shutil.copy(whole, log)
+    night()
+    assert half not in counted(tmp_path)
+    assert not (tmp_path / "store" / "sources.json").exists()
+
+
+# --- logs that are still written ------------------------------------------------------------------------------------
+
+
+def test_a_young_log_waits_and_is_no_failure(tmp_path, night):
+    log = tmp_path / "logs" / "other.mcap"
+    found, code = night(min_age_s=3600.0)
+    assert (found["other.mcap"].status, code) == ("waiting", 0)
+    assert not (tmp_path / "store").exists()
+    os.utime(log, ns=(0, 10**18))
+    assert night(min_age_s=3600.0)[0]["other.mcap"].status == "done"
+    assert night(min_age_s=1e12)[0]["other.mcap"].status == "unchanged"  # what is there does not wait
+
+
+def test_a_log_that_changes_while_it_is_looked_at_waits_also_where_it_cannot_be_read_yet(tmp_path, night, monkeypatch):
+    log = tmp_path / "logs" / "other.mcap"
+
+    def growing(*_, **__):
+        with log.open("ab") as file:
+            file.write(b"more")
+        raise ValueError("half a message")
+
+    monkeypatch.setattr(ingestion, "_streams", growing)
+    found, code = night()
+    assert (found["other.mcap"].status, code) == ("waiting", 0)
+    monkeypatch.undo()
+    assert night()[0]["other.mcap"].status == "damaged"  # nothing of it was remembered as a failure
+
+
+# --- known trouble --------------------------------------------------------------------------------------------------
+
+
+def told(night, name, **how):
+    found, code = night(**how)
+    return found[name].status, found[name].known, code
+
+
+def test_a_failure_is_news_once_until_something_is_another(tmp_path, night, monkeypatch):
+    junk = tmp_path / "logs" / "junk.bag"
+    junk.write_bytes(JUNK)
+    once, again = ("failed", False, 3), ("failed", True, 0)
+    assert [told(night, "junk.bag") for _ in range(3)] == [once, again, again]
+    assert told(night, "junk.bag", retry_failed=True) == once
+    assert told(night, "junk.bag", robot="jackal") == once
+    assert told(night, "junk.bag") == again
+    junk.write_bytes(JUNK + b"!")
+    assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
+    monkeypatch.setattr(known_trouble, "__version__", "9.9.9")
+    assert [told(night, "junk.bag") for _ in range(2)] == [once, again]
+    (tmp_path / "tcpipe.toml").write_text("[segment]\nchord_m = 2.0\n")
+    summaries = [ingest([junk], store=tmp_path / "store", recipe=tmp_path / "tcpipe.toml") for _ in range(2)]
+    assert [summary.exit_code for summary in summaries] == [1, 0]
+    drive_at(tmp_path / "logs" / "junk.bag")
+    assert told(night, "junk.bag") == ("done", False, 0)
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENOSPC, "No space left on device"), MemoryError(), BlockingIOError(errno.EAGAIN, "locked")]
+)
+def test_what_may_pass_is_tried_again(night, monkeypatch, error):
+    def failing(*_, **__):
+        raise error
+
+    monkeypatch.setattr(ingestion, "_fuse_and_label", failing)
+    assert [told(night, "other.mcap") for _ in range(2)] == [("failed", False, 1)] * 2
+    monkeypatch.undo()
+    assert told(night, "other.mcap") == ("done", False, 0)
+
+
+def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, night):
+    junk, cut = tmp_path / "logs" / "junk.bag", tmp_path / "logs" / "cut.mcap"
+    junk.write_bytes(JUNK)
+    copy_part(drive_at(tmp_path / "whole.mcap"), cut, 0.6)
+    found, code = night()
+    assert (found["cut.mcap"].is_news, code) == (True, 3)
+    assert (told(night, "cut.mcap"), told(night, "cut.mcap", force=True)) == (
+        ("unchanged", True, 0),
+        ("damaged", True, 3),  # junk.bag was tried again
+    )
+    run_id = found["cut.mcap"].run_id
+    with pytest.raises(UsageError) as caught:
+        accept([run_id, "nosuch", found["other.mcap"].run_id], store=tmp_path / "store")
+    assert [line.split(":")[0] for line in caught.value.problems] == ["nosuch", found["other.mcap"].run_id]
+    assert f"trouble is known of {junk}, {run_id}" in caught.value.problems[0]
+    assert not found["cut.mcap"].accepted
+    assert [trouble.called for trouble in accept([run_id, str(junk)], store=tmp_path / "store").accepted] == [
+        run_id,
+        str(junk),
+    ]
+    second = accept(["junk.bag"], store=tmp_path / "store")
+    assert (second.accepted, [trouble.called for trouble in second.before]) == ((), [str(junk)])
+    found, code = night(retry_failed=True, force=True)
+    assert (code, found["cut.mcap"].accepted, found["junk.bag"].accepted) == (0, True, True)
+    copy_part(tmp_path / "whole.mcap", cut, 0.5)
+    assert night()[1] == 3  # that is another damage
+    checked = verify(tmp_path / "store")
+    assert (checked.problems, checked.read["records"]) == ((), 8)
+
+
+# --- the memory of logs ---------------------------------------------------------------------------------------------
+
+
+def test_what_is_remembered_of_a_log_is_believed_only_as_it_was_written(tmp_path, night, caplog):
+    run_id = night()[0]["other.mcap"].run_id
+    (record,) = tmp_path.glob("store/records/logs/*/*.json")
+    whole = record.read_bytes()
+    sha256 = run_id.rsplit("-", 1)[1].encode()
+    for broken in (whole.replace(sha256, b"0" * 8), whole[:40], b"[]", b""):
+        record.write_bytes(broken)
+        assert [night()[0]["other.mcap"].status for _ in range(2)] == ["unchanged", "unchanged"]
+        assert record.read_bytes() == whole
+        assert f"{record}: " in caplog.text
+        caplog.clear()
+    assert counted(tmp_path) == {run_id}
+
+
+def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, monkeypatch):
+    (tmp_path / "logs" / "junk.bag").write_bytes(JUNK)
+    drive_at(tmp_path / "logs" / "second.mcap")
+    night()
+
+    def refused(*_, **__):
+        raise AssertionError
+
+    monkeypatch.setattr("tcpipe.execution.ProcessPoolExecutor", refused)
+    monkeypatch.setattr(ingestion, "open_logs", refused)
+    found, code = night(jobs=8)
+    assert code == 0
+    assert [result.status for result in found.values()] == ["failed", "unchanged", "unchanged"]
+
+
+# --- names ----------------------------------------------------------------------------------------------------------
+
+
+def test_a_link_is_called_what_the_user_calls_it(tmp_path):
+    """git-annex: the file lies under the name of its hash."""
+    annexed = drive_at(tmp_path / ".git" / "annex" / "SHA256E-s123--abc.mcap")
+    (tmp_path / "logs").mkdir()
+    (tmp_path / "logs" / "run.mcap").symlink_to(annexed)
+    summary = ingest([tmp_path / "logs", annexed], store=tmp_path / "store", recipe=Recipe())
+    (result,) = summary.results
+    assert result.log == str(tmp_path / "logs" / "run.mcap")
+    assert str(result.run_id).startswith("run-")
+    (known,) = [Store(tmp_path / "store").run_json(run_id) for run_id in counted(tmp_path)]
+    assert known["source"]["paths"] == [result.log]
+    annexed.unlink()
+    with pytest.raises(UsageError, match=rf"run\.mcap: is a link to {annexed}, which is not there"):
+        ingest([tmp_path / "logs" / "run.mcap"], store=tmp_path / "store", recipe=Recipe())
+
+
+def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_path):
+    store, names = Store(tmp_path), []
+    hashes = ["abcdef01" + digit * 56 for digit in "012"] + ["abcdef01" + "0" * 55 + "9"]
+    for sha256 in hashes:
+        with store.claimed_run("latest", sha256) as run_id:
+            store.write_run_json(run_id, {"source": {"sha256": sha256}})
+            names.append(run_id)
+    assert names == ["latest-abcdef01", "latest-abcdef011111", "latest-abcdef012222", "latest-abcdef010000"]
+    for sha256, name in zip(hashes, names, strict=True):
+        with store.claimed_run("other", sha256) as run_id:
+            assert run_id == store.run_of(sha256, store.run_ids_by_hash()) == name
