@@ -33,6 +33,15 @@ def test_a_broken_record_is_named_left_out_and_written_again(tmp_path, caplog, b
     assert [record["a"] for record in read_records(tmp_path, "kind")] == [1, 2]
 
 
+def test_a_record_of_another_form_is_none(tmp_path, caplog):
+    put_record(tmp_path, "logs/where/what", {"log": "/a.bag"})
+    assert list(read_records(tmp_path, "logs/where")) == []
+    assert "log is" in caplog.text
+    fact = {"log": ["/a.bag"], "size_and_time": [[1, 2]], "sha256": "0"}
+    assert put_record(tmp_path, "logs/where/what", fact)
+    assert read_record(tmp_path, "logs/where/what")["sha256"] == "0"
+
+
 def test_of_many_writers_one_wins(tmp_path):
     program = (
         "import sys; from pathlib import Path; from tcpipe.formats.record_files import put_record\n"

@@ -266,7 +266,7 @@ def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_pa
     hashes = ["abcdef01" + digit * 56 for digit in "012"] + ["abcdef01" + "0" * 55 + "9"]
     for sha256 in hashes:
         with store.claimed_run("latest", sha256) as run_id:
-            store.write_run_json(run_id, {"source": {"sha256": sha256}})
+            store.write_run_json(run_id, {"source": {"paths": ["/latest.bag"], "sha256": sha256}})
             names.append(run_id)
     assert names == ["latest-abcdef01", "latest-abcdef011111", "latest-abcdef012222", "latest-abcdef010000"]
     for sha256, name in zip(hashes, names, strict=True):
