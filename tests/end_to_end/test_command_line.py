@@ -260,7 +260,7 @@ def _patched(directory: Path, program: str) -> dict[str, str]:
     """Return an environment in which every Python process begins with ``program``."""
     (directory / "patch").mkdir()
     (directory / "patch" / "sitecustomize.py").write_text(program)
-    return {"PYTHONPATH": str(directory / "patch")}
+    return {"PYTHONPATH": os.pathsep.join([str(directory / "patch"), *filter(None, [os.environ.get("PYTHONPATH")])])}
 
 
 def test_it_is_a_module_too(tmp_path: Path) -> None:
