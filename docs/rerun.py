@@ -3,9 +3,9 @@
     python docs/rerun.py docs/tutorials/first-dataset.md docs/how-to/damaged-logs.md
 
 Blocks fenced as ``console`` hold commands after ``$ ``, blocks fenced as ``pycon`` Python after ``>>> ``; the rest of such a block is
-output and is replaced. Pages given together share one empty directory, so that a later page may use what an earlier one made; it is
-shown as ~/site-a. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA). tests/end_to_end/test_docs.py runs the
-pages the same way and compares, numbers aside.
+output and is replaced. Pages given together share one empty directory, shown as ~; a page that says ``mkdir NAME && cd NAME`` runs in
+NAME there, as its reader does. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA). tests/end_to_end/test_docs.py runs
+the pages the same way and compares, numbers aside.
 """
 
 from __future__ import annotations
@@ -21,19 +21,21 @@ from code import InteractiveConsole
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-SHOWN = "~/site-a"
+_HOME = re.compile(r"^mkdir (\S+) && cd \1$", re.MULTILINE)
 _BLOCK = re.compile(r"^```(console|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _MARK = "\x01"
 
 
 def rerun(text: str, directory: Path) -> str:
-    """Return a page's text with the output of its blocks as it is today; they run in ``directory``, in order."""
-    console = InteractiveConsole(locals={})
+    """Return a page's text with the output of its blocks as it is today; they run in ``directory``, or the page's own in it, in order."""
+    console, own = InteractiveConsole(locals={}), _HOME.search(text)
+    home = directory / own[1] if own else directory
+    home.mkdir(exist_ok=True)
 
     def block(found: re.Match[str]) -> str:
         kind, body = found[1], found[2]
-        said = _shell(body, directory) if kind == "console" else _python(body, directory, console)
-        return f"```{kind}\n{said.replace(str(directory), SHOWN)}```"
+        said = _shell(body, home) if kind == "console" else _python(body, home, console)
+        return f"```{kind}\n{said.replace(str(directory), '~')}```"
 
     return _BLOCK.sub(block, text)
 

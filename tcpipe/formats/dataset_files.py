@@ -378,6 +378,8 @@ def open_patches(directory: Path, card: Mapping[str, Any]) -> PatchFiles:
             f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card['format']}: wanted up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"
         )
+    if "terrain" in layers and not card["classes"]:
+        raise DatasetError(f"{directory / CARD}: a layer terrain, but no classes; build the dataset again")
     if card["format"] == "parquet":
         return _in_shards(directory, layers, px, card)
     try:

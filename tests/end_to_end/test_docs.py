@@ -28,9 +28,15 @@ def rerun():
     return module.rerun
 
 
+@pytest.fixture(scope="module")
+def readers_directory(tmp_path_factory) -> Path:
+    """Where one reader follows all pages, in any order."""
+    return tmp_path_factory.mktemp("reader").resolve()
+
+
 @pytest.mark.parametrize("page", PAGES)
-def test_page_prints_what_it_says(page: str, rerun, tmp_path: Path) -> None:
+def test_page_prints_what_it_says(page: str, rerun, readers_directory: Path) -> None:
     written = (DOCS / page).read_text(encoding="utf-8")
-    today = rerun(written, tmp_path.resolve())
+    today = rerun(written, readers_directory)
     assert "Traceback" not in today
     assert _masked(today) == _masked(written), f"run 'python docs/rerun.py docs/{page}', read it, and commit the page"
