@@ -88,7 +88,7 @@ class RunDirectory:
         return read_table(self.path / f"{name}.parquet", columns).replace_schema_metadata(None)
 
     def prove(self, *names: str) -> None:
-        """Compare files with what the manifest has of them; `StoreError` has a line for each that is not as it was written."""
+        """Compare files with what the manifest has of them; `StoreError` names the first that is not as it was written."""
         prove_files(self.path, self.manifest["checksums"], names)
 
     def segments(self) -> pa.Table:

@@ -76,10 +76,11 @@ def read_sealed(
 
 
 def prove_files(directory: Path, checksums: Mapping[str, Any], names: Iterable[str]) -> None:
-    """Compare files of a directory with what a sealed document has of them; `StoreError` with a line for each that differs."""
+    """Compare files of a directory with what a sealed document has of them; `StoreError` names the first that differs."""
     lines = list(broken_checksums(directory, {name: checksums.get(name) for name in names}))
     if lines:
-        raise StoreError(*(f"{line}{_TELLS.format(directory)}" for line in lines))
+        more = f", and {len(lines) - 1} more" if len(lines) > 1 else ""
+        raise StoreError(f"{lines[0]}{more}{_TELLS.format(directory)}")
 
 
 def write_checksums(directory: Path) -> None:

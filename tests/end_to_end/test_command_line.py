@@ -380,7 +380,7 @@ def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
     site = sites[0]
     commands = [
         ["add-map", "site", *(str(x) for name in ("height", "ortho") for x in (f"--{name}", site.rasters[name]))],
-        ["build-dataset", "--split", str(site.region)],
+        ["build-dataset", "--holdout", "sample"],
         ["report", "tcpipe-store"],
         ["init"],
         ["schemas", "schemas"],

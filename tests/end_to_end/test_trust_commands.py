@@ -20,7 +20,10 @@ def work(tmp_path_factory):
     layers = [item for name in ("height", "ortho", "terrain", "classes") for item in (f"--{name}", site.rasters[name])]
     for arguments in (("ingest", *site.logs), ("add-map", "site", *layers), ("build-dataset",)):
         done = tcpipe(*arguments, "--quiet", cwd=here)
-        assert done.returncode == 0, done.stderr
+        # so small a site is one block, and that is told: nothing tests
+        assert (done.returncode, done.stderr[:24]) == (
+            (3, "tcpipe: no sample tests:") if arguments == ("build-dataset",) else (0, "")
+        )
     return here
 
 
@@ -102,6 +105,6 @@ def test_a_build_that_is_killed_leaves_what_the_next_one_clears_away(work):
     assert not (work / "killed").exists()
     assert any(work.glob(".tmp-killed-*"))
     done = tcpipe("build-dataset", "killed", "--quiet", cwd=work)
-    assert done.returncode == 0, done.stderr
+    assert done.returncode == 3, done.stderr
     assert sorted(path.name for path in work.iterdir()) == sorted([*before, "killed"])
     assert tcpipe("verify", "killed", cwd=work).returncode == 0
