@@ -1,0 +1,99 @@
+"""What a command costs before it does anything, and what a second worker gains.
+
+Run by hand, on idle cores: ``python benchmarks/start_up.py [--quick]``. Each line is CPU time of a process (and of what it starts) beside
+that of ``import numpy, pyarrow, numba`` in the same run, the least of some times: the floor that nothing can go below. ``kernel`` is that
+floor with one cached kernel called, for which numba loads much more. ``ingest`` is half a minute of driving less what the same ingest takes
+once more in the same process. The last line is the wall time of two logs of twelve minutes with one worker against two, in turns;
+``--quick`` leaves it out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+KERNEL = """
+import numpy as np, pyarrow
+from tcpipe.geometry import polyline
+polyline._split(np.linspace(-1.0, 1.0, 7), 0.5)
+"""
+TWICE = """
+import shutil, sys, time
+from pathlib import Path
+from tcpipe.pipeline.ingest import ingest
+spent = []
+for turn in "ab":
+    began = time.process_time()
+    assert ingest([sys.argv[1]], store=Path(sys.argv[2], turn)).exit_code == 0
+    spent.append(time.process_time() - began)
+    shutil.rmtree(Path(sys.argv[2], turn))
+print(time.process_time() - spent[1])
+"""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--turns", type=int, default=5)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as name:
+        here = Path(name)
+        log = simulated(here / "tiny", "tiny", 1)
+        run("-m", "tcpipe", "ingest", log, "--store", here / "warm", "-q")  # compiles the kernels
+        floor = min(cpu_s("-c", "import numpy, pyarrow, numba") for _ in range(options.turns))
+        print(f"floor    {floor:5.2f} s  (import numpy, pyarrow, numba)")
+        run("-c", KERNEL)
+        cases = {
+            "kernel": ("-c", KERNEL),
+            "--help": ("-m", "tcpipe", "--help"),
+            "inspect": ("-m", "tcpipe", "inspect", log),
+            "nothing": ("-m", "tcpipe", "ingest", log, "--store", here / "warm", "-q"),
+        }
+        for case, command in cases.items():
+            told(case, min(cpu_s(*command) for _ in range(options.turns)), floor)
+        told("ingest", min(float(run("-c", TWICE, log, here / "again")) for _ in range(options.turns)), floor)
+        if not options.quick:
+            second_worker(here, options.turns)
+
+
+def second_worker(here: Path, turns: int) -> None:
+    logs = [simulated(here / f"hills{seed}", "hills12", seed) for seed in (1, 2)]
+    wall_s: dict[int, list[float]] = {1: [], 2: []}
+    for turn in range(turns):
+        for jobs in (1, 2):
+            began = time.perf_counter()
+            run("-m", "tcpipe", "ingest", *logs, "--store", here / f"store-{turn}-{jobs}", "-q", "--jobs", jobs)
+            wall_s[jobs].append(time.perf_counter() - began)
+    one, two = min(wall_s[1]), min(wall_s[2])
+    print(f"workers  {one:5.2f} s with one, {two:.2f} s with two: {one / two:.2f} x")
+
+
+def simulated(place: Path, scenario: str, seed: int) -> Path:
+    run("-m", "tcpipe", "simulate", place, "--scenario", scenario, "--seed", seed, "-q")
+    log = next((place / "logs").iterdir())
+    return log.rename(log.with_stem(f"{log.stem}-{seed}"))
+
+
+def told(case: str, seconds: float, floor: float) -> None:
+    print(f"{case:<8} {seconds:5.2f} s  {seconds / floor:.2f} x the floor")
+
+
+def cpu_s(*arguments: object) -> float:
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    run(*arguments)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+
+
+def run(*arguments: object) -> str:
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+
+if __name__ == "__main__":
+    main()
