@@ -11,21 +11,29 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 help:
 	@sed -n 's/^#   //p' Makefile
 
-.venv/installed: requirements.lock pyproject.toml
+# Where the environment forbids to keep bytecode, each of the hundreds of processes of the tests would compile the package anew.
+unexport PYTHONDONTWRITEBYTECODE
+
+.venv/bin/python:
 	$(PYTHON) -m venv .venv
+
+.venv/installed: requirements.lock pyproject.toml | .venv/bin/python
 	$(PIP) install --quiet --require-hashes -r requirements.lock
 	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
 	@touch $@
 
-.venv/installed-dev: .venv/installed requirements-dev.lock
+# This lock holds all of the other.
+.venv/installed-dev: requirements-dev.lock pyproject.toml | .venv/bin/python
 	$(PIP) install --quiet --require-hashes -r requirements-dev.lock
-	@touch $@
+	$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+	@touch .venv/installed $@
 
 # PyTorch is pinned by version alone, since its CPU and CUDA builds differ in hash; `make test TORCH=` leaves out what needs it.
+# Most of its modules are never imported: bytecode is made as they are.
 TORCH ?= torch==2.13.0
 .venv/installed-train: .venv/installed-dev requirements-train.lock
-	$(PIP) install --quiet --require-hashes -r requirements-train.lock
-	$(PIP) install --quiet $(TORCH)
+	$(PIP) install --quiet --no-compile --require-hashes -r requirements-train.lock
+	$(PIP) install --quiet --no-compile $(TORCH)
 	@touch $@
 
 demo: .venv/installed
@@ -37,8 +45,10 @@ check: .venv/installed-dev
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+# In random order; the seed that it prints repeats it: make test PYTEST="-n 2 --randomly-seed=N".
+PYTEST ?= -n 2
 test: check $(if $(TORCH),.venv/installed-train)
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest --dist loadfile --no-loadscope-reorder $(PYTEST)
 
 # The locks: hashes, no registry address. Needs uv; run it when pyproject.toml's dependencies change.
 # The one for training holds Keras and what PyTorch needs beside itself.

@@ -11,7 +11,7 @@ from tcpipe.cli.options import quiet_option
 
 @click.command(short_help="See everything work on a simulated site")
 @click.argument("directory", default="tcpipe-demo", metavar="[DIR]")
-@click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same bytes.")
+@click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same site.")
 @quiet_option
 def demo(directory: str, *, seed: int, quiet: bool) -> None:
     """Simulate a small site and two drives, run the whole pipeline on them, and say what to open.

@@ -18,7 +18,7 @@ from tcpipe.cli.options import json_option, quiet_option
     metavar="NAME",
     help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
 )
-@click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same bytes.")
+@click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same site.")
 @json_option
 @quiet_option
 def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:

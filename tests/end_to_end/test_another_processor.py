@@ -1,0 +1,90 @@
+"""What docs/explanation/same-bytes.md says of another processor: the same site, runs and samples, but for the last digits."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+import rasterio
+from processors import ANOTHER_PROCESSOR
+from simulated_streams import streams_of
+
+import tcpipe
+
+NEAR = 1e-9
+"""Of the largest value of a column; the page says 1e-12, this leaves room for processors that were not seen."""
+
+MAKE = """
+import sys
+from pathlib import Path
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.maps import add_map
+from tcpipe.simulation import Faults, simulate, tiny
+
+out = Path(sys.argv[1])
+site = simulate(out / "site", scenario=tiny(Faults.every()))
+first = Path(sys.argv[2]) / "site"
+layers = {name: first / path.relative_to(out / "site") for name, path in site.rasters.items()}
+assert ingest([first / path.relative_to(out / "site") for path in site.logs], store=out / "store").exit_code == 0
+add_map("site", **layers, store=out / "store")
+build_dataset(out / "dataset", store=out / "store")
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Two simulated sites; the log and the rasters of the first, ingested and built on both processors."""
+    places = tuple(tmp_path_factory.mktemp(name) for name in ("here", "elsewhere"))
+    for place, env in zip(places, ({}, ANOTHER_PROCESSOR), strict=True):
+        subprocess.run([sys.executable, "-c", MAKE, place, places[0]], env={**os.environ, **env}, check=True)
+    return places
+
+
+def _unlike(ours: pa.Table, theirs: pa.Table) -> list[str]:
+    """Return the columns that differ by more than last digits; ids hold a stamp, and are left to the stamp."""
+    assert (ours.num_rows, ours.column_names) == (theirs.num_rows, theirs.column_names)
+    return [
+        name for name in ours.column_names if not name.endswith("_id") and not _near(name, ours[name], theirs[name])
+    ]
+
+
+def _near(name: str, ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> bool:
+    if pa.types.is_floating(ours.type):
+        here, there = (column.to_numpy().astype(float) for column in (ours, theirs))
+        return np.allclose(there, here, rtol=0.0, atol=NEAR * np.nanmax(np.abs(here), initial=0.0), equal_nan=True)
+    if name.endswith("_ns"):  # an interpolated stamp that is rounded to a whole one
+        return bool(pc.all(pc.less_equal(pc.abs(pc.subtract(ours, theirs)), 1)).as_py())
+    return ours.equals(theirs)
+
+
+@pytest.mark.parametrize(
+    "table", ["site/truth/*", "store/runs/*/*/track", "store/runs/*/*/segments", "dataset/samples"]
+)
+def test_tables_are_the_same_but_for_last_digits(made: tuple[Path, Path], table: str) -> None:
+    ours, theirs = (list(place.glob(f"{table}.parquet")) for place in made)
+    assert [path.relative_to(made[0]) for path in ours] == [path.relative_to(made[1]) for path in theirs] != []
+    for here, there in zip(ours, theirs, strict=True):
+        assert not _unlike(pq.read_table(here), pq.read_table(there))
+
+
+def test_a_simulated_log_says_the_same_but_for_last_digits(made: tuple[Path, Path]) -> None:
+    ours, theirs = (streams_of(next((place / "site" / "logs").iterdir())).tables for place in made)
+    assert ours.keys() == theirs.keys()
+    assert not {role: unlike for role in ours if (unlike := _unlike(ours[role], theirs[role]))}
+
+
+@pytest.mark.parametrize("layer", ["height", "ortho", "terrain"])
+def test_rasters_and_patches_differ_by_one_step_at_most(made: tuple[Path, Path], layer: str) -> None:
+    rasters = []
+    for place in made:
+        with rasterio.open(place / "site" / "maps" / f"{layer}.tif") as raster:
+            rasters.append(raster.read(masked=True).filled(0).astype(float))
+    assert np.abs(rasters[0] - rasters[1]).max() <= (1e-4 if layer == "height" else 0.0 if layer == "terrain" else 1.0)
+    patches = [tcpipe.open_dataset(place / "dataset")["train"].patches for place in made]
+    assert np.abs(patches[0] - patches[1]).max() <= 1.001 / 255.0
