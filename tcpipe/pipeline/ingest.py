@@ -337,8 +337,8 @@ def _in_words(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str
     if isinstance(error, TcpipeError):
         return _naming(source, error.problems), None
     if isinstance(error, OSError):
-        where = f" ({error.filename})" if error.filename else ""
-        return (f"{source.name}: {error.strerror or error}{where}",), None
+        where = f"{error.filename}: " if error.filename else ""
+        return _naming(source, (plain_line(f"{where}{error.strerror or error}"),)), None
     if isinstance(error, MemoryError):
         return (f"{source.name}: not enough memory; fewer --jobs need less",), None
     what = f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"

@@ -1,0 +1,40 @@
+"""What fails in an ingest is named: the output, or the log."""
+
+import errno
+import os
+import re
+
+import pytest
+from simulated_streams import log_of
+
+from tcpipe.pipeline import ingest as module
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.simulation import tiny
+
+
+@pytest.mark.parametrize("number", [errno.EACCES, errno.EIO, errno.ENOSPC])
+def test_a_disk_that_fails_in_mid_write_is_told_with_the_output(tmp_path, monkeypatch, number):
+    scenario = tiny(seconds=16.0)
+    log, store = log_of(scenario, scenario.drives[0], tmp_path / "site"), tmp_path / "store"
+
+    def fail(*_, **__):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr("tcpipe.formats.parquet.pq.ParquetWriter.write_table", fail)
+    (result,) = ingest([log], store=store).results
+    (line,) = result.problems
+    assert re.fullmatch(
+        rf"{re.escape(str(log))}: {re.escape(str(store))}/runs/.*/streams: cannot be written \({os.strerror(number)}\)",
+        line,
+    )
+    assert not store.exists()
+
+
+def test_a_file_that_cannot_be_opened_is_named(tmp_path, monkeypatch):
+    def fail(*_, **__):
+        raise PermissionError(errno.EACCES, "Permission denied", "/store/runs/x")
+
+    monkeypatch.setattr(module, "open_logs", fail)
+    (tmp_path / "a.mcap").write_bytes(b"a")
+    (result,) = ingest([tmp_path / "a.mcap"], store=tmp_path / "store").results
+    assert result.problems == (f"{tmp_path / 'a.mcap'}: /store/runs/x: Permission denied",)
