@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +31,7 @@ class Chosen:
     damaged: tuple[str, ...]
     """A line for each run that is not as it was written."""
     left_out: frozenset[str]
-    """The runs that those lines are about."""
+    """The runs that those lines are about, and those that others have taken the place of."""
     warnings: tuple[str, ...]
 
 
@@ -57,18 +57,18 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     others = [run for run in others if _belongs(run.manifest, robot, tags)]
     left_out = {*damaged, *(run.run_id for run in others)}
     total = len({run.run_id for run in runs} | left_out)
-    seen = (
-        found.superseded.keys()
-        | {run.run_id for run in (*found.finished, *found.outdated.values())}
-        | {path.parent.name for path in found.damaged}
-    )
-    unfinished = set(store.run_ids()) - seen
-    warnings = [f"no ingestion of {_named(unfinished)} has finished; ingest again"] if unfinished else []
+    missing, warnings = tuple(_missing(store, others, total)), tuple(_remarks(store, found))
+    return Chosen(tuple(runs), logs, missing, lines, frozenset(left_out | found.superseded.keys()), warnings)
+
+
+def _remarks(store: Store, found: Ingestions) -> Iterator[str]:
+    """Yield a line about runs that have not finished, and about those that others have taken the place of."""
+    seen = {run.run_id for run in (*found.finished, *found.outdated.values())}
+    unfinished = set(store.run_ids()) - seen - found.superseded.keys() - {path.parent.name for path in found.damaged}
+    if unfinished:
+        yield f"no ingestion of {_named(unfinished)} has finished; ingest again"
     if found.superseded:
-        warnings.append(
-            f"superseded, since their logs were completed or repaired: {_named(found.superseded)}; left out"
-        )
-    return Chosen(tuple(runs), logs, tuple(_missing(store, others, total)), lines, frozenset(left_out), tuple(warnings))
+        yield f"superseded, since their logs were completed or repaired: {_named(found.superseded)}; left out"
 
 
 def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:

@@ -154,6 +154,14 @@ def test_runs_of_the_dataset_before_that_are_gone_are_told_once(store):
     assert any("no longer in the store: d" in line for line in result.warnings)
 
 
+def test_a_run_that_another_has_taken_the_place_of_is_not_gone(store):
+    build(store)
+    store.supersede("b", "a")
+    result = build(store)
+    assert (result.problems, runs(store)) == ((), ["a", "c", "d"])
+    assert any("superseded" in line for line in result.warnings)
+
+
 def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
     store.tag_run("d", {"weather": "wet"})
     build(store)
