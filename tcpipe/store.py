@@ -15,6 +15,7 @@ A recipe directory appears by one rename, manifest inside: if it is there, it is
 
 from __future__ import annotations
 
+import logging
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -44,6 +45,8 @@ from tcpipe.tables.levels import (
     metadata_of,
     with_metadata,
 )
+
+logger = logging.getLogger("tcpipe")
 
 RUN_FILES = ("track.parquet", "segments.parquet", "rejections.parquet")
 
@@ -220,7 +223,7 @@ class Store:
 
     def _runs_of(self, sha256: str) -> Iterator[str]:
         for path in sorted(self.runs_path.glob(f"*-{sha256[:_NAME_HEX]}*")):
-            known, end = self.run_json(path.name), f"-{sha256[:_NAME_HEX]}"
+            known, end = self.known_run(path.name), f"-{sha256[:_NAME_HEX]}"
             if path.name.endswith(end) if known is None else known["source"]["sha256"] == sha256:
                 yield path.name
 
@@ -239,7 +242,7 @@ class Store:
     def run_of(self, sha256: str, among: Mapping[str, Sequence[str]]) -> str | None:
         """Return the run of a recording, among `run_ids_by_hash`; None where there is none."""
         for run_id in among.get(sha256[:_NAME_HEX], ()):
-            known = self.run_json(run_id)
+            known = self.known_run(run_id)
             if known is not None and known["source"]["sha256"] == sha256:
                 return run_id
         return None
@@ -262,6 +265,14 @@ class Store:
         if name and not found["source"]["sha256"].startswith(name[1]):
             raise StoreError(f"{path}: is of another run: its log's sha256 does not begin with {name[1]}")
         return found
+
+    def known_run(self, run_id: str) -> dict[str, Any] | None:
+        """Return `run_json`; None also where it is not as it was written, which is said: the run is to be made again."""
+        try:
+            return self.run_json(run_id)
+        except StoreError as error:
+            logger.warning("%s; the run is made again when its log is ingested", error.problems[0])
+            return None
 
     def write_run_json(self, run_id: str, values: Mapping[str, Any]) -> None:
         """Write what is known of a run's log."""

@@ -361,7 +361,7 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         hashed.append(sha256)
         run_id = stack.enter_context(store.claimed_run(source.stem, sha256))
         same_as = _twin(store, run_id, source)
-        finished = None if task.force else _finished(store, run_id, task)
+        finished = None if task.force or store.known_run(run_id) is None else _finished(store, run_id, task)
         if finished is not None:
             return _result(source, _retagged(store, run_id, task), finished, sha256, same_as=same_as)
         task, log = opened or _opened(task, stack)
@@ -394,12 +394,14 @@ def _fuse_and_label(
 
 def _tags(store: Store, run_id: str, task: IngestTask) -> dict[str, str]:
     """Return the run's tags: those it has, and those given."""
-    return {**(store.run_json(run_id) or {}).get("tags", {}), **task.tags}
+    known = store.known_run(run_id)
+    before = known.get("tags", {}) if known else next((run.manifest["tags"] for run in store.recipes_of(run_id)), {})
+    return {**before, **task.tags}
 
 
 def _retagged(store: Store, run_id: str, task: IngestTask) -> Status:
     """Set the tags of a run that is there already; "done" where that changed something."""
-    before = (store.run_json(run_id) or {}).get("tags", {})
+    before = (store.known_run(run_id) or {}).get("tags", {})
     tags = _tags(store, run_id, task)
     if tags == before:
         return "unchanged"
@@ -409,7 +411,7 @@ def _retagged(store: Store, run_id: str, task: IngestTask) -> Status:
 
 def _twin(store: Store, run_id: str, source: LogSource) -> str | None:
     """Return where else the same recording was ingested from, if it was."""
-    before = (store.run_json(run_id) or {}).get("source", {}).get("paths")
+    before = (store.known_run(run_id) or {}).get("source", {}).get("paths")
     return None if before is None or before == list(source.origins) else " + ".join(before)
 
 
@@ -442,7 +444,7 @@ def _streams(store: Store, run_id: str, log: Any, task: IngestTask) -> tuple[Str
     from tcpipe.stages.read import read_run  # noqa: PLC0415
 
     key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
-    known = store.run_json(run_id)
+    known = store.known_run(run_id)
     same = known is not None and known.get("message_definitions", "") == task.definitions
     cached = store.read_streams(run_id, key=key) if same and not task.force else None
     if cached is not None and known is not None:

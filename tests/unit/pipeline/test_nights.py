@@ -272,3 +272,15 @@ def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_pa
     for sha256, name in zip(hashes, names, strict=True):
         with store.claimed_run("other", sha256) as run_id:
             assert run_id == store.run_of(sha256, store.run_ids_by_hash()) == name
+
+
+def test_a_run_json_that_is_not_as_it_was_written_costs_no_other_log_and_is_made_again(tmp_path, night):
+    run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run_id
+    path = tmp_path / "store" / "runs" / run_id / "run.json"
+    whole = path.read_bytes()
+    path.write_bytes(whole.replace(b'"dry"', b'"wet"'))
+    (tmp_path / "logs" / "junk.mcap").write_bytes(JUNK)
+    found, _ = night()
+    assert [found[name].status for name in ("other.mcap", "junk.mcap")] == ["done", "failed"]
+    assert path.read_bytes() == whole, "its tags are those of the manifest, which is whole"
+    assert night()[0]["other.mcap"].status == "unchanged"
