@@ -261,9 +261,9 @@ class Store:
         path = self.runs_path / run_id / "run.json"
         if not path.exists():
             return None
-        found, name = read_sealed(path, _RUN), _HASH_IN_NAME.search(run_id)
-        if name and not found["source"]["sha256"].startswith(name[1]):
-            raise StoreError(f"{path}: is of another run: its log's sha256 does not begin with {name[1]}")
+        found = read_sealed(path, _RUN)
+        if not is_named_after(run_id, found["source"]["sha256"]):
+            raise StoreError(f"{path}: is of another run: its log's sha256 begins with {found['source']['sha256'][:8]}")
         return found
 
     def known_run(self, run_id: str) -> dict[str, Any] | None:
@@ -387,6 +387,12 @@ def _ingestion(path: Path) -> RunDirectory:
 def add_by_hash(runs: dict[str, list[str]], run_id: str) -> None:
     """Add a new run to `Store.run_ids_by_hash`."""
     runs.setdefault(run_id.rpartition("-")[2][:_NAME_HEX], []).append(run_id)
+
+
+def is_named_after(run_id: str, sha256: str) -> bool:
+    """Return whether a run can be that of a log: the digits at the end of its name, if any, are the first of the log's sha256."""
+    name = _HASH_IN_NAME.search(run_id)
+    return name is None or sha256.startswith(name[1])
 
 
 def is_store(path: Path) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
+from tcpipe.cost.budget import pooled
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -26,9 +27,11 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.recipe_toml import parse_recipe, recipe_id
 from tcpipe.formats.seals import broken_checksums, broken_seal
 from tcpipe.pipeline.dataset_card import CARD_COLUMNS, measured
 from tcpipe.pipeline.dataset_segments import KEPT
+from tcpipe.store import is_named_after
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
@@ -76,6 +79,7 @@ def _samples(directory: Path, card: Mapping[str, Any]) -> Iterator[Finding]:
     for key, value in plain(measured(samples.select(CARD_COLUMNS), has_terrain="terrain" in card["layers"])).items():
         if card.get(key) != value:
             yield f"{directory / CARD}: {key} is {card.get(key)}, but the samples give {value}"
+    yield from (f"{directory / CARD}: {problem}" for problem in _wrong_runs(samples, card))
     used_m = math.fsum(floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
     if not math.isclose(used_m, card["ledger_m"][KEPT], rel_tol=1e-9, abs_tol=1e-6):
         yield f"{directory / CARD}: the ledger keeps {card['ledger_m'][KEPT]:.3f} m, the samples cover {used_m:.3f} m"
@@ -100,6 +104,30 @@ def _wrong_joins(samples: pa.Table, card: Mapping[str, Any]) -> Iterator[str]:
     for pair in pairs.to_pylist():
         if names.get(pair["terrain_class"]) != pair["terrain_name"]:
             yield f"class {pair['terrain_class']} is called {pair['terrain_name']!r}, {names.get(pair['terrain_class'])!r} in the card"
+
+
+def _wrong_runs(samples: pa.Table, card: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a line for what the card copied from its runs and the samples, the recipe or the rest of the card say otherwise."""
+    recipe = parse_recipe(card["recipe"], where=CARD)
+    robots: dict[str, dict[str, int]] = {}
+    for row in samples.group_by(["run_id", "robot"]).aggregate([([], "count_all")]).to_pylist():
+        robots.setdefault(row["run_id"], {})[row["robot"]] = row["count_all"]
+    for run in card["runs"]:
+        name, robot = run["run_id"], run["robot"]
+        of = robots.get(name, {})
+        if of.keys() - {robot}:
+            yield f"run {name} is of robot {robot}, its samples of {', '.join(sorted(of))}"
+        if sum(of.values()) != run["samples"]:
+            yield f"run {name} has {run['samples']} samples, {sum(of.values())} are there"
+        if run["recipe_id"] != recipe_id(recipe, robot):
+            yield f"run {name} is of recipe {run['recipe_id']}, the card's for robot {robot} is {recipe_id(recipe, robot)}"
+        if not is_named_after(name, run["sha256"]):
+            yield f"run {name} is of a log whose sha256 begins with {run['sha256'][:8]}"
+    driven_m, ledger_m = [run.get("driven_m") for run in card["runs"]], math.fsum(card["ledger_m"].values())
+    if None not in driven_m and not math.isclose(math.fsum(driven_m), ledger_m, rel_tol=1e-9, abs_tol=1e-6):
+        yield f"the ledger sums to {ledger_m:.3f} m, its runs drove {math.fsum(driven_m):.3f} m"
+    if plain(pooled([run["energy_budget"] for run in card["runs"] if run["energy_budget"]])) != card["energy_budget"]:
+        yield "its energy budget is not that of its runs"
 
 
 def _rows(wrong: pa.ChunkedArray, what: str) -> Iterator[str]:

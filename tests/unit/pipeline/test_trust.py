@@ -122,6 +122,25 @@ def test_a_card_that_lacks_something_is_one_problem_and_no_traceback(copy, key):
     assert "cannot be followed" in "\n".join(verify(directory).problems)
 
 
+@pytest.mark.parametrize(
+    ("key", "value", "said"),
+    [
+        ("robot", "warthog", "run north is of robot warthog, its samples of husky"),
+        ("samples", 7, "run north has 7 samples, 224 are there"),
+        ("recipe_id", "00000000", "run north is of recipe 00000000, the card's for robot husky is"),
+        ("driven_m", 7.0, "m, its runs drove "),
+        ("run_id", "north-00000000", "begins with north"),
+    ],
+)
+def test_what_a_card_copied_from_its_runs_is_compared(copy, key, value, said):
+    directory = copy("zarr")
+    card = json.loads((directory / "dataset.json").read_text())
+    card["runs"][0][key] = value
+    write_sealed(directory / "dataset.json", card)
+    problems = verify(directory).problems
+    assert any(said in problem for problem in problems), problems
+
+
 @pytest.mark.parametrize("name", ["zarr", "parquet"])
 def test_rows_that_are_joined_to_others_patches_are_found(copy, name):
     """Every file is as the card has it, but the samples were sorted and the patches were not."""
