@@ -22,10 +22,17 @@ The command line prints them; a traceback is a bug.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 
 def plain_line(text: str) -> str:
     """Return ``text`` as one line that every terminal can show: control characters and bytes that are no text as escapes."""
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def plain_lines(lines: Iterable[str]) -> str:
+    """Return lines as one text, a `plain_line` each: no name in them makes a line of its own."""
+    return "\n".join(map(plain_line, lines))
 
 
 class TcpipeError(Exception):

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
 import traceback
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import NoReturn
 
 import click
@@ -26,6 +24,7 @@ from tcpipe.cli.export import export
 from tcpipe.cli.ingest import ingest
 from tcpipe.cli.init import init
 from tcpipe.cli.inspect import inspect
+from tcpipe.cli.output import say_failure
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
 from tcpipe.cli.process import Ended, prepare_process
@@ -35,7 +34,7 @@ from tcpipe.cli.schemas import schemas
 from tcpipe.cli.simulate import simulate
 from tcpipe.cli.train import train
 from tcpipe.cli.verify import verify
-from tcpipe.errors import TcpipeError, UsageError, plain_line
+from tcpipe.errors import TcpipeError, UsageError
 
 
 class _InOrder(click.Group):
@@ -127,12 +126,8 @@ def _fail(problems: Sequence[str], code: int) -> NoReturn:
     """Say what went wrong, with ``--json`` as an object on stdout too, and exit."""
     if "--debug" in sys.argv:
         traceback.print_exc()
-    with suppress(OSError):
-        for problem in problems:
-            click.echo(f"tcpipe: {plain_line(problem)}", err=True)
     try:
-        if "--json" in sys.argv:
-            click.echo(json.dumps({"exit_code": code, "problems": list(problems)}, indent=2))
+        say_failure(problems, code, as_json="--json" in sys.argv)
         sys.stdout.flush()
     except OSError:
         _drop_stdout()

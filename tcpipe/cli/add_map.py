@@ -46,7 +46,7 @@ def add_map(
     A raster is a GeoTIFF, JPEG 2000, ERDAS Imagine or VRT. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
     repeating the option; where tiles overlap, the last lies on top.
     """
-    from tcpipe.cli.output import print_json, progress
+    from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.pipeline.maps import add_map as run
 
     if strays:
@@ -58,4 +58,4 @@ def add_map(
     if as_json:
         print_json(added)
     else:
-        click.echo(str(added))
+        say_lines(added)

@@ -18,9 +18,9 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
 
     Writes to DIR (default: tcpipe-demo): real .mcap and .bag logs, real GeoTIFFs, a store, a dataset and its report.
     """
-    from tcpipe.cli.output import progress
+    from tcpipe.cli.output import progress, say_lines
     from tcpipe.pipeline.demo import run_demo
 
     with progress("demo", 1, quiet=quiet) as shown:
         result = run_demo(Path(directory), seed=seed, say=shown.line)
-    click.echo(str(result))
+    say_lines(result)

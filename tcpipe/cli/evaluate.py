@@ -40,7 +40,7 @@ def evaluate(
     Isler and the expected time; what the labels' own noise allows; each beside the paper's own figures. Networks that it trains are
     kept in OUT and used again.
     """
-    from tcpipe.cli.output import print_json, progress
+    from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.evaluation import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
 
@@ -50,4 +50,4 @@ def evaluate(
     if as_json:
         print_json(result.values)
     else:
-        click.echo(str(result))
+        say_lines(result)

@@ -51,7 +51,6 @@ def _as_json(exported: Exported) -> dict[str, Any]:
 
 def _print(exported: Exported, log: str, out: str) -> None:
     from tcpipe.cli.output import say
-    from tcpipe.errors import plain_line
 
     if exported.status == "unchanged":
         count = len(exported.topics)
@@ -63,4 +62,4 @@ def _print(exported: Exported, log: str, out: str) -> None:
             say(f"nothing to export: {log} holds no topic")
     for kind in ("damage", "remarks"):
         for line in getattr(exported, kind):
-            click.echo(plain_line(f"{kind.rstrip('s')}: {line}"), err=True)
+            say(f"{kind.rstrip('s')}: {line}", err=True)

@@ -17,7 +17,7 @@ from tcpipe.cli.options import (
     store_option,
     tag_values,
 )
-from tcpipe.errors import plain_line
+from tcpipe.cli.output import say
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestResult, IngestSummary
@@ -83,7 +83,7 @@ def ingest(
     Exit code 3: some logs failed or are damaged, and that is news: it was not told before, and not accepted (tcpipe
     accept).
     """
-    from tcpipe.cli.output import print_json_line, progress, ruling_recipe, say
+    from tcpipe.cli.output import print_json_line, progress, ruling_recipe
     from tcpipe.pipeline.ingest import ingest as run
 
     ruling, source = ruling_recipe(recipe)
@@ -133,23 +133,23 @@ def _print_one(result: IngestResult) -> None:
     aside = " (accepted)" if result.accepted else ""
     if result.status in ("failed", "waiting"):
         known = " (known, not tried again)" if result.known else ""
-        click.echo(f"{result.status:<10} {plain_line(result.log)}{aside or known}")
+        say(f"{result.status:<10} {result.log}{aside or known}")
     else:
         known = " (damaged, known)" if result.damage and not result.is_news else ""
-        click.echo(
+        say(
             f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
             f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{aside or known}"
         )
     if result.same_as:
-        click.echo(f"  {plain_line(result.log)} is the same recording as {plain_line(result.same_as)}: one run")
+        say(f"  {result.log} is the same recording as {result.same_as}: one run")
     if result.energy_budget is not None and result.status != "unchanged":
-        click.echo(f"  {in_words(result.energy_budget)}")
+        say(f"  {in_words(result.energy_budget)}")
     for note in result.notes:
-        click.echo(f"  {plain_line(note)}")
+        say(f"  {note}")
     for damage in result.damage if result.is_news or result.status == "damaged" else ():
-        click.echo(f"  damage:  {plain_line(damage)}")
+        say(f"  damage:  {damage}")
     for warning in result.warnings if result.status != "unchanged" else ():
-        click.echo(f"  warning: {plain_line(warning)}")
+        say(f"  warning: {warning}")
 
 
 def _print_sum(summary: IngestSummary) -> None:
@@ -160,14 +160,14 @@ def _print_sum(summary: IngestSummary) -> None:
         for status in ("done", "unchanged", "damaged", "failed", "waiting")
     }
     if not number:
-        click.echo("nothing to do: this shard holds none of the logs")
+        say("nothing to do: this shard holds none of the logs")
     elif count["unchanged"] + len(old) == number:
-        click.echo(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
+        say(f"nothing to do: {count['unchanged']} of {number} logs are in {summary.store} already")
     elif count["failed"] == number:
-        click.echo(f"no run came into {summary.store}: {number} of {number} logs failed")
+        say(f"no run came into {summary.store}: {number} of {number} logs failed")
     else:
         said = ", ".join(f"{of} {status}" for status, of in count.items() if of)
-        click.echo(f"{summary.store}: {said}")
+        say(f"{summary.store}: {said}")
     _print_known(summary)
 
 
@@ -178,8 +178,8 @@ def _print_known(summary: IngestSummary) -> None:
     failed = sum(result.status == "failed" for result in known)
     if failed:
         tried = "tries them" if failed > 1 else "tries it"
-        click.echo(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
+        say(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
     if len(known) > failed:
-        click.echo(f"{len(known) - failed} with known damage; 'tcpipe accept RUN' when it has been looked at")
+        say(f"{len(known) - failed} with known damage; 'tcpipe accept RUN' when it has been looked at")
     if accepted:
-        click.echo(f"{accepted} with accepted trouble")
+        say(f"{accepted} with accepted trouble")

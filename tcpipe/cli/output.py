@@ -1,10 +1,11 @@
-"""What commands print: progress on stderr, results on stdout."""
+"""What commands print: progress on stderr, results on stdout. Nothing else in `tcpipe` prints, so that every name is escaped here."""
 
 from __future__ import annotations
 
+import json
 import logging
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -49,10 +50,11 @@ class Progress:
         self._bar: Any = None
         if not quiet and sys.stderr.isatty():
             from rich.console import Console
+            from rich.markup import escape
             from rich.progress import Progress as Bar
 
             self._bar = Bar(console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
-            self._task = self._bar.add_task(what, total=total)
+            self._task = self._bar.add_task(escape(plain_line(what)), total=total)
 
     def __enter__(self) -> Self:
         """Start the bar."""
@@ -80,7 +82,7 @@ class Progress:
             if self._bar is not None:
                 self._bar.console.print(plain_line(text), markup=False, highlight=False)
             else:
-                click.echo(plain_line(text), err=True)
+                say(text, err=True)
 
     def expect(self, total: int) -> None:
         """Say how many there are."""
@@ -111,26 +113,39 @@ class _Lines(logging.Handler):
         self._shown.line(record.getMessage())
 
 
-def say(text: str) -> None:
-    """Print one line of the result on stdout."""
-    click.echo(plain_line(text))
+def say(text: str, *, err: bool = False) -> None:
+    """Print one line on stdout, or on stderr."""
+    click.echo(plain_line(text), err=err)
 
 
 def say_lines(result: object) -> None:
     """Print a result that tells itself in lines of text on stdout."""
-    for line in str(result).splitlines():
+    for line in str(result).split("\n"):
         say(line)
 
 
 def print_json(value: Any) -> None:
-    """Print one JSON object on stdout."""
+    """Print one JSON object on stdout, what no terminal should see as escapes of JSON."""
     from tcpipe.formats.json_files import to_json
 
-    click.echo(to_json(value), nl=False)
+    click.echo(_shown(to_json(value)), nl=False)
 
 
 def print_json_line(value: Any) -> None:
-    """Print one JSON object on one line of stdout."""
+    """Print one JSON object on one line of stdout, as `print_json` does."""
     from tcpipe.formats.json_files import to_json_line
 
-    click.echo(to_json_line(value))
+    click.echo(_shown(to_json_line(value)))
+
+
+def _shown(text: str) -> str:
+    return "".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
+
+
+def say_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> None:
+    """Say on stderr what went wrong, and print it on stdout as a JSON object if that is wanted."""
+    with suppress(OSError):
+        for problem in problems:
+            say(f"tcpipe: {problem}", err=True)
+    if as_json:
+        click.echo(json.dumps({"exit_code": exit_code, "problems": list(problems)}, indent=2))

@@ -26,7 +26,7 @@ def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, as_json: bo
     """
     from dataclasses import asdict
 
-    from tcpipe.cli.output import print_json, progress
+    from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.reproduction import reproduce as run
 
     with progress("reproduce", 1, quiet=quiet):
@@ -34,4 +34,4 @@ def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, as_json: bo
     if as_json:
         print_json({**asdict(result), "claims": [{**asdict(claim), "held": claim.held} for claim in result.claims]})
     else:
-        click.echo(str(result))
+        say_lines(result)

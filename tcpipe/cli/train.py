@@ -45,7 +45,7 @@ def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **
     """
     from dataclasses import asdict
 
-    from tcpipe.cli.output import print_json, progress
+    from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.fitting import FitConfig
     from tcpipe.learning.training import train as run
 
@@ -54,4 +54,4 @@ def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **
     if as_json:
         print_json({**asdict(result), "feeding_share": result.spent.feeding_share})
     else:
-        click.echo(str(result))
+        say_lines(result)

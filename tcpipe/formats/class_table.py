@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import csv
 import tomllib
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ def table_from_json(values: list[dict[str, Any]]) -> ClassTable:
 
 
 def _csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
-    reader = csv.DictReader(text.splitlines(), skipinitialspace=True)
+    reader = csv.DictReader(StringIO(text, newline=""), skipinitialspace=True)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]
     if missing:
         raise MapError(f"{path}: line 1: columns {','.join(missing)} are missing (wanted {','.join(_COLUMNS)})")
@@ -102,6 +103,9 @@ def _entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], Terrai
     if len(problems) > before or class_id is None or traversable is None:
         return None
     name = str(row["name"]).strip()
+    if not name.isprintable():
+        problems.append(f"{where}: name {name!r} holds characters that cannot be printed")
+        return None
     return [value for value in values if value is not None], TerrainClass(class_id, name, traversable=traversable)
 
 

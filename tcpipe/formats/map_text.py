@@ -9,7 +9,7 @@ _SHARES = 5
 """Classes that a line lists by their share, commonest first."""
 
 
-def map_text(summary: Mapping[str, Any]) -> str:
+def map_lines(summary: Mapping[str, Any]) -> list[str]:
     """Return where a map lies and what each layer holds; ``summary`` is `tcpipe.formats.map_files.MapFile.summary`'s."""
     rows, cols, pitch_m = summary["rows"], summary["cols"], summary["pitch_m"]
     crs = summary["crs"] if len(summary["crs"]) < 20 else "a CRS of its own"
@@ -18,7 +18,7 @@ def map_text(summary: Mapping[str, Any]) -> str:
         covered = summary["covered"][layer]
         line = f"{layer:8s} {_percent(covered):>5s} covered, from {summary['sources'][layer]}"
         lines.append(line + _detail(layer, summary))
-    return "\n".join(lines)
+    return lines
 
 
 def _detail(layer: str, summary: Mapping[str, Any]) -> str:

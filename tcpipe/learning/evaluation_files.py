@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe import __version__
-from tcpipe.errors import UsageError
+from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import digest, read_json, to_json, write_json
@@ -41,7 +41,7 @@ class EvaluationResult:
                 for quantity in QUANTITIES
             )
             lines.append(f"{split}: {part['samples']} samples, MAPE {', '.join(figures)}")
-        return "\n".join((*lines, f"open {self.path / PAGE}"))
+        return plain_lines((*lines, f"open {self.path / PAGE}"))
 
 
 def run_evaluation(

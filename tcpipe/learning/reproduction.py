@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import DatasetError, UsageError
+from tcpipe.errors import DatasetError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.claims import Claim, checked_claims
@@ -71,7 +71,7 @@ class Reproduction:
         """Return every claim and how it stands, as plain lines."""
         held = sum(claim.held for claim in self.claims)
         spent = ", ".join(f"{name} {seconds:.0f} s" for name, seconds in self.seconds.items())
-        return "\n".join(
+        return plain_lines(
             (
                 "the data are simulated: what is compared with the paper is the pattern, not the figures",
                 *(str(claim) for claim in self.claims),

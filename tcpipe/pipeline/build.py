@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 
 from tcpipe.cost.budget import in_words
-from tcpipe.errors import DatasetError
+from tcpipe.errors import DatasetError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_files import (
@@ -97,7 +97,7 @@ class BuildResult:
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
         floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
         said = (f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s"))
-        return "\n".join((head, *audit_lines(self.audit), ledger, *floor, *said))
+        return plain_lines((head, *audit_lines(self.audit), ledger, *floor, *said))
 
 
 def build_dataset(

@@ -12,6 +12,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from tcpipe.errors import plain_lines
 from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
 from tcpipe.formats.json_files import plain
 from tcpipe.pipeline.explain import flat_recipe
@@ -52,7 +53,7 @@ class Difference:
 
     def __str__(self) -> str:
         """Return the lines as one text."""
-        return "\n".join(self.lines())
+        return plain_lines(self.lines())
 
     def lines(self) -> list[str]:
         """Return causes and effects as plain lines."""

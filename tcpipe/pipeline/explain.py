@@ -14,7 +14,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe import __version__
-from tcpipe.errors import DatasetError, StoreError, TcpipeError
+from tcpipe.errors import DatasetError, StoreError, TcpipeError, plain_lines
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     open_patches,
@@ -61,7 +61,7 @@ class Explained:
 
     def __str__(self) -> str:
         """Return the lines as one text."""
-        return "\n".join(self.lines())
+        return plain_lines(self.lines())
 
     def lines(self) -> list[str]:
         """Return the history as plain lines."""

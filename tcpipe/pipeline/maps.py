@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcpipe.errors import MapError, StoreError
+from tcpipe.errors import MapError, StoreError, plain_lines
 from tcpipe.formats.atomic import place_state
 from tcpipe.formats.geotiff import raster_files
 from tcpipe.formats.map_building import build_map
 from tcpipe.formats.map_files import MapFile, open_map
-from tcpipe.formats.map_text import map_text
+from tcpipe.formats.map_text import map_lines
 from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.formats.terrain_polygons import is_drawn
 from tcpipe.report.overview import quick_look, shows_map, write_quick_look
@@ -47,7 +47,7 @@ class AddedMap:
         head = f"{self.path} (quick look: {self.picture.name})"
         if self.status == "unchanged":
             head += ": nothing to do: it is made from the same files and options"
-        return "\n".join((head, map_text(self.map), *(f"warning: {text}" for text in self.map["warnings"])))
+        return plain_lines((head, *map_lines(self.map), *(f"warning: {text}" for text in self.map["warnings"])))
 
 
 def add_map(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcpipe.errors import TcpipeError, UsageError
+from tcpipe.errors import TcpipeError, UsageError, plain_lines
 from tcpipe.formats.atomic import left_beside
 from tcpipe.formats.dataset_files import CARD
 from tcpipe.formats.seals import broken_checksums, read_sealed
@@ -39,7 +39,7 @@ class Verified:
 
     def __str__(self) -> str:
         """Return the lines as one text."""
-        return "\n".join(self.lines())
+        return plain_lines(self.lines())
 
     def lines(self) -> list[str]:
         """Return a line of what was read, and one for each problem."""

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import MapError, StoreError, UsageError
+from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive
 from tcpipe.formats.geotiff import read_bands, write_cog
 from tcpipe.formats.json_files import digest, read_json, write_json
@@ -73,7 +73,7 @@ class CostMapResult:
         reasons = ", ".join(
             f"{name.replace('_', ' ')} {share:.1%}" for name, share in self.card["reason_share"].items()
         )
-        return "\n".join(
+        return plain_lines(
             (
                 head,
                 f"{cells['with_cost']} cells with a cost, {cells['trusted']} of them on ground the model knows along some course",

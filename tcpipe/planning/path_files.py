@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcpipe.errors import StoreError, UsageError
+from tcpipe.errors import StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import read_line
 from tcpipe.formats.json_files import digest
@@ -38,7 +38,9 @@ class PathResult:
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and where the model has no business, as plain lines."""
-        return "\n".join((f"{self.path}: {cost_text(self.summary)}", *_reason_lines(self.summary), *self._out_lines()))
+        return plain_lines(
+            (f"{self.path}: {cost_text(self.summary)}", *_reason_lines(self.summary), *self._out_lines())
+        )
 
     def _out_lines(self) -> tuple[str, ...]:
         if self.out is None:

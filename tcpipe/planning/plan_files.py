@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.errors import ModelError, StoreError, UsageError
+from tcpipe.errors import ModelError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import check_lonlat, write_lines
 from tcpipe.formats.json_files import digest, read_json
@@ -65,7 +65,7 @@ class PlanResult:
                 f"warning: {first['negative_steps']} steps give back more than their height explains; taken as free"
             )
         same = ": nothing to do: it is made from the same model, map and points" if self.status == "unchanged" else ""
-        return "\n".join((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
+        return plain_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
 
 
 def plan(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -11,6 +12,10 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from tcpipe import __version__
+from tcpipe.errors import plain_line
+
+_UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
+"""Characters that cannot be seen in a page, or turn its text round: a name may hold them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,9 +46,10 @@ def render_page(
     source = files("tcpipe.report").joinpath("page.html.j2").read_text(encoding="utf-8")
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["breakable"] = _breakable
-    return environment.from_string(source).render(
+    page = environment.from_string(source).render(
         title=title, lead=lead, numbers=numbers, warnings=warnings, sections=sections, version=__version__
     )
+    return _UNSEEN.sub(lambda found: plain_line(found[0]), page)
 
 
 def _breakable(cell: object) -> str:

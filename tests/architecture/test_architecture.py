@@ -244,6 +244,22 @@ print(*sorted({name.split(".")[0] for name in sys.modules}))
     assert not set(done.stdout.split()) & HEAVY
 
 
+PRINTING = {
+    "click.echo", "click.secho", "click.echo_via_pager", "click.style", "print", "sys.stdout.write", "sys.stderr.write", "rich.print",
+    "sys.stdout.buffer.write", "sys.stderr.buffer.write", "os.write", "click.progressbar",
+}  # fmt: skip
+
+
+def test_only_one_module_prints_so_that_every_name_is_escaped():
+    printing = {
+        path
+        for path, tree in TREES.items()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in PRINTING
+    }
+    assert printing == {"cli/output.py"}
+
+
 def _tracked_files():
     if shutil.which("git") is None or not (ROOT / ".git").exists():
         pytest.skip("not a git checkout: which files belong to the project is not known here")
