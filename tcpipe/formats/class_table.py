@@ -20,6 +20,12 @@ from typing import Any
 from tcpipe.errors import MapError
 from tcpipe.terrain.classes import MAX_ID, ClassScheme, ClassTable, TerrainClass
 
+MAX_BYTES = 2_000_000
+"""Of a class table: every value of 16 bits, and to spare."""
+
+_SHOWN = 20
+_INT64 = 2**63
+
 _COLUMNS = ("value", "id", "name", "traversable")
 _TRUTH = {"true": True, "yes": True, "1": True, "false": False, "no": False, "0": False}
 
@@ -33,9 +39,14 @@ def read_class_scheme(path: Path) -> ClassScheme:
         The file cannot be read, or breaks its contract: one problem a wrong line, all at once.
     """
     try:
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise MapError(
+                f"{path}: a class table of {size / 1e6:.1f} MB, at most {MAX_BYTES // 10**6}: {MAX_ID} classes and their values"
+            )
         text = path.read_text(encoding="utf-8-sig")
         rows = _toml_rows(text) if path.suffix.lower() == ".toml" else _csv_rows(text, path)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, csv.Error) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, csv.Error, RecursionError) as error:
         raise MapError(f"{path}: the class table cannot be read ({error})") from error
     problems: list[str] = []
     classes: dict[int, TerrainClass] = {}
@@ -52,7 +63,9 @@ def read_class_scheme(path: Path) -> ClassScheme:
     if not classes and not problems:
         problems.append(f"{path}: the class table has no classes (wanted columns {','.join(_COLUMNS)})")
     if problems:
-        raise MapError(*problems)
+        raise MapError(
+            *problems[:_SHOWN], *([f"{path}: … and {len(problems) - _SHOWN} more"] if len(problems) > _SHOWN else [])
+        )
     return ClassScheme(ClassTable(tuple(classes[key] for key in sorted(classes))), dict(sorted(id_by_value.items())))
 
 
@@ -102,7 +115,7 @@ def _entry(row: Any, where: str, problems: list[str]) -> tuple[list[int], Terrai
         problems.append(f"{where}: traversable {row['traversable']!r} is neither true nor false")
     if len(problems) > before or class_id is None or traversable is None:
         return None
-    name = str(row["name"]).strip()
+    name = str(row["name"]).strip(" \t")
     if not name.isprintable():
         problems.append(f"{where}: name {name!r} holds characters that cannot be printed")
         return None
@@ -113,6 +126,7 @@ def _integer(value: Any) -> int | None:
     if isinstance(value, bool):
         return None
     try:
-        return int(str(value).strip())
+        number = int(str(value).strip())
     except ValueError:
         return None
+    return number if -_INT64 <= number < _INT64 else None

@@ -22,6 +22,17 @@ KINDS = ("train_test", "unseen", "exclude")
 _GEOMETRIES = ("Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon", "GeometryCollection")
 _WGS84_NAMES = ("CRS84", "4326")
 _MAX_OVERLAP_M2 = 0.01
+MAX_BYTES = 50_000_000
+"""Of a GeoJSON file."""
+
+MAX_VALUES = 1_500_000
+"""Lists and objects of a file, nearly all of them positions."""
+
+_MAX_DEPTH = 8
+"""Collections in one another."""
+
+_SIMPLER = "; simplify it: ogr2ogr -simplify 0.000001 out.geojson in.geojson"
+_SHOWN_CHARACTERS = 200
 _SHOWN = 5
 """Problems of one kind that an error lists."""
 
@@ -47,7 +58,7 @@ def read_regions(path: Path) -> Regions:
         if kind in KINDS:
             polygons[str(kind)] += feature.polygons
         else:
-            problems.append(f"{feature.where}: property split is {kind!r}, wanted one of {', '.join(KINDS)}")
+            problems.append(f"{feature.where}: property split is {brief(kind)}, wanted one of {', '.join(KINDS)}")
     if not problems and not any(polygons.values()):
         problems.append(f"{path}: no polygon in it; draw the region that trains and tests as a polygon")
     if not problems and not polygons["train_test"]:
@@ -89,6 +100,12 @@ def read_features(path: Path) -> Iterator[tuple[str, Mapping[str, Any], Any]]:
     yield from _features(path, _document(path))
 
 
+def brief(value: Any) -> str:
+    """Return a value as it stands in a file, cut if it is long."""
+    text = repr(value)
+    return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
+
+
 def shortened(problems: list[str]) -> list[str]:
     """Return the first few problems, and how many more there are."""
     more = len(problems) - _SHOWN
@@ -97,14 +114,21 @@ def shortened(problems: list[str]) -> list[str]:
 
 def _document(path: Path) -> Mapping[str, Any]:
     try:
-        document = json.loads(path.read_text(encoding="utf-8-sig"))
+        size = path.stat().st_size
+        if size > MAX_BYTES:
+            raise RegionError(f"{path}: {size / 1e6:.0f} MB of GeoJSON, at most {MAX_BYTES // 10**6}{_SIMPLER}")
+        text = path.read_text(encoding="utf-8-sig")
+        values = text.count("[") + text.count("{")
+        if values > MAX_VALUES:
+            raise RegionError(f"{path}: {values} positions, rings and objects, at most {MAX_VALUES}{_SIMPLER}")
+        document = json.loads(text)
     except OSError as error:
         raise RegionError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:
         raise RegionError(f"{path}: not GeoJSON: not JSON ({error})") from None
     if not isinstance(document, dict) or "type" not in document:
         raise RegionError(f"{path}: not GeoJSON: wanted an object with a 'type' such as FeatureCollection")
-    crs = json.dumps(document.get("crs"))
+    crs = json.dumps(document.get("crs"))[:_SHOWN_CHARACTERS]
     if crs != "null" and not any(name in crs for name in _WGS84_NAMES):
         raise RegionError(
             f"{path}: declares the CRS {crs}; GeoJSON is WGS84 lon/lat (RFC 7946): export it again as EPSG:4326"
@@ -122,7 +146,7 @@ def _features(path: Path, document: Mapping[str, Any]) -> Iterator[tuple[str, Ma
     elif name in _GEOMETRIES:
         features = [{"type": "Feature", "properties": None, "geometry": document}]
     else:
-        raise RegionError(f"{path}: not GeoJSON: type {name!r}, wanted FeatureCollection, Feature or a geometry")
+        raise RegionError(f"{path}: not GeoJSON: type {brief(name)}, wanted FeatureCollection, Feature or a geometry")
     for number, feature in enumerate(features):
         where = f"{path}: feature {number}"
         if not isinstance(feature, dict) or feature.get("type") != "Feature":
@@ -131,18 +155,25 @@ def _features(path: Path, document: Mapping[str, Any]) -> Iterator[tuple[str, Ma
         yield where, properties if isinstance(properties, dict) else {}, feature.get("geometry")
 
 
-def _polygons(where: str, geometry: Any, problems: list[str]) -> Iterator[BaseGeometry]:
+def _polygons(where: str, geometry: Any, problems: list[str], *, depth: int = 0) -> Iterator[BaseGeometry]:
     """Yield the sound polygons of one geometry object; add a line to ``problems`` for every unsound one."""
     name = geometry.get("type") if isinstance(geometry, dict) else None
     if geometry is None or (isinstance(geometry, dict) and not geometry.get("coordinates", geometry.get("geometries"))):
         problems.append(f"{where}: its geometry is empty; draw it or remove the feature")
     elif name == "GeometryCollection":
-        for part in geometry["geometries"]:
-            yield from _polygons(where, part, problems)
+        parts = geometry.get("geometries")
+        if depth == _MAX_DEPTH or not isinstance(parts, list):
+            problems.append(
+                f"{where}: a GeometryCollection without a list of geometries, or more than {_MAX_DEPTH} in one another"
+            )
+            return
+        for part in parts:
+            yield from _polygons(where, part, problems, depth=depth + 1)
     elif name not in ("Polygon", "MultiPolygon"):
-        problems.append(f"{where}: geometry is {name!r}, wanted Polygon or MultiPolygon")
+        problems.append(f"{where}: geometry is {brief(name)}, wanted Polygon or MultiPolygon")
     else:
-        parts = geometry["coordinates"] if name == "MultiPolygon" else [geometry["coordinates"]]
+        coordinates = geometry.get("coordinates")
+        parts = coordinates if name == "MultiPolygon" else [coordinates]
         for rings in parts if isinstance(parts, list) else [None]:
             found = _polygon(rings)
             if isinstance(found, str):
@@ -157,7 +188,7 @@ def _polygon(rings: Any) -> BaseGeometry | str:
         return "its geometry is empty; draw it or remove the feature"
     try:
         lonlat = [np.array([position[:2] for position in ring], dtype=np.float64) for ring in rings]
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, KeyError, OverflowError):
         return "its coordinates are not rings of [lon, lat] positions"
     for ring in lonlat:
         problem = _ring_problem(ring)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import PathError, RegionError
-from tcpipe.formats.geojson import read_features
+from tcpipe.formats.geojson import brief, read_features
 from tcpipe.formats.json_files import write_json
 
 _DECIMALS = 9
@@ -40,7 +40,7 @@ def read_line(path: Path) -> NDArray[np.float64]:
     if name == "MultiLineString" and isinstance(coordinates, list) and len(coordinates) == 1:
         name, coordinates = "LineString", coordinates[0]
     if name != "LineString":
-        raise PathError(f"{where}: geometry is {name!r}, wanted one LineString")
+        raise PathError(f"{where}: geometry is {brief(name)}, wanted one LineString")
     return _positions(where, coordinates)
 
 
@@ -49,7 +49,7 @@ def _positions(where: str, coordinates: Any) -> NDArray[np.float64]:
         raise PathError(f"{where}: its line has no points; wanted at least two")
     try:
         lonlat = np.array([position[:2] for position in coordinates], dtype=np.float64)
-    except (TypeError, ValueError, OverflowError):
+    except (TypeError, ValueError, KeyError, OverflowError):
         raise PathError(f"{where}: its coordinates are not [lon, lat] positions") from None
     if lonlat.ndim != 2 or lonlat.shape[1] != 2 or not np.isfinite(lonlat).all():
         raise PathError(f"{where}: its coordinates are not finite [lon, lat] positions")

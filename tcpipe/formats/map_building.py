@@ -128,8 +128,8 @@ def _write_layers(writer: MapWriter, layers: Mapping[str, Layer], grid: MapGrid)
     for role, layer in layers.items():
         for row0, col0, rows, cols in shards_of(grid, SHARD_PX):
             shard = layer.shard(grid, row0, col0, rows, cols)
-            layer.tally.count(layer, shard)
-            writer.write(role, row0, col0, shard)
+            if layer.tally.count(layer, shard):
+                writer.write(role, row0, col0, shard)
 
 
 def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Raster | None) -> tuple[ClassScheme, str]:

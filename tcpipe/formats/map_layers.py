@@ -38,13 +38,13 @@ class Tally:
     unnamed: set[int] = field(default_factory=set)
     unnamed_pixels: int = 0
 
-    def count(self, layer: Layer, shard: NDArray[Any]) -> None:
-        """Count the pixels of a shard; `MapError` if heights are not metres of dry land."""
+    def count(self, layer: Layer, shard: NDArray[Any]) -> bool:
+        """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
         if layer.role == "terrain":
             found = np.bincount(shard.reshape(-1), minlength=256)
             self.by_class += found
             self.pixels += int(found[1:].sum())
-            return
+            return bool(found[1:].any())
         present = shard[shard != 0] if layer.role == "ortho" else shard[np.isfinite(shard)]
         self.pixels += present.size
         if layer.role == "height" and present.size:
@@ -55,6 +55,7 @@ class Tally:
                     f"{layer.label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
                     f"{wrong:.6g} is no data (gdal_edit -a_nodata {wrong:.9g}), or that they are centimetres (gdal_edit -scale 0.01)"
                 )
+        return bool(present.size)
 
     def note_unnamed(self, values: NDArray[Any]) -> None:
         """Remember raster values that the class table does not name."""

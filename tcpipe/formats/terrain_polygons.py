@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, RegionError
-from tcpipe.formats.geojson import PolygonFeature, read_polygons, shortened
+from tcpipe.formats.geojson import PolygonFeature, brief, read_polygons, shortened
 from tcpipe.formats.geotiff import burn_polygons
 from tcpipe.formats.map_layers import Tally
 from tcpipe.terrain.classes import ClassScheme, name_key
@@ -36,6 +36,16 @@ _EDGE_STEP_DEG = 0.001
 
 _SEEN_OVERLAP_M2 = 1.0
 """Polygons of different classes that overlap by more than this are said."""
+
+
+_LOOKED_AT = 5_000_000
+"""Vertices of pairs of polygons that are held against each other to tell how they overlap."""
+
+_TOGETHER = 32
+"""Polygons that are held against all others at one time."""
+
+_DETAILED = 10_000
+"""A polygon of more vertices is cut to the part of the map that it is burnt into: each row of pixels looks at every edge."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +71,13 @@ class PolygonLayer:
         box = shapely.box(left, top - rows * grid.pitch_m, left + cols * grid.pitch_m, top)
         drawn = np.sort(self._tree.query(box))
         affine = (grid.pitch_m, 0.0, left, 0.0, -grid.pitch_m, top)
-        return burn_polygons(self.polygons[drawn], self.ids[drawn], affine=affine, rows=rows, cols=cols)
+        polygons = self.polygons[drawn].copy()
+        detailed = shapely.get_num_coordinates(polygons) > _DETAILED
+        polygons[detailed] = shapely.intersection(
+            polygons[detailed], shapely.buffer(box, grid.pitch_m, join_style="mitre")
+        )
+        kept = ~shapely.is_empty(polygons)
+        return burn_polygons(polygons[kept], self.ids[drawn][kept], affine=affine, rows=rows, cols=cols)
 
     def nothing(self) -> str | None:
         """No reason of its own: `place_polygons` has seen that they reach the map."""
@@ -137,7 +153,7 @@ def _class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str])
     """Return a feature's class id; 0, and a line in ``problems``, where it has none."""
     given = _property(feature.properties)
     if given is None:
-        there = ", ".join(sorted(feature.properties)) or "none"
+        there = brief(", ".join(sorted(feature.properties)) or "none")[1:-1]
         problems.append(
             f"{feature.where}: has no property {PROPERTY!r} that names its terrain (its properties: {there})"
         )
@@ -150,7 +166,7 @@ def _class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str])
         found = known.get(number)
     if found is None:
         names = ", ".join(entry.name for entry in scheme.table.classes)
-        problems.append(f"{feature.where}: {PROPERTY} {given!r} is not in the class table ({names})")
+        problems.append(f"{feature.where}: {PROPERTY} {brief(given)} is not in the class table ({names})")
     return found or 0
 
 
@@ -191,15 +207,29 @@ def _carried(
 
 
 def _overlaps(name: str, polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> Iterator[str]:
-    """Say how much ground polygons of different classes share."""
-    below, above = shapely.STRtree(polygons).query(polygons, predicate="intersects")
-    pairs = (below < above) & (ids[below] != ids[above])
-    below, above = below[pairs], above[pairs]
-    shared_m2 = shapely.area(shapely.intersection(polygons[below], polygons[above]))
-    if shared_m2.sum() > _SEEN_OVERLAP_M2:
-        worst = int(np.argmax(shared_m2))
-        names = [scheme.table.name(int(ids[part[worst]])) for part in (above, below)]
+    """Say how much ground polygons of different classes share; of very many, and of very detailed ones, not all are looked at."""
+    tree, shared_m2, worst, left = shapely.STRtree(polygons), 0.0, (0.0, ""), _LOOKED_AT
+    vertices = shapely.get_num_coordinates(polygons)
+    for first in range(0, len(polygons), _TOGETHER):
+        above, below = tree.query(polygons[first : first + _TOGETHER], predicate="intersects")
+        above += first
+        pairs = (below < above) & (ids[below] != ids[above])
+        above, below = above[pairs], below[pairs]
+        looked_at = np.cumsum(vertices[above] + vertices[below]) <= left
+        above, below = above[looked_at], below[looked_at]
+        left -= int((vertices[above] + vertices[below]).sum())
+        areas_m2 = shapely.area(shapely.intersection(polygons[below], polygons[above]))
+        shared_m2 += float(areas_m2.sum())
+        if areas_m2.size and areas_m2.max() > worst[0]:
+            at = int(np.argmax(areas_m2))
+            names = [scheme.table.name(int(ids[part[at]])) for part in (above, below)]
+            worst = float(areas_m2[at]), f"{names[0]} over {names[1]}"
+        if not looked_at.all():
+            left = 0
+            break
+    if shared_m2 > _SEEN_OVERLAP_M2:
+        more = "" if left else "at least "
         yield (
-            f"{name}: polygons of different classes overlap by {shared_m2.sum():.0f} m² (most of it {names[0]} over {names[1]}); "
+            f"{name}: polygons of different classes overlap by {more}{shared_m2:.0f} m² (most of it {worst[1]}); "
             "the later in the file lies on top"
         )

@@ -89,10 +89,16 @@ def _level(source: MapFile) -> tuple[MapFile, int]:
 
 def _thinned(level: MapFile, layer: str, step: int) -> NDArray[Any]:
     """Return every ``step``-th pixel of a layer."""
-    strip = max(step, level.tile_px // step * step)
+    side = max(step, level.tile_px * 4 // step * step)
     rows, cols = level.grid.rows, level.grid.cols
-    parts = [level.read(layer, row, min(row + strip, rows), 0, cols)[::step, ::step] for row in range(0, rows, strip)]
-    return np.concatenate(parts)
+    blocks = [
+        [
+            level.read(layer, i, min(i + side, rows), j, min(j + side, cols))[::step, ::step]
+            for j in range(0, cols, side)
+        ]
+        for i in range(0, rows, side)
+    ]
+    return np.block(blocks)
 
 
 def _shaded(height_m: NDArray[Any], pitch_m: float) -> NDArray[np.uint8]:

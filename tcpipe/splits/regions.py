@@ -24,6 +24,9 @@ _EDGE_STEP_DEG = 0.001
 _CHUNK = 65_536
 """Footprints that are geometries at one time (0.5 kB each)."""
 
+_PIECE_EDGES = 16
+"""Edges of a piece of a border."""
+
 
 class Side(IntEnum):
     """Where a footprint lies."""
@@ -95,8 +98,11 @@ def sides_of(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDAr
     Sides, shape (N,).
 
     """
-    usable, borders = shapely.difference(regions.train_test, regions.exclude), regions.borders()
-    for geometry in (usable, regions.exclude, borders):
+    usable, borders = (
+        shapely.difference(regions.train_test, regions.exclude),
+        shapely.STRtree(_pieces(regions.borders())),
+    )
+    for geometry in (usable, regions.exclude):
         shapely.prepare(geometry)
     sides = np.full(len(corners_xy_m), Side.UNSEEN, np.uint8)
     for first in range(0, len(sides), _CHUNK):
@@ -109,11 +115,27 @@ def sides_of(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDAr
     return sides
 
 
-def _on_border(squares: NDArray[np.object_], borders: BaseGeometry, *, buffer_m: float) -> NDArray[np.bool_]:
+def _pieces(borders: BaseGeometry) -> NDArray[np.object_]:
+    """Return lines in pieces of a few edges, so that a square is held against those near it, not against a whole border."""
+    lines = shapely.get_parts(borders)
+    xy_m, line = shapely.get_coordinates(lines, return_index=True)
+    begins = np.flatnonzero(np.diff(line, prepend=-1))
+    within = np.arange(len(line)) - begins[line]
+    first = np.flatnonzero((within % _PIECE_EDGES == 0) & np.append(line[1:] == line[:-1], False))
+    last = np.minimum(first + _PIECE_EDGES, np.append(begins[1:], len(line))[line[first]] - 1)
+    counts = last - first + 1
+    at = np.repeat(first, counts) + np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    return np.asarray(shapely.linestrings(xy_m[at], indices=np.repeat(np.arange(len(first)), counts)))
+
+
+def _on_border(squares: NDArray[np.object_], borders: shapely.STRtree, *, buffer_m: float) -> NDArray[np.bool_]:
     """Tell which squares a border runs through, or passes nearer than the buffer."""
     found = np.zeros(len(squares), np.bool_)
-    close = np.flatnonzero(shapely.dwithin(borders, squares, buffer_m))
-    near = shapely.distance(borders, squares[close]) < buffer_m
-    through = shapely.intersects(borders, squares[close]) & ~shapely.touches(borders, squares[close])
-    found[close] = near | through
+    if buffer_m > 0.0:
+        (square, _), distance_m = borders.query_nearest(
+            squares, max_distance=buffer_m, return_distance=True, all_matches=False
+        )
+        found[square] = distance_m < buffer_m
+    square, piece = borders.query(squares, predicate="intersects")
+    found[square[~shapely.touches(borders.geometries[piece], squares[square])]] = True
     return found

@@ -24,6 +24,12 @@ FloatArray = NDArray[np.float64]
 LATTICE_STEP_PX = 16
 """Positions are projected at every so-many-th pixel and interpolated between: 1e-7 px off for a site, 1e-3 px for a country."""
 
+MAX_PIXELS = 2**32
+"""Of a map: 3.3 km a side at 5 cm; 21 GB before compression."""
+
+MAX_SIDE_PX = 2**18
+"""Of a side of a map: 13 km at 5 cm."""
+
 _FINER = 0.95
 _TURN = 1e-9
 _EDGE_POINTS = 21
@@ -126,12 +132,23 @@ def choose_grid(height: Footing, others: Sequence[Footing], crs: CRS, pitch_m: f
         x_base, y_base = float(corners[:, 0].min()), float(corners[:, 1].max())
     elif height.on_grid_of(crs):
         x_base, y_base = x_min, y_max
+    _refuse_huge(height, (x_max - x_min, y_max - y_min), pitch)
     slack = 1e-3
     left = x_base + math.floor((x_min - x_base) / pitch + slack) * pitch
     top = y_base + math.ceil((y_max - y_base) / pitch - slack) * pitch
     cols = max(math.ceil((x_max - left) / pitch - slack), 1)
     rows = max(math.ceil((top - y_min) / pitch - slack), 1)
     return MapGrid(crs_text(crs), left, top, pitch, rows, cols)
+
+
+def _refuse_huge(height: Footing, sides_m: tuple[float, float], pitch_m: float) -> None:
+    """Refuse a grid that no disk and no night would hold."""
+    cols, rows = (side_m / pitch_m if pitch_m > 0.0 else math.inf for side_m in sides_m)
+    if not (max(cols, rows) <= MAX_SIDE_PX and cols * rows <= MAX_PIXELS):
+        raise MapError(
+            f"{height.name}: the map would have {cols:.3g} x {rows:.3g} pixels of {pitch_m:.3g} m, at most {MAX_PIXELS:.2g} in all and "
+            f"{MAX_SIDE_PX} a side; cut out the site (gdal_translate -projwin ulx uly lrx lry in.tif out.tif) or give coarser rasters"
+        )
 
 
 def _pixel_side(raster: Footing, crs: CRS) -> float:
