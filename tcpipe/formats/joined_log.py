@@ -13,6 +13,7 @@ import pyarrow as pa
 
 from tcpipe.errors import LogError
 from tcpipe.formats.log_file import Log, open_log
+from tcpipe.formats.split_bag import PartOfDrive, open_part
 from tcpipe.logs.topics import Topic
 
 
@@ -79,10 +80,10 @@ def _joined(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
         ) from None
 
 
-def open_logs(paths: Sequence[Path], *, message_definitions: Path | None = None) -> Log | JoinedLog:
+def open_logs(paths: Sequence[Path], *, message_definitions: Path | None = None) -> Log | PartOfDrive | JoinedLog:
     """Open one log, or several as one; `LogError` when a topic has different types in two of them."""
     if len(paths) == 1:
-        return open_log(paths[0], message_definitions=message_definitions)
+        return open_part(paths[0], message_definitions=message_definitions)
     with ExitStack() as stack:
         logs = [stack.enter_context(open_log(path, message_definitions=message_definitions)) for path in sorted(paths)]
         return JoinedLog(logs, stack.pop_all())

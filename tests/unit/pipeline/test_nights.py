@@ -5,10 +5,11 @@ import os
 import shutil
 
 import pytest
-from wheel_drives import START_NS, drive_at
+from wheel_drives import START_NS, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest as ingestion
 from tcpipe.errors import UsageError
+from tcpipe.formats.log_writing import MessageStream, write_bag
 from tcpipe.pipeline import known_trouble
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
@@ -284,3 +285,16 @@ def test_a_run_json_that_is_not_as_it_was_written_costs_no_other_log_and_is_made
     assert [found[name].status for name in ("other.mcap", "junk.mcap")] == ["done", "failed"]
     assert path.read_bytes() == whole, "its tags are those of the manifest, which is whole"
     assert night()[0]["other.mcap"].status == "unchanged"
+
+
+def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_before(tmp_path):
+    first, second = tmp_path / "logs" / "run_0.bag", tmp_path / "logs" / "run_1.bag"
+    first.parent.mkdir()
+    (stream,) = wheel_drive(rows=1000)
+    write_bag(first, [stream, MessageStream("/tf_static", "tf2_msgs/msg/TFMessage", stream.log_time_ns[:1])])
+    write_bag(second, wheel_drive(seed=1, start_ns=int(stream.log_time_ns[-1]) + 10**7))
+    summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
+    assert [result.status for result in summary.results] == ["done", "done"]
+    known = [Store(tmp_path / "store").run_json(result.run_id)["remarks"] for result in summary.results]
+    taken = [sum("run_0.bag ends, whose static transforms are taken" in line for line in lines) for lines in known]
+    assert taken == [0, 1]
