@@ -18,6 +18,7 @@ CARD = ModelCard(
     scale=(400.0, 1.0),
     patch_m=1.0,
     chord_m=1.0,
+    max_arc_to_chord=1.02,
     label_velocity="ground",
     robot="husky",
     classes=PAPER_CLASSES,

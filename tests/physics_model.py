@@ -55,6 +55,7 @@ class PhysicsModel:
     patch_m: float = 1.0
     patch_px: int = 40
     chord_m: float = 1.0
+    max_arc_to_chord: float = 1.02
     label_velocity: str = "ground"
     class_counts: dict = field(default_factory=lambda: dict.fromkeys(CLASSES_SEEN, 100))
     pixel_classes: tuple = CLASSES_SEEN

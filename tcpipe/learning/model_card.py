@@ -13,7 +13,7 @@ from tcpipe.terrain.classes import ClassTable
 
 KIND = "tcpipe model"
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 """Of model.json and the files beside it."""
 
 
@@ -42,6 +42,8 @@ class ModelCard:
     patch_m: float
     chord_m: float
     """d: T = d / v."""
+    max_arc_to_chord: float
+    """No segment that it was trained on is more curved."""
     label_velocity: str
     """ground or fused: which velocity v is."""
     robot: str
@@ -51,6 +53,9 @@ class ModelCard:
     """Name, checksum, data-model version and number of samples of what it was trained on."""
     training: Mapping[str, Any]
     """Loss, optimiser, seed, fold, epochs: how it was trained."""
+
+
+_PLAIN = ("patch_m", "chord_m", "max_arc_to_chord", "label_velocity", "robot", "dataset", "training")
 
 
 def card_to_json(card: ModelCard) -> dict[str, Any]:
@@ -85,7 +90,7 @@ def card_from_json(found: Mapping[str, Any], where: str) -> ModelCard:
         raise ModelError(f"{where}: written by model schema {version}, wanted {SCHEMA_VERSION}; train the model again")
     try:
         seen = found["seen"]
-        plain = {name: found[name] for name in ("patch_m", "chord_m", "label_velocity", "robot", "dataset", "training")}
+        plain = {name: found[name] for name in _PLAIN}
         return ModelCard(
             architecture=Architecture(**found["architecture"]),
             channels=tuple(found["channels"]),

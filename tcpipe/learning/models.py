@@ -92,6 +92,11 @@ class Model:
         return self.card.chord_m
 
     @property
+    def max_arc_to_chord(self) -> float:
+        """Arc over chord of the most curved segment that could train it."""
+        return self.card.max_arc_to_chord
+
+    @property
     def label_velocity(self) -> str:
         """``ground`` or ``fused``: which velocity it predicts."""
         return self.card.label_velocity

@@ -281,6 +281,7 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         scale=fitted.scale,
         patch_m=card["patch_m"],
         chord_m=card["recipe"]["segment"]["chord_m"],
+        max_arc_to_chord=card["recipe"]["segment"]["max_arc_to_chord"],
         label_velocity=card["label"]["velocity"],
         robot=", ".join(card["robots"]),
         classes=class_table(card),

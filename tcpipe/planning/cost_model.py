@@ -61,6 +61,10 @@ class CostModel(Protocol):
         """Length of the segments that it was trained on [m]."""
 
     @property
+    def max_arc_to_chord(self) -> float:
+        """Arc over chord above which no segment was trained on."""
+
+    @property
     def label_velocity(self) -> str:
         """``ground``: chord over duration; ``fused``: forward velocity along the surface (docs/adr, Velocity is chord over duration)."""
 

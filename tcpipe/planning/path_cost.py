@@ -19,7 +19,6 @@ from tcpipe.planning.path_table import PIECES
 from tcpipe.planning.pieces import Pieces, cut_path, ground_scale
 from tcpipe.planning.reasons import Reason, counts_of, names_of
 from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
-from tcpipe.recipe import SegmentConfig
 from tcpipe.terrain.patches import corners_on, footprints
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.tiles import MapReader
@@ -103,7 +102,7 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
     if not corners_on(source.grid, footprints(frames, model.patch_m)).any():
         raise PathError(off_map_text(source, where, lonlat_deg))
     said = joined(verdicts_of(model, source, in_batches(frames)))
-    said.reasons[pieces.arc_m > SegmentConfig().max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
+    said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _costed(model, source, pieces, said)
 
 

@@ -105,6 +105,8 @@ def test_a_bend_sharper_than_any_segment_is_marked_and_paid_along_its_arc():
     found = _cost(plane(), (4.0, 4.0), (8.5, 4.0), (8.5, 8.0))
     assert found.reasons == {"curved": 1}
     assert found.length_m == pytest.approx(8.5 * SCALE, rel=1e-4)
+    bent = _cost(plane(), (4.0, 4.0), (8.5, 4.0), (8.5, 8.0), model=replace(MODEL, max_arc_to_chord=1.5))
+    assert bent.reasons == {}, "a model of curved segments knows bends"
 
 
 def test_without_held_out_samples_there_are_no_intervals():
