@@ -50,7 +50,7 @@ class TcpipeError(Exception):
 
 
 class UsageError(TcpipeError):
-    """The command line asks for something impossible."""
+    """The call asks for something impossible: an option, a path where nothing or something else is."""
 
     exit_code = 2
 

@@ -26,10 +26,11 @@ from typing import Any
 
 import pyarrow as pa
 
-from tcpipe.errors import StoreError, TableError
+from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.places import local_output
 from tcpipe.formats.record_files import put_record, read_record, read_records, record_name
 from tcpipe.formats.seals import CHECKSUMS, checksums_to_json, prove_files, read_sealed, write_checksums, write_sealed
 from tcpipe.tables.levels import (
@@ -426,13 +427,11 @@ def run_at(path: Path) -> tuple[Store, list[RunDirectory]] | None:
 
 def open_store(root: str | Path, *, create: bool = False) -> Store:
     """Return the store at ``root``; `StoreError` if it is no directory, is missing (unless ``create``) or cannot be written."""
-    if "://" in str(root):
-        raise StoreError(f"{root}: this version keeps stores on local disk only; give a directory")
-    path = Path(root)
+    path = local_output(root)
     if path.exists() and not path.is_dir():
-        raise StoreError(f"{path}: is a file, wanted a directory for the store")
+        raise UsageError(f"{path}: is a file, wanted a directory for the store")
     if not path.exists() and not create:
-        raise StoreError(f"{path}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
+        raise UsageError(f"{path}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
     if create:
         try:
             path.mkdir(parents=True, exist_ok=True)

@@ -4,22 +4,30 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option, store_option
+from tcpipe.cli.options import INPUT_FILE, ONE_OF_SEVERAL, json_option, quiet_option, store_option
 from tcpipe.errors import UsageError
 
 
 @click.command("add-map", short_help="Rasters of a site into the store")
 @click.argument("name")
 @click.argument("strays", nargs=-1, metavar="")
-@click.option("--height", required=True, multiple=True, metavar="FILE", help="Height raster, metres.")
-@click.option("--ortho", multiple=True, metavar="FILE", help="Orthophoto, grey or RGB.")
+@click.option(
+    "--height", required=True, multiple=True, type=ONE_OF_SEVERAL, metavar="FILE", help="Height raster, metres."
+)
+@click.option("--ortho", multiple=True, type=ONE_OF_SEVERAL, metavar="FILE", help="Orthophoto, grey or RGB.")
 @click.option(
     "--terrain",
     multiple=True,
+    type=ONE_OF_SEVERAL,
     metavar="FILE",
     help="Terrain classes: one integer band, or GeoJSON polygons with a property 'class'.",
 )
-@click.option("--classes", metavar="FILE", help="What the terrain values mean: CSV value,id,name,traversable, or TOML.")
+@click.option(
+    "--classes",
+    type=INPUT_FILE,
+    metavar="FILE",
+    help="What the terrain values mean: CSV value,id,name,traversable, or TOML.",
+)
 @click.option(
     "--crs", metavar="EPSG:n", help="Projected, metric CRS of the map (default: the height's, or its UTM zone)."
 )

@@ -6,12 +6,27 @@ from typing import Literal
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option, recipe_option, store_option, tag_values
+from tcpipe.cli.options import (
+    INPUT_DIRECTORY,
+    INPUT_FILE,
+    OUTPUT_DIRECTORY,
+    SEED,
+    json_option,
+    quiet_option,
+    recipe_option,
+    store_option,
+    tag_values,
+)
 
 
 @click.command("build-dataset", short_help="Segments and map to a dataset")
-@click.argument("out", default="dataset", metavar="[OUT]")
-@click.option("--split", metavar="FILE", help="GeoJSON region (WGS84): inside is train and test, outside is unseen.")
+@click.argument("out", default="dataset", type=OUTPUT_DIRECTORY, metavar="[OUT]")
+@click.option(
+    "--split",
+    type=INPUT_FILE,
+    metavar="FILE",
+    help="GeoJSON region (WGS84): inside is train and test, outside is unseen.",
+)
 @click.option(
     "--map",
     "map_name",
@@ -37,9 +52,12 @@ from tcpipe.cli.options import json_option, quiet_option, recipe_option, store_o
 @click.option(
     "--holdout", type=click.Choice(["block", "sample", "run"]), help="How test is drawn (default: the recipe's)."
 )
-@click.option("--seed", type=int, help="Seed of split and row order (default: the recipe's).")
+@click.option("--seed", type=SEED, help="Seed of split and row order (default: the recipe's).")
 @click.option(
-    "--keep-split", metavar="OLD", help="An earlier dataset (OUT, too): its samples keep their split and fold."
+    "--keep-split",
+    type=INPUT_DIRECTORY,
+    metavar="OLD",
+    help="An earlier dataset (OUT, too): its samples keep their split and fold.",
 )
 @click.option(
     "--min-runs",

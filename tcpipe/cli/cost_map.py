@@ -6,19 +6,27 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import json_option, map_option, quiet_option, store_option
+from tcpipe.cli.options import (
+    INPUT_DIRECTORY,
+    OUTPUT_DIRECTORY,
+    FloatRange,
+    json_option,
+    map_option,
+    quiet_option,
+    store_option,
+)
 
 
 @click.command("cost-map", short_help="Directional cost maps of a whole map")
-@click.argument("model", metavar="MODEL")
-@click.argument("out", default="cost-map", metavar="[OUT]")
+@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
+@click.argument("out", default="cost-map", type=OUTPUT_DIRECTORY, metavar="[OUT]")
 @map_option
 @click.option(
     "--step",
     "step_m",
     default=1.0,
     show_default=True,
-    type=click.FloatRange(0.05, 1000.0),
+    type=FloatRange(0.05, 1000.0),
     metavar="METRES",
     help="Side of a cell.",
 )

@@ -4,22 +4,26 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option
+from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, json_option, quiet_option
 
 
 @click.command(short_help="Measure a model, beside the paper's tables")
-@click.argument("model", metavar="MODEL")
-@click.argument("dataset", metavar="DATASET")
-@click.argument("out", default="evaluation", metavar="[OUT]")
+@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
+@click.argument("dataset", type=INPUT_DIRECTORY, metavar="DATASET")
+@click.argument("out", default="evaluation", type=OUTPUT_DIRECTORY, metavar="[OUT]")
 @click.option(
-    "--draws", default=5, show_default=True, type=click.IntRange(1), help="Draws of noise for each ablated input set."
+    "--draws",
+    default=5,
+    show_default=True,
+    type=click.IntRange(1, 1000),
+    help="Draws of noise for each ablated input set.",
 )
 @click.option(
     "--baselines/--no-baselines", default=True, show_default=True,
     help="Train the height-only networks of Wei and Isler: one of grass, one a class.",
 )  # fmt: skip
 @click.option("--retrain", is_flag=True, help="Train a network for each input set of the ablation, too (six more).")
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of the noise.")
+@click.option("--seed", default=0, show_default=True, type=SEED, help="Of the noise.")
 @json_option
 @quiet_option
 def evaluate(

@@ -4,12 +4,19 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option, store_option
+from tcpipe.cli.options import INPUT_DIRECTORY, json_option, quiet_option, store_option
 
 
 @click.command(short_help="Where a sample came from; make it again")
 @click.argument("sample_id", metavar="SAMPLE_ID")
-@click.option("--dataset", default="dataset", show_default=True, metavar="DIR", help="The dataset that holds it.")
+@click.option(
+    "--dataset",
+    default="dataset",
+    show_default=True,
+    type=INPUT_DIRECTORY,
+    metavar="DIR",
+    help="The dataset that holds it.",
+)
 @store_option
 @json_option
 @quiet_option

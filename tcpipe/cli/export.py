@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tcpipe.cli.options import json_option, msgdef_option
+from tcpipe.cli.options import LOG, OUTPUT_DIRECTORY, json_option, msgdef_option
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.export import Exported
 
 
 @click.command(short_help="Topics of a log as Parquet")
-@click.argument("log", metavar="LOG")
+@click.argument("log", type=LOG, metavar="LOG")
 @click.argument("names", nargs=-1, metavar="[TOPIC]...")
-@click.argument("out", metavar="OUT")
+@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 @click.option("--topics", multiple=True, metavar="NAME[,NAME]", help="Only these topics; repeatable (default: all).")
 @msgdef_option
 @json_option

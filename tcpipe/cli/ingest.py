@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import click
 
 from tcpipe.cli.options import (
+    ONE_OF_SEVERAL,
     duration_value,
     msgdef_option,
     quiet_option,
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Logs to labelled 1 m segments")
-@click.argument("logs", nargs=-1, required=True, metavar="LOG...")
+@click.argument("logs", nargs=-1, required=True, type=ONE_OF_SEVERAL, metavar="LOG...")
 @store_option
 @recipe_option
 @click.option(

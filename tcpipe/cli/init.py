@@ -6,9 +6,11 @@ from pathlib import Path
 
 import click
 
+from tcpipe.cli.options import OUTPUT_DIRECTORY
+
 
 @click.command(short_help="Write a commented recipe")
-@click.argument("directory", default=".", metavar="[DIR]")
+@click.argument("directory", default=".", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 def init(directory: str) -> None:
     """Write tcpipe.toml, the recipe: every key with its default and its meaning, commented out."""
     from tcpipe.cli.output import say

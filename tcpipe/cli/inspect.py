@@ -8,12 +8,12 @@ from typing import Any
 
 import click
 
-from tcpipe.cli.options import json_option, msgdef_option, recipe_option
+from tcpipe.cli.options import LOG, json_option, msgdef_option, recipe_option
 from tcpipe.cli.output import say
 
 
 @click.command(short_help="What is in a log, map, dataset or store")
-@click.argument("path", metavar="PATH")
+@click.argument("path", type=LOG, metavar="PATH")
 @click.option("--full", is_flag=True, help="Read everything: damage and gaps, not the index alone.")
 @click.option("--robot", metavar="NAME", help="Robot profile.")
 @recipe_option

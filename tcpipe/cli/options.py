@@ -4,11 +4,54 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from math import isfinite
 from typing import Any
 
 import click
 
+from tcpipe.formats import places
+
 Command = Callable[..., Any]
+
+
+class Place(click.ParamType[str]):
+    """A path in the command line: looked at before the command begins; what it cannot be is a usage error (exit code 2)."""
+
+    name = "path"
+
+    def __init__(self, check: Callable[[str], object], *, written: bool = False, urls: bool = False) -> None:
+        self._check = check
+        self.written = written
+        """Whether the command writes there."""
+        self._urls = urls
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ARG002  click's signature
+        """Return the text as it was given."""
+        if not (self._urls and "://" in value):
+            self._check(value)
+        return value
+
+
+class FloatRange(click.FloatRange):
+    """A number within bounds; NaN is in none."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the number."""
+        found = super().convert(value, param, ctx)
+        return found if isfinite(found) else self.fail(f"{value!r} is not a finite number.", param, ctx)
+
+
+SEED = click.IntRange(0, 2**32 - 1)
+"""What every generator of random numbers takes."""
+OUTPUT_DIRECTORY = Place(places.output_directory, written=True)
+OUTPUT_FILE = Place(places.output_file, written=True)
+INPUT = Place(places.input_path)
+INPUT_FILE = Place(places.input_file)
+INPUT_DIRECTORY = Place(places.input_directory)
+LOG = Place(places.input_path, urls=True)
+"""A log, here or in object storage."""
+ONE_OF_SEVERAL = Place(str)
+"""A log or raster, by pattern or address: the command looks at each for itself, and tells of all at once."""
 
 
 def store_option(function: Command) -> Command:
@@ -18,6 +61,7 @@ def store_option(function: Command) -> Command:
         envvar="TCPIPE_STORE",
         default="tcpipe-store",
         show_default=True,
+        type=OUTPUT_DIRECTORY,
         metavar="DIR",
         help="Where runs and maps are kept (or TCPIPE_STORE).",
     )(function)
@@ -27,7 +71,7 @@ def recipe_option(function: Command) -> Command:
     """``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
     return click.option(
         "--recipe",
-        type=click.Path(dir_okay=False),
+        type=INPUT_FILE,
         metavar="FILE",
         help="Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).",
     )(function)
@@ -37,7 +81,7 @@ def msgdef_option(function: Command) -> Command:
     """``--msgdef``: definitions of types that a log does not define."""
     return click.option(
         "--msgdef",
-        type=click.Path(exists=True, file_okay=False),
+        type=INPUT_DIRECTORY,
         metavar="DIR",
         help="Directory of package/msg/Name.msg (or .idl) files for types the log does not define.",
     )(function)

@@ -8,7 +8,7 @@ from typing import Literal
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option, store_option
+from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_FILE, FloatRange, json_option, quiet_option, store_option
 
 
 def _lonlat(context: click.Context, parameter: click.Parameter, value: str) -> tuple[float, float]:
@@ -23,7 +23,7 @@ def _lonlat(context: click.Context, parameter: click.Parameter, value: str) -> t
 
 
 @click.command("plan-path", short_help="The path of least energy, time or distance")
-@click.argument("model", metavar="MODEL")
+@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
 @click.option(
     "--from", "start", required=True, metavar="LON,LAT", callback=_lonlat, help="Where it begins (WGS84, degrees)."
 )
@@ -36,17 +36,24 @@ def _lonlat(context: click.Context, parameter: click.Parameter, value: str) -> t
     help="What is to be least.",
 )
 @click.option("--map", "map_name", metavar="NAME", help="Map to plan on (default: the only one in the store).")
-@click.option("--out", default="plan.geojson", show_default=True, metavar="FILE", help="The path as GeoJSON.")
-@click.option("--picture", metavar="FILE", help="Draw all three objectives side by side on the hill (.png).")
 @click.option(
-    "--cost-map", metavar="DIR", help="A cost map of this model and map; without one only what is needed is predicted."
+    "--out", default="plan.geojson", show_default=True, type=OUTPUT_FILE, metavar="FILE", help="The path as GeoJSON."
+)
+@click.option(
+    "--picture", type=OUTPUT_FILE, metavar="FILE", help="Draw all three objectives side by side on the hill (.png)."
+)
+@click.option(
+    "--cost-map",
+    type=INPUT_DIRECTORY,
+    metavar="DIR",
+    help="A cost map of this model and map; without one only what is needed is predicted.",
 )
 @click.option(
     "--step",
     "step_m",
     default=1.0,
     show_default=True,
-    type=click.FloatRange(0.05, 1000.0),
+    type=FloatRange(0.05, 1000.0),
     metavar="METRES",
     help="Side of a cell; that of --cost-map rules.",
 )

@@ -6,14 +6,29 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import json_option, map_option, quiet_option, store_option
+from tcpipe.cli.options import (
+    INPUT_DIRECTORY,
+    INPUT_FILE,
+    OUTPUT_FILE,
+    json_option,
+    map_option,
+    quiet_option,
+    store_option,
+)
 
 
 @click.command("predict-path", short_help="Time and energy of a path")
-@click.argument("model", metavar="MODEL")
-@click.option("--path", "path_file", required=True, metavar="FILE", help="GeoJSON LineString (WGS84, lon before lat).")
+@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
+@click.option(
+    "--path",
+    "path_file",
+    required=True,
+    type=INPUT_FILE,
+    metavar="FILE",
+    help="GeoJSON LineString (WGS84, lon before lat).",
+)
 @map_option
-@click.option("--out", metavar="FILE", help="Write the table of pieces: .csv, .parquet or .json.")
+@click.option("--out", type=OUTPUT_FILE, metavar="FILE", help="Write the table of pieces: .csv, .parquet or .json.")
 @store_option
 @json_option
 @quiet_option

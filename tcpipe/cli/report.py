@@ -6,9 +6,11 @@ from pathlib import Path
 
 import click
 
+from tcpipe.cli.options import INPUT_DIRECTORY
+
 
 @click.command(short_help="HTML page of a run, dataset or store")
-@click.argument("path", metavar="PATH")
+@click.argument("path", type=INPUT_DIRECTORY, metavar="PATH")
 def report(path: str) -> None:
     """Write report.html for PATH: a run directory, a dataset, or a store (one page a run). The page needs no network."""
     from tcpipe.cli.output import say

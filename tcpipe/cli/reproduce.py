@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, json_option, quiet_option
 
 
 @click.command(short_help="The paper's experiment, on a simulated site")
-@click.argument("directory", default="tcpipe-reproduction", metavar="[DIR]")
+@click.argument("directory", default="tcpipe-reproduction", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 @click.option("--quick", is_flag=True, help="Minutes: a small site and a narrow network, to see it run.")
 @click.option(
     "--seeds", default=1, show_default=True, type=click.IntRange(1, 100), help="Trainings; claims compare their means."

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import click
 
+from tcpipe.cli.options import OUTPUT_DIRECTORY
+
 
 @click.command(short_help="The contracts as JSON Schema")
-@click.argument("out", metavar="OUT")
+@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 def schemas(out: str) -> None:
     """Write the contract of every table and of the recipe as JSON Schema, one file each, to OUT."""
     from tcpipe.cli.output import say

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, json_option, quiet_option
 
 
 @click.command(short_help="A simulated site with its truth")
-@click.argument("out", metavar="OUT")
+@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 @click.option(
     "--scenario",
     default="demo",
@@ -18,7 +18,7 @@ from tcpipe.cli.options import json_option, quiet_option
     metavar="NAME",
     help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
 )
-@click.option("--seed", default=1, show_default=True, type=int, help="Same seed, same site.")
+@click.option("--seed", default=1, show_default=True, type=SEED, help="Same seed, same site.")
 @json_option
 @quiet_option
 def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:

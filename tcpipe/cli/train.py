@@ -6,23 +6,29 @@ from typing import Any
 
 import click
 
-from tcpipe.cli.options import json_option, quiet_option
+from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRange, json_option, quiet_option
 
 
 @click.command(short_help="Train the paper's network on a dataset")
-@click.argument("dataset", metavar="DATASET")
-@click.argument("out", default="model", metavar="[OUT]")
+@click.argument("dataset", type=INPUT_DIRECTORY, metavar="DATASET")
+@click.argument("out", default="model", type=OUTPUT_DIRECTORY, metavar="[OUT]")
 @click.option(
     "--loss", default="nrmse", show_default=True, type=click.Choice(["nrmse", "paper_eq4"]),
     help="paper_eq4 is the paper's equation 4 as printed; nrmse makes both errors dimensionless.",
 )  # fmt: skip
-@click.option("--epochs", default=100, show_default=True, type=click.IntRange(1), help="At most.")
+@click.option("--epochs", default=100, show_default=True, type=click.IntRange(1, 100_000), help="At most.")
 @click.option(
-    "--patience", default=12, show_default=True, type=click.IntRange(1), help="Epochs without a better held-out loss."
+    "--patience",
+    default=12,
+    show_default=True,
+    type=click.IntRange(1, 100_000),
+    help="Epochs without a better held-out loss.",
 )
-@click.option("--batch", default=64, show_default=True, type=click.IntRange(1), help="Samples in a batch.")
-@click.option("--learning-rate", default=1e-4, show_default=True, type=click.FloatRange(0.0, min_open=True))
-@click.option("--fold", default=0, show_default=True, type=click.IntRange(0), help="Fold of train to stop early by.")
+@click.option("--batch", default=64, show_default=True, type=click.IntRange(1, 65_536), help="Samples in a batch.")
+@click.option("--learning-rate", default=1e-4, show_default=True, type=FloatRange(0.0, 1.0, min_open=True))
+@click.option(
+    "--fold", default=0, show_default=True, type=click.IntRange(0, 99), help="Fold of train to stop early by."
+)
 @click.option(
     "--mirror/--no-mirror", default=True, show_default=True, help="Mirror every other patch across its travel."
 )
@@ -34,7 +40,7 @@ from tcpipe.cli.options import json_option, quiet_option
     type=click.IntRange(16, 512),
     help="Filters of the first stage, a multiple of 16; 64 is ResNet-18.",
 )
-@click.option("--seed", default=0, show_default=True, type=click.IntRange(0), help="Of weights, shuffles and mirrors.")
+@click.option("--seed", default=0, show_default=True, type=SEED, help="Of weights, shuffles and mirrors.")
 @click.option("--fresh", is_flag=True, help="Do not go on from where an earlier training was stopped.")
 @json_option
 @quiet_option

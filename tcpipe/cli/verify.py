@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import json_option
+from tcpipe.cli.options import INPUT_DIRECTORY, json_option
 
 
 @click.command(short_help="Re-read everything, compare counts and checksums")
-@click.argument("path", metavar="PATH")
+@click.argument("path", type=INPUT_DIRECTORY, metavar="PATH")
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
     """Re-read the dataset, run, store, map, model or cost map at PATH: compare counts, checksums, contracts.

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError
+from tcpipe.formats.places import local_output
 
 TEMPORARY_PREFIX = ".tmp-"
 """What is left behind by a killed process begins with this; readers skip it."""
@@ -176,7 +177,7 @@ def _is_of_writing(error: OSError, place: Path) -> bool:
 @contextmanager
 def _parents_of(path: Path) -> Iterator[Path]:
     """Make the directories above ``path`` and yield its real place; those that were made go again on failure."""
-    place = Path(os.path.realpath(path))
+    place = Path(os.path.realpath(local_output(path)))
     missing = [parent for parent in place.parents if not parent.exists()]
     in_the_way = next((parent for parent in place.parents if parent.exists() and not parent.is_dir()), None)
     if in_the_way is not None:
@@ -226,13 +227,13 @@ def _prefix(name: str) -> str:
 
 def clear(directory: Path) -> None:
     """Put a directory in order after killed writers: what they took away comes back, what they left behind goes."""
-    for holder in _holders(directory):
+    for holder in _holders(local_output(directory)):
         _claimed(holder, lambda holder=holder: _clear_holder(holder))  # type: ignore[misc]
 
 
 def clear_beside(path: Path) -> None:
     """Clear the directory in which ``path`` lies, or would."""
-    clear(Path(os.path.realpath(path)).parent)
+    clear(Path(os.path.realpath(local_output(path))).parent)
 
 
 def left_beside(path: Path) -> list[Path]:

@@ -19,7 +19,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import DatasetError, StoreError
+from tcpipe.errors import DatasetError, StoreError, UsageError
 from tcpipe.formats.parquet import column_names, read_row_group, read_table, write_table
 from tcpipe.formats.seals import prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
@@ -250,11 +250,11 @@ def read_card(directory: Path, *, proved: bool = True) -> dict[str, Any]:
 
     """
     if not directory.exists():
-        raise DatasetError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
+        raise UsageError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
     if not directory.is_dir():
-        raise DatasetError(f"{directory}: is a file, wanted the directory of a dataset")
+        raise UsageError(f"{directory}: is a file, wanted the directory of a dataset")
     if not (directory / CARD).is_file():
-        raise DatasetError(f"{directory}: not a dataset: it has no {CARD}")
+        raise UsageError(f"{directory}: not a dataset: it has no {CARD}")
     try:
         card = read_sealed(directory / CARD, _CARD, ours=lambda found: proved and _is_current(found))
     except StoreError as error:

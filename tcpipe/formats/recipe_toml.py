@@ -16,6 +16,7 @@ from tcpipe.recipe import IngestSections, Recipe
 from tcpipe.recipe.checking import as_toml, from_values, kinds_of, range_of
 
 FILE_NAME = "tcpipe.toml"
+_MOST_BYTES = 1_000_000
 
 
 def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
@@ -35,12 +36,17 @@ def load_recipe(path: Path | None) -> Recipe:
     if path is None:
         return Recipe()
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        with path.open("rb") as stream:
+            data = stream.read(_MOST_BYTES + 1)
+        if len(data) > _MOST_BYTES:
+            raise RecipeError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, which no recipe is")
+        return parse_recipe(tomllib.loads(data.decode("utf-8")), where=str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path}: the recipe cannot be read ({getattr(error, 'strerror', None) or error})") from None
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise RecipeError(f"{path}: not a recipe: its values are nested too deep") from None
+    except ValueError as error:  # no TOML, or a number of thousands of digits
         raise RecipeError(f"{path}: not valid TOML: {error}") from None
-    return parse_recipe(values, where=str(path))
 
 
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:

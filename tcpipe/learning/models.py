@@ -21,7 +21,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import ModelError, StoreError
+from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import atomic_directory, write_text
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.parquet import read_table, write_table
@@ -184,9 +184,9 @@ def load_model(path: str | Path) -> Model:
 def read_model_card(place: Path) -> dict[str, Any]:
     """Return model.json of a folder; `ModelError` says what the folder is otherwise."""
     if not place.is_dir():
-        raise ModelError(f"{place}: there is no such model; run 'tcpipe train' first")
+        raise UsageError(f"{place}: there is no such model; run 'tcpipe train' first")
     if not (place / CARD).is_file():
-        raise ModelError(f"{place}: not a model: it has no {CARD}")
+        raise UsageError(f"{place}: not a model: it has no {CARD}")
     try:
         return read_sealed(place / CARD, {"checksums": dict}, ours=is_current)
     except StoreError as error:

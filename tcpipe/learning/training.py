@@ -13,7 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.dataset import Dataset, Split, open_dataset
-from tcpipe.errors import DatasetError, ModelError
+from tcpipe.errors import DatasetError, ModelError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.class_table import table_from_json
 from tcpipe.formats.json_files import digest
@@ -204,7 +204,7 @@ def _known(place: Path) -> dict[str, Any] | None:
         return None
     found = read_model_card(place) if (place / CARD).is_file() else {}
     if found.get("kind") != KIND:
-        raise ModelError(f"{place}: exists and is no model; it is left alone; give another OUT")
+        raise UsageError(f"{place}: exists and is no model; it is left alone; give another OUT")
     return found
 
 
@@ -213,7 +213,7 @@ def _refuse_strangers(place: Path) -> None:
     entries = {entry.name for entry in place.iterdir()} if place.is_dir() else set()
     strangers = sorted(name for name in entries - set(FILES) if not name.startswith("."))
     if strangers:
-        raise ModelError(
+        raise UsageError(
             f"{place}: holds {', '.join(strangers)} beside a model, and would be replaced; move that away, or give another OUT"
         )
 

@@ -12,7 +12,7 @@ from typing import Any
 import pyarrow as pa
 
 from tcpipe.cost.budget import in_words
-from tcpipe.errors import DatasetError, plain_lines
+from tcpipe.errors import DatasetError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_files import (
@@ -33,6 +33,7 @@ from tcpipe.formats.dataset_files import (
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import plain, write_json
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
+from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.seals import file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.zarr_arrays import Compression
@@ -155,7 +156,7 @@ def build_dataset(
 
     """
     ruling = _ruling(recipe, holdout=holdout, seed=seed)
-    place, house = Path(out), open_store(store)
+    place, house = local_output(out), open_store(store)
     clear_beside(place)
     known, proved = _card_in_place(place)
     regions = None if split is None else read_regions(Path(split))
@@ -226,9 +227,9 @@ def _card_in_place(place: Path) -> tuple[Mapping[str, Any] | None, bool]:
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None, False
     if not place.is_dir():
-        raise DatasetError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
+        raise UsageError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
     if not (place / CARD).is_file():
-        raise DatasetError(f"{place}: exists and is no dataset (it has no {CARD}); it is left alone; give another OUT")
+        raise UsageError(f"{place}: exists and is no dataset (it has no {CARD}); it is left alone; give another OUT")
     card, proved = read_card(place, proved=False), True
     try:
         read_current_card(place)
@@ -239,7 +240,7 @@ def _card_in_place(place: Path) -> tuple[Mapping[str, Any] | None, bool]:
     others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
-        raise DatasetError(f"{place}: holds {others[0]}{more} beside the dataset; move it away or give another OUT")
+        raise UsageError(f"{place}: holds {others[0]}{more} beside the dataset; move it away or give another OUT")
     return card, proved
 
 

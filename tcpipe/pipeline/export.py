@@ -13,7 +13,7 @@ from typing import Any, Literal
 import pyarrow as pa
 
 from tcpipe import __version__
-from tcpipe.errors import LogError, StoreError
+from tcpipe.errors import LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.log_file import Log, open_log
@@ -144,7 +144,7 @@ def _refuse_what_is_ours(out: Path) -> None:
     }  # fmt: skip
     kind = "store" if is_store(out) else next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
     if kind:
-        raise LogError(f"{out}: is a {kind}; give another directory for the topics")
+        raise UsageError(f"{out}: is a {kind}; give another directory for the topics")
 
 
 def _refuse_others_files(index: Mapping[str, Any], made_from: Mapping[str, Any], paths: Mapping[str, Path]) -> None:
@@ -156,11 +156,11 @@ def _refuse_others_files(index: Mapping[str, Any], made_from: Mapping[str, Any],
     taken = sorted({others[path.name] for path in paths.values() if path.name in others})
     if taken:
         out = next(iter(paths.values())).parent
-        raise LogError(f"{out}: holds the same topics of {', '.join(taken)}; give another directory")
+        raise UsageError(f"{out}: holds the same topics of {', '.join(taken)}; give another directory")
     known = {entry["file"] for entry in index["topics"].values()}
     strange = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
     if strange:
-        raise LogError(
+        raise UsageError(
             *(f"{path}: is there, and no topic that was exported; give another directory" for path in strange)
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from tcpipe.errors import LogError, TcpipeError
+from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.log_file import belongs_to_a_log, logs_below, open_log
 from tcpipe.formats.object_storage import copied, is_url
@@ -43,7 +43,7 @@ def inspect(
             return _named(_logs_at(copy, recipe, **how), str(copy), str(path).rstrip("/"))
     path = Path(path)
     if not path.exists():
-        raise LogError(f"{path}: there is no such file or directory")
+        raise UsageError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
         from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as below
 
@@ -63,7 +63,7 @@ def inspect(
 def _logs_at(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
     logs = logs_below(path) if path.is_dir() else [path]
     if not logs:
-        raise LogError(f"{path}: is no map, dataset, run or store, and holds no log")
+        raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
     if len(logs) == 1:
         return _one(logs[0], recipe, **how)
     return {"kind": "logs", "path": str(path), "logs": [_one_of(entry, recipe, **how) for entry in logs]}

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcpipe.errors import MapError, StoreError, plain_lines
+from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import place_state
 from tcpipe.formats.geotiff import raster_files
 from tcpipe.formats.map_building import build_map
@@ -85,10 +85,10 @@ def add_map(
         When a raster cannot be placed, the classes are not the store's, or the store cannot be written: the store is as it was.
 
     """
-    house = open_store(store, create=True)
-    path = house.map_path(name)
     given = {"height": height, "ortho": ortho, "terrain": terrain, "classes": classes}
     files = _found({role: value for role, value in given.items() if value})
+    house = open_store(store, create=True)
+    path = house.map_path(name)
     inputs = _inputs(files, crs)
     before = place_state(path)
     if path.exists() and not force:
@@ -136,7 +136,7 @@ def _found(given: Mapping[str, Files]) -> dict[str, list[Path]]:
         every = [Path(name) for found in matches for name in found]
         files[role] = list(reversed({path.absolute(): path for path in reversed(every)}.values()))
     if problems:
-        raise MapError(*problems)
+        raise UsageError(*problems)
     return files
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import StoreError
+from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.seals import sealed_page
 from tcpipe.report.dataset_report import dataset_report
@@ -28,7 +28,7 @@ def report(path: Path) -> list[Page]:
 
     Raises
     ------
-    StoreError
+    UsageError
         When the path is none of these.
 
     """
@@ -38,7 +38,7 @@ def report(path: Path) -> list[Page]:
     found = (store, store.runs()) if is_store(path) else run_at(path)
     if found is None or not found[1]:
         what = "is no dataset, run or store with runs" if path.exists() else "there is no such directory"
-        raise StoreError(f"{path}: {what}; give a dataset, a run of a store, or a store")
+        raise UsageError(f"{path}: {what}; give a dataset, a run of a store, or a store")
     return [_write(run.path, run_report(found[0], run)) for run in found[1]]
 
 

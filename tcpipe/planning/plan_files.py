@@ -129,8 +129,9 @@ def _card_of(path: Path, model: CostModel, source: MapFile) -> Mapping[str, Any]
     """Return the card of a cost map of this model and map; `ModelError` if it is none."""
     card = read_cost_map_card(path)
     if card is None:
-        problem = broken_seal(path / CARD) if (path / CARD).is_file() else f"{path}: not a cost map"
-        raise ModelError(f"{problem}; make one with tcpipe cost-map")
+        if not (path / CARD).is_file():
+            raise UsageError(f"{path}: not a cost map; make one with tcpipe cost-map")
+        raise ModelError(f"{broken_seal(path / CARD)}; make one with tcpipe cost-map")
     if card["key"] != cost_map_key(model, source, card["grid"]["pitch_m"]):
         raise ModelError(
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"

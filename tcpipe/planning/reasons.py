@@ -48,7 +48,7 @@ class Reason(IntFlag):
     OBSTACLE = 1 << 8
     """More than 5 % of the strip that the robot drives over (0.7 m wide) cannot be driven over, though the middle can."""
     CURVED = 1 << 9
-    """The path bends more within the metre than any segment that is trained on (arc over chord above the `max_arc_to_chord` of its recipe)."""
+    """The path bends more within the metre than any segment that is trained on (its recipe's `max_arc_to_chord`)."""
 
 
 NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.NO_MOTION

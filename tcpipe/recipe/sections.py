@@ -241,7 +241,7 @@ class SplitConfig:
     """A footprint nearer than this to a region's border goes to no split; none takes sqrt(2) times the chord [m]."""
     folds: Annotated[int, Ge(2), Le(100)] = 5
     """Folds of spatial cross-validation among train and test: whole blocks, or whole runs with the holdout run."""
-    seed: Annotated[int, Ge(0), Le(2**63 - 1)] = 0
+    seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0
     """Seed of the split and of the row order."""
 
     def __post_init__(self) -> None:

@@ -100,7 +100,7 @@ def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):
 
 def test_bad_input_is_one_plain_line(reproduced):
     here, _ = reproduced
-    assert "there is no such directory" in plain_lines(tcpipe("train", "nowhere", cwd=here, env=ENV), 1)
+    assert "there is no such directory" in plain_lines(tcpipe("train", "nowhere", cwd=here, env=ENV), 2)
     assert "run 'tcpipe train' first" in plain_lines(
         tcpipe("evaluate", "nowhere", "here/dataset", cwd=here, env=ENV), 1
     )

@@ -69,7 +69,7 @@ WRONG = {
     "segment.chord_m = 1e-300": "segment.chord_m is 1e-300; wanted from 0.05 to 1000",
     "split.test_fraction = 1.0": "split.test_fraction is 1.0; wanted from 0 to below 1",
     "split.block_m = 1e-12": "split.block_m is 1e-12; wanted from 0.1 to 1000000",
-    "split.seed = -1": "split.seed is -1; wanted from 0 to 9223372036854775807",
+    "split.seed = -1": "split.seed is -1; wanted from 0 to 4294967295",
     'fuse.estimator = "UKF"': 'fuse.estimator is "UKF"; wanted one of smoother, ukf',
     'split.holdout = "samples"': 'split.holdout is "samples"; wanted one of block, sample, run',
     "fuse.rate_hz = nan": "fuse.rate_hz is nan; wanted a finite number",
@@ -136,7 +136,18 @@ def test_a_recipe_does_not_change_with_the_lists_it_was_made_of() -> None:
     assert config.topics == {"imu": ["/imu"]}
 
 
-@pytest.mark.parametrize(("text", "said"), [("robot = ", "not valid TOML"), (None, "cannot be read")])
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("robot = ", "not valid TOML"),
+        (None, "cannot be read"),
+        ("robot = " + "[" * 100_000, "nested too deep"),
+        ("read.topics.imu = " + "[" * 200 + "]" * 200, "wanted text in quotes|nested too deep"),
+        ("split.seed = " + "9" * 5000, "not valid TOML"),
+        ("# " + "x" * 1_000_001, "larger than 1 MB"),
+    ],
+    ids=lambda of: str(of)[:20],
+)
 def test_unreadable_recipe_is_one_plain_line(tmp_path: Path, text: str | None, said: str) -> None:
     path = tmp_path / "r.toml"
     if text is not None:

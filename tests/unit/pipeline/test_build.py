@@ -6,7 +6,7 @@ import pytest
 from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file, segments
 
 from tcpipe.dataset import open_dataset
-from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError
+from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError, UsageError
 from tcpipe.formats.recipe_toml import recipe_id
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.pipeline.verify import verify
@@ -58,7 +58,7 @@ def refused(store, tmp_path, error=DatasetError, **keywords):
 
 
 def test_no_store(tmp_path):
-    assert "there is no store here" in refused(Store(tmp_path / "nowhere"), tmp_path, StoreError)
+    assert "there is no store here" in refused(Store(tmp_path / "nowhere"), tmp_path, UsageError)
 
 
 def test_no_runs(store, tmp_path):
@@ -394,4 +394,4 @@ def test_a_kept_split_moves_nothing_whatever_the_rules_are_now(store, tmp_path, 
 
 def test_a_split_to_keep_must_be_a_dataset(store, tmp_path):
     add(store)
-    assert "there is no such directory" in refused(store, tmp_path, keep_split=tmp_path / "nowhere")
+    assert "there is no such directory" in refused(store, tmp_path, UsageError, keep_split=tmp_path / "nowhere")

@@ -8,7 +8,7 @@ import pytest
 from mcap.writer import Writer
 from random_messages import ROS1, Message, random_messages, write_bag, write_mcap
 
-from tcpipe.errors import LogError
+from tcpipe.errors import LogError, UsageError
 from tcpipe.pipeline.export import export
 from tcpipe.store import Store
 
@@ -77,14 +77,14 @@ def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, sign, 
     out = tmp_path / "out"
     out.mkdir()
     (out / sign).write_text("{}")
-    with pytest.raises(LogError, match=f"out: is a {kind}; give another directory"):
+    with pytest.raises(UsageError, match=f"out: is a {kind}; give another directory"):
         export(log, out)
     assert [path.name for path in out.iterdir()] == [sign]
 
 
 def test_nothing_is_written_into_a_store(tmp_path, log):
     Store(tmp_path / "out").remember("logs/where/what", {"log": ["/a.bag"]})
-    with pytest.raises(LogError, match="out: is a store; give another directory"):
+    with pytest.raises(UsageError, match="out: is a store; give another directory"):
         export(log, tmp_path / "out")
 
 
@@ -136,7 +136,7 @@ def test_files_of_another_log_are_not_overwritten(tmp_path, log):
     export(log, tmp_path / "out", topics=["/Imu"])
     other = write_mcap(tmp_path / "b.mcap", random_messages(2, count=30, types=TYPES))
     export(other, tmp_path / "out", topics=["/Path"])
-    with pytest.raises(LogError, match=r"holds the same topics of .*a\.mcap; give another directory"):
+    with pytest.raises(UsageError, match=r"holds the same topics of .*a\.mcap; give another directory"):
         export(other, tmp_path / "out")
 
 
@@ -145,7 +145,7 @@ def test_files_that_are_none_of_an_export_are_not_overwritten(tmp_path, log):
     out.mkdir()
     pq.write_table(pa.table({"mine": [1]}), out / "Imu.parquet")
     (out / "Path.parquet").write_text("notes")
-    with pytest.raises(LogError) as refused:
+    with pytest.raises(UsageError) as refused:
         export(log, out)
     assert [line.split(": ")[0] for line in refused.value.problems] == [
         str(out / "Imu.parquet"),

@@ -4,7 +4,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from tcpipe.errors import LogError
+from tcpipe.errors import UsageError
 from tcpipe.formats.log_file import open_log
 from tcpipe.formats.log_writing import MessageStream, write_mcap
 from tcpipe.pipeline import log_stamps
@@ -147,5 +147,5 @@ def test_what_repeats_is_compared_in_every_kind_of_column():
 
 def test_a_link_that_leads_to_itself_is_refused(tmp_path):
     (tmp_path / "loop").symlink_to("loop")
-    with pytest.raises(LogError, match="there is no such file"):
+    with pytest.raises(UsageError, match="there is no such file"):
         inspect(tmp_path / "loop", recipe=Recipe())

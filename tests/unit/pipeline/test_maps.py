@@ -146,7 +146,9 @@ def test_a_disk_that_takes_no_more_leaves_the_store_as_it_was(site, store):
 
 
 def test_everything_wrong_with_the_files_is_said_at_once(site, store, tmp_path):
-    problems = refused(store, "m", height=tmp_path / "no.tif", terrain=site["terrain"], classes=tmp_path / "no.csv")
+    problems = refused(
+        store, "m", UsageError, height=tmp_path / "no.tif", terrain=site["terrain"], classes=tmp_path / "no.csv"
+    )
     assert [line.rpartition("/")[2] for line in problems] == [
         "no.tif: there is no such file",
         "no.csv: there is no such file",
@@ -288,7 +290,7 @@ def test_a_tile_that_a_pattern_names_once_more_lies_where_it_is_named_last(site,
 
 def test_what_names_no_file_is_said(site, store, tmp_path):
     given = {"height": [tmp_path, "https://x.org/dem.tif", "/vsicurl/x.tif"], "ortho": str(tmp_path / "*.jpg")}
-    assert refused(store, "m", **given) == (
+    assert refused(store, "m", UsageError, **given) == (
         f"{tmp_path}: is a directory, wanted its files: '{tmp_path}/*.tif'",
         "https://x.org/dem.tif: is an address, wanted a file on this machine: gdal_translate https://x.org/dem.tif local.tif",
         "/vsicurl/x.tif: is an address, wanted a file on this machine: gdal_translate /vsicurl/x.tif local.tif",

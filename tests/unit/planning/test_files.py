@@ -126,7 +126,7 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
             out=tmp_path / "p.json",
             picture=None,
         )
-    with pytest.raises(ModelError, match="not a cost map"):
+    with pytest.raises(UsageError, match="not a cost map"):
         plan(MODEL, source, _request(source, cost_map=tmp_path), out=tmp_path / "p.json", picture=None)
 
 
