@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test check lock schemas docs clean
+.PHONY: help demo test check check-and-train kernels lock schemas docs clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -47,8 +47,18 @@ check: .venv/installed-dev
 
 # In random order; the seed that it prints repeats it: make test PYTEST="-n 2 --randomly-seed=N".
 PYTEST ?= -n 2
-test: check $(if $(TORCH),.venv/installed-train)
+test: .venv/installed-dev
+	$(MAKE) --jobs 2 kernels check-and-train
 	$(BIN)/pytest --dist loadfile --no-loadscope-reorder $(PYTEST)
+
+check-and-train: check
+	$(if $(TORCH),$(MAKE) .venv/installed-train)
+
+# Compiled while one core checks and installs: each worker of the tests would compile them for itself.
+kernels: .venv/installed-dev
+	@rm -rf .venv/tiny
+	$(BIN)/python tests/tiny_pipeline.py .venv/tiny
+	@rm -rf .venv/tiny
 
 # The locks: hashes, no registry address. Needs uv; run it when pyproject.toml's dependencies change.
 # The one for training holds Keras and what PyTorch needs beside itself.

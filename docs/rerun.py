@@ -64,7 +64,7 @@ def _shell(body: str, directory: Path) -> str:
     env = {**clean, "PATH": f"{here}{os.pathsep}{os.environ['PATH']}", "DATA": str(_data())}
     done = subprocess.run(
         ["bash", "-c", script],  # the pages are ours
-        cwd=directory, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=600, check=False,
+        cwd=directory, env=env, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, timeout=3600, check=False,
     )  # fmt: skip
     outputs = done.stdout.split(_MARK)
     if len(outputs) != len(shown) + 1:

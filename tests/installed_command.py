@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 COMMAND = Path(sys.executable).parent / "tcpipe"
+HANGS_S = 3600.0
+"""After this long a command hangs; a machine that others use takes its time."""
 
 
 def tcpipe(
-    *arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None, timeout_s: float = 300.0
+    *arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None, timeout_s: float = HANGS_S
 ) -> subprocess.CompletedProcess[str]:
     """Run the command; nothing of the caller's TCPIPE_ environment reaches it."""
     clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")}

@@ -19,22 +19,7 @@ import tcpipe
 NEAR = 1e-9
 """Of the largest value of a column; the page says 1e-12, this leaves room for processors that were not seen."""
 
-MAKE = """
-import sys
-from pathlib import Path
-from tcpipe.pipeline.build import build_dataset
-from tcpipe.pipeline.ingest import ingest
-from tcpipe.pipeline.maps import add_map
-from tcpipe.simulation import Faults, simulate, tiny
-
-out = Path(sys.argv[1])
-site = simulate(out / "site", scenario=tiny(Faults.every()))
-first = Path(sys.argv[2]) / "site"
-layers = {name: first / path.relative_to(out / "site") for name, path in site.rasters.items()}
-assert ingest([first / path.relative_to(out / "site") for path in site.logs], store=out / "store").exit_code == 0
-add_map("site", **layers, store=out / "store")
-build_dataset(out / "dataset", store=out / "store")
-"""
+PIPELINE = Path(__file__).parents[1] / "tiny_pipeline.py"
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +27,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """Two simulated sites; the log and the rasters of the first, ingested and built on both processors."""
     places = tuple(tmp_path_factory.mktemp(name) for name in ("here", "elsewhere"))
     for place, env in zip(places, ({}, ANOTHER_PROCESSOR), strict=True):
-        subprocess.run([sys.executable, "-c", MAKE, place, places[0]], env={**os.environ, **env}, check=True)
+        subprocess.run([sys.executable, PIPELINE, place, places[0]], env={**os.environ, **env}, check=True)
     return places
 
 

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import rasterio
-from installed_command import COMMAND, plain_lines, tcpipe, told
+from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
@@ -349,7 +349,13 @@ def test_tags_are_kept_and_changed_without_doing_the_work_again(log: Path, store
 def test_a_place_without_home_and_with_nothing_writable_but_the_store(logs: list[Path], tmp_path: Path) -> None:
     env = {"HOME": "/proc", "NUMBA_CACHE_DIR": "/proc/none"}
     done = subprocess.run(
-        [COMMAND, "ingest", logs[1]], cwd=tmp_path, env=env, capture_output=True, text=True, check=False, timeout=120
+        [COMMAND, "ingest", logs[1]],
+        cwd=tmp_path,
+        env=env,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANGS_S,
     )
     assert done.returncode == 0, done.stderr
 
@@ -440,7 +446,7 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs
     running = _start("ingest", *logs, "--jobs", "2", cwd=tmp_path)
     _wait_until_fusing(running)
     running.send_signal(number)
-    _, told = running.communicate(timeout=60)
+    _, told = running.communicate(timeout=HANGS_S)
     if number != signal.SIGKILL:
         assert running.returncode == 128 + number
         assert "nothing is half-written" in told
@@ -476,7 +482,7 @@ def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_p
     batches = [[logs[1]], [tmp_path / "copy.mcap", logs[2]]]
     running = [_start("ingest", *batch, cwd=tmp_path) for batch in batches]
     for process in running:
-        _, told = process.communicate(timeout=120)
+        _, told = process.communicate(timeout=HANGS_S)
         assert process.returncode == 0, told
     assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest.json"))) == 2
     assert len(list(tmp_path.glob("tcpipe-store/records/logs/*/*.json"))) == 3

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from installed_command import COMMAND, plain_lines, tcpipe, told
+from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.writer import Writer
 from storage_server import FORBIDDEN, object_store
 from wheel_drives import drive_at
@@ -157,7 +157,7 @@ def test_each_log_is_told_as_it_ends(tmp_path):
     first = json.loads(running.stdout.readline())
     assert (first["kind"], first["log"], running.poll()) == ("log", str(tmp_path / "a.mcap"), None)
     (tmp_path / "go").touch()
-    rest, _ = running.communicate(timeout=120)
+    rest, _ = running.communicate(timeout=HANGS_S)
     assert [json.loads(line)["kind"] for line in rest.splitlines()] == ["log", "summary"]
 
 

@@ -6,7 +6,7 @@ import signal
 import subprocess
 
 import pytest
-from installed_command import COMMAND, plain_lines, tcpipe
+from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe
 
 pytest.importorskip("torch")
 pytest.importorskip("keras")
@@ -17,9 +17,7 @@ ENV = {"OMP_NUM_THREADS": "1", "KERAS_BACKEND": os.environ["KERAS_BACKEND"]}
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
     here = tmp_path_factory.mktemp("reproduced")
-    done = tcpipe(
-        "reproduce", "here", "--quick", cwd=here, env=ENV, timeout_s=1200.0
-    )  # one and a half minutes on an idle machine
+    done = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)  # one and a half minutes on an idle machine
     assert done.returncode == 0, done.stderr
     return here, done
 
@@ -86,7 +84,7 @@ def test_an_interrupted_training_ends_as_one_that_is_not(reproduced, tmp_path):
     ) as running:
         assert next(line for line in running.stderr if "epoch 1 of" in line)
         running.send_signal(signal.SIGINT)
-        told = running.communicate(timeout=120)[1]
+        told = running.communicate(timeout=HANGS_S)[1]
     assert running.returncode == 130, told
     assert "nothing is half-written" in told
     assert [path.name for path in tmp_path.iterdir()] == ["stopped.checkpoint"]
