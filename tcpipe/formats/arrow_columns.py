@@ -52,6 +52,8 @@ MIN_GROUP = 8
 """A smaller group of equal shape is not worth a layout."""
 MAX_MISSES = 3
 """After so many shapes that fitted few messages, the rest of a group counts as ragged."""
+MAX_REFUSED = 20_000
+"""Of a topic's messages that neither a layout nor a walk fits, so many are refused one by one."""
 RAGGED_BYTES = 1 << 21
 """Ragged messages are walked side by side when about this much of them has gathered."""
 
@@ -134,6 +136,7 @@ class TopicTable:
         self._gathered_bytes = 0
         self._taken_until = _BEFORE_ALL
         self._side_by_side = True
+        self._refused = 0
         self._decode_row: Callable[[bytes], dict[str, Any]] | None = None
 
     def add(self, block: MessageBlock) -> None:
@@ -368,11 +371,15 @@ class TopicTable:
             self._leave_out(str(error), len(rows))
             return
         kept, values = [], []
-        for row, start, end in zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True):
+        for number, (row, start, end) in enumerate(zip(rows.tolist(), starts.tolist(), ends.tolist(), strict=True)):
+            if self._refused > MAX_REFUSED:
+                self._leave_out("so many of the topic's do not fit that the rest is not tried", len(rows) - number)
+                break
             try:
                 values.append(decode(data[start:end].tobytes()))
             except RowError as error:
                 self._leave_out(str(error), 1)
+                self._refused += 1
             else:
                 kept.append(row)
         names = [name for name, _ in flat_fields(self._type.wire)]

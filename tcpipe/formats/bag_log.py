@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.errors import LogError
 from tcpipe.formats.chunk_runs import (
     MAX_PLANNED_BYTES,
     Entries,
@@ -27,6 +28,7 @@ from tcpipe.formats.chunk_runs import (
 )
 from tcpipe.formats.log_part import (
     MAX_CHUNK_BYTES,
+    Bounds,
     ByteSource,
     Channel,
     DamageError,
@@ -131,13 +133,22 @@ class BagPart:
         self._chunks: list[_Chunk] = []
         self._without_checksum = False
         self._index_heads: dict[int, tuple[int, int, int, bytes]] = {}
+        self._bounds = Bounds(path, self._bytes.size)
+        try:
+            self._read_index_or_walk()
+        except LogError:
+            self.close()
+            raise
+        self.channels = {number: _channel(self._connections[number]) for number in sorted(self._connections)}
+
+    def _read_index_or_walk(self) -> None:
         try:
             self._read_index()
         except DamageError as error:
             self._note(self._bytes.size, f"{error}; it is read record by record")
             self._connections, self._chunks = {}, []
             self._walk()
-        self.channels = {number: _channel(self._connections[number]) for number in sorted(self._connections)}
+        self._bounds.claim(self._chunk_record(chunk)[1] for chunk in self._chunks)
 
     def close(self) -> None:
         """Close the file."""
@@ -216,15 +227,19 @@ class BagPart:
             except DamageError as error:
                 noted.append(self._lost(member.chunk, str(error)))
             else:
-                walked = _walk_chunk(data)
+                walked = self._walked(member.chunk, data)
                 by_connection = {number: walked.messages(number) for number in wanted & walked.offsets.keys()}
                 connections, offsets, stamps = _joined(by_connection)
                 noted += self._contradictions(member.chunk, walked, len(data))
-                if run.plan.entries is not None:
-                    noted += self._disagreement(
-                        member.chunk, (offsets, connections, stamps), run.plan.entries.of_chunk(number)
-                    )
+                entries = None if run.plan.entries is None else run.plan.entries.of_chunk(number)
+                noted += self._disagreement(member, (offsets, connections, stamps), entries)
                 yield from _blocks(data, connections, offsets, stamps, member.base + offsets)
+
+    def _walked(self, chunk: _Chunk, data: memoryview) -> _ChunkRecords:
+        """Step through the records of a chunk."""
+        walked = _walk_chunk(data, self._bounds.most_records)
+        self._bounds.walk(chunk.offset, walked.count)
+        return walked
 
     def _contradictions(self, chunk: _Chunk, walked: _ChunkRecords, size: int) -> list[Damage]:
         """Return what is wrong with a chunk of ``size`` bytes of which each record was looked at."""
@@ -242,16 +257,22 @@ class BagPart:
             found.append(Damage(where, what, messages_lost=lost or None))
         return found
 
-    def _disagreement(self, chunk: _Chunk, messages: _Messages, entries: Entries) -> list[Damage]:
-        """Return what to say where the index behind a chunk names other messages than its records: neither has a checksum."""
-        offsets, connections, stamps = messages
-        order = np.argsort(offsets)
-        mine = np.stack([offsets[order], connections[order], stamps[order]])
-        if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+    def _disagreement(self, member: _PlacedChunk, messages: _Messages, entries: Entries | None) -> list[Damage]:
+        """Return what to say where the index behind a chunk is broken, or names other messages; bz2 proves that the chunk is right."""
+        chunk = member.chunk
+        if entries is None and (chunk.counts is None or chunk.cut or member.size > MAX_PLANNED_BYTES):
             return []
-        what = "the index of a chunk names other messages than the chunk holds, which are read"
-        lost = max(len(entries.offset) - len(offsets), 0) or None
-        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=lost)]
+        what, lost = "the index of a chunk is broken; its messages are read without it", 0
+        if entries is not None:
+            offsets, connections, stamps = messages
+            order = np.argsort(offsets)
+            mine = np.stack([offsets[order], connections[order], stamps[order]])
+            if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+                return []
+            what = "the index of a chunk names other messages than the chunk holds, which are read"
+            lost = max(len(entries.offset) - len(offsets), 0)
+        right = member.record is not None and _codec(member.record) == "bz2"
+        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=0 if right else lost or None)]
 
     def _entries(self, members: list[_PlacedChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of several chunks by the index records behind them, and of which chunks these are sound."""
@@ -385,12 +406,14 @@ class BagPart:
         if chunk.offset >= self._bytes.size or not counts.keys() <= self._connections.keys():
             raise DamageError("the bag's index points outside the file")
         self._chunks.append(chunk)
+        self._bounds.count(len(self._chunks), 0)
         for connection, count in counts.items():
             self._tally(connection, count, chunk.start_ns, chunk.end_ns)
 
     def _take_connection(self, record: _Record, data: memoryview | bytes) -> None:
         described = _header_fields(data)
         topic = record.fields.get(b"topic", described.get(b"topic", b""))
+        self._bounds.count(len(self._chunks), len(self._connections))
         self._connections.setdefault(
             record.number(b"conn"),
             _Connection(
@@ -435,10 +458,11 @@ class BagPart:
         except DamageError as error:
             self.damage[self._lost(chunk, str(error))] = None
             return
-        found = _walk_chunk(data)
+        found = self._walked(chunk, data)
         for connection in found.connections:
             self._take_connection(connection, data[connection.data_offset : connection.end])
         self._chunks.append(chunk)
+        self._bounds.count(len(self._chunks), 0)
         self.damage.update(dict.fromkeys(self._contradictions(chunk, found, len(data))))
         for number in found.offsets.keys() & self._connections.keys():
             _, stamps = found.messages(number)
@@ -515,20 +539,21 @@ class BagPart:
 
 @dataclass(slots=True)
 class _ChunkRecords:
-    """What a walk through a chunk met: connections, each connection's messages, and where the records end."""
+    """What a walk through a chunk met: connections, each connection's messages, where the records end, and how many there are."""
 
     connections: list[_Record] = field(default_factory=list)
     offsets: dict[int, list[int]] = field(default_factory=dict)
     stamps: dict[int, list[int]] = field(default_factory=dict)
     end: int = 0
+    count: int = 0
 
     def messages(self, connection: int) -> tuple[Int64Array, Int64Array]:
         """Return a connection's message offsets and log times."""
         return np.array(self.offsets[connection], np.int64), np.array(self.stamps[connection], np.int64)
 
 
-def _walk_chunk(data: memoryview) -> _ChunkRecords:
-    """Step through the records of a chunk; one that does not fit ends the walk.
+def _walk_chunk(data: memoryview, most: int) -> _ChunkRecords:
+    """Step through the records of a chunk; one that does not fit, or is one too many, ends the walk.
 
     A message's header differs from the one before it in connection and time only, so that most need no parsing.
     """
@@ -536,7 +561,7 @@ def _walk_chunk(data: memoryview) -> _ChunkRecords:
     length_at = struct.Struct("<I").unpack_from
     known: dict[bytes, int] = {}
     time_at = 0
-    while position + 8 <= size:
+    while position + 8 <= size and found.count <= most:
         header_end = position + 4 + length_at(data, position)[0]
         if header_end + 4 > size:
             break
@@ -562,6 +587,7 @@ def _walk_chunk(data: memoryview) -> _ChunkRecords:
             found.offsets.setdefault(connection, []).append(position)
             found.stamps.setdefault(connection, []).append(seconds * _NS + nanoseconds)
         found.end = position = end
+        found.count += 1
     return found
 
 

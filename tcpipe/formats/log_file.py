@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import resource
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
@@ -32,16 +33,22 @@ from tcpipe.formats.rosbag2_log import (
     rosbag2_files,
 )
 from tcpipe.formats.sqlite_log import SqlitePart
-from tcpipe.logs.topics import Damage, Topic
+from tcpipe.logs.topics import Damage, Topic, condensed
 
 LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd")
 
 BATCH_BYTES = 1 << 25
 """About how much a piece of a log takes in memory."""
 
+MAX_TOPICS = 10_000
+"""A log of more topics is refused; a robot has some hundred. A topic costs a millisecond, however small."""
+MAX_COLUMNS = 200_000
+"""Topics that unfold to more columns together are not read at once; five hundred topics of a robot have some 20,000."""
+
 _WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
 _HASH_BYTES = 1 << 20
 _LISTED = 5
+_OTHER_FILES = 256
 _FILE_SYSTEMS_OWN = ("lost+found",)
 _KNOWN_MAGIC = (
     (b"PK\x03\x04", "a zip archive"),
@@ -121,7 +128,7 @@ def find_logs(path: Path) -> list[Path]:
 
 def logs_below(directory: Path) -> list[Path]:
     """Return the logs in a directory as `find_logs` does; none where there is none."""
-    return list(_logs_below(directory, set()))
+    return list(_logs_below(directory))
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +190,7 @@ class Log:
         found = dict(self._damage)
         for part in self._parts:
             found.update(part.damage)
-        return list(found)
+        return condensed(list(found))
 
     @property
     def remarks(self) -> list[str]:
@@ -321,7 +328,14 @@ class Log:
             raise LogError(
                 *(f"{self.path}: there is no topic {name}; it has {_listed(self.topics)}" for name in unknown)
             )
-        types = {name: self._message_type(name) for name in wanted}
+        types, columns = {}, 0
+        for name in wanted:
+            types[name] = of = self._message_type(name)
+            columns += of.wire.leaves if of is not None else 0
+            if columns > MAX_COLUMNS:
+                raise LogError(
+                    f"{self.path}: its topics unfold to more than {MAX_COLUMNS} columns; read fewer of them at once"
+                )
         return {
             name: TopicTable(
                 of,
@@ -385,6 +399,9 @@ class Log:
         if missing > 0 and not self.damage:
             what = f"the index counts {missing} messages more than the file holds"
             self._damage[Damage(self.path.name, what, name, missing)] = None
+        if missing < 0 and not self.damage:
+            what = f"the file holds {-missing} messages more than its index counts; they may be another topic's"
+            self._damage[Damage(self.path.name, what, name)] = None
         for reason, count in topic_table.undecodable.items():
             what = f"messages do not fit their definition: {reason}"
             self._damage[Damage(self.path.name, what, name, count)] = None
@@ -405,6 +422,8 @@ class Log:
             first = self._channel_of.setdefault(channel.topic, channel)
             if channel is first:
                 topics[channel.topic] = topic
+                if len(topics) > MAX_TOPICS:
+                    raise LogError(f"{self.path}: it holds more than {MAX_TOPICS} topics; no such log is read")
             elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
                 topics[channel.topic] = topics[channel.topic].joined(topic)
         return topics
@@ -437,6 +456,7 @@ def _open_file(path: Path, stack: ExitStack) -> _OpenFiles:
 def _open_directory(directory: Path, stack: ExitStack) -> _OpenFiles:
     """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
     found = rosbag2_files(directory)
+    _allow_files(len(found.paths))
     parts, damage, errors = [], list(found.damage), []
     for file in found.paths:
         try:
@@ -447,6 +467,15 @@ def _open_directory(directory: Path, stack: ExitStack) -> _OpenFiles:
     if not parts:
         raise LogError(*(problem for error in errors for problem in error.problems))
     return _OpenFiles("rosbag2", found.paths, tuple(parts), tuple(damage), found.message_count, found.topic_counts)
+
+
+def _allow_files(count: int) -> None:
+    """Let this process hold so many files open, where the system lets it: 1024 is usual, and many more are allowed."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 2 * count + _OTHER_FILES
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
@@ -508,28 +537,37 @@ def _described(path: Path, magic: bytes) -> str:
     return f"it is {path.stat().st_size} bytes that begin with {magic[:8]!r}"
 
 
-def _logs_below(directory: Path, seen: set[Path]) -> Iterable[Path]:
-    real = directory.resolve()
-    if real in seen:
-        return
-    seen.add(real)
-    try:
-        entries = [(entry, _is_directory(entry)) for entry in sorted(directory.iterdir(), key=lambda entry: entry.name)]
-        one_bag = is_one_bag(directory)
-    except OSError:
-        yield directory
-        return
-    if one_bag:
-        yield directory
+def _logs_below(directory: Path) -> Iterator[Path]:
+    """Yield the logs in and below a directory; each directory is looked at once, whatever links lead to it."""
+    seen: set[Path] = set()
+    waiting = [(directory, True)]
+    while waiting:
+        path, is_directory = waiting.pop()
+        if not is_directory:
+            yield path
+        elif (real := path.resolve()) not in seen:
+            seen.add(real)
+            try:
+                waiting += reversed(_entries(path))
+            except OSError:
+                yield path
+
+
+def _entries(directory: Path) -> list[tuple[Path, bool]]:
+    """Return what may be a log in a directory, and whether it is one that has to be looked into; the directory itself where it is a bag."""
+    entries = [(entry, _is_directory(entry)) for entry in sorted(directory.iterdir(), key=lambda entry: entry.name)]
+    one_bag = is_one_bag(directory)
+    found = [(directory, False)] if one_bag else []
     for entry, is_directory in entries:
         if entry.name.startswith((".", "~")) or entry.name in _FILE_SYSTEMS_OWN:
             continue
         if is_directory:
-            yield from _logs_below(entry, seen)
+            found.append((entry, True))
         elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
             continue
         elif entry.name.lower().endswith(LOG_SUFFIXES) and (entry.is_symlink() or entry.is_file()):
-            yield entry
+            found.append((entry, False))
+    return found
 
 
 def _is_directory(path: Path) -> bool:

@@ -21,12 +21,20 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.errors import LogError
 from tcpipe.logs.topics import Damage
 
-MAX_CHUNK_BYTES = 1 << 30
-"""A chunk that claims to hold more than this is taken for damaged."""
+MAX_CHUNK_BYTES = 1 << 29
+"""A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
 _PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO = 1 << 26, 1000
 """What claims to hold more than both so many bytes and so many times its compressed size is taken for damaged: a bomb."""
+MAX_CHUNKS = 1 << 20
+"""A file of more chunks is refused: of chunks of a megabyte, as writers make them, this is a terabyte."""
+MAX_CHANNELS = 1 << 16
+"""More channels or connections of a file are refused: MCAP cannot number more."""
+_FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 22, 2
+"""A file that holds more records than the first, and than one for so many of its bytes, is a bomb: a message alone has two times."""
+_PLAUSIBLE_TOTAL = 1 << 30
 SEARCH_BYTES = 1 << 20
 
 _LZ4_HEAD = struct.Struct("<4sBBQ")
@@ -108,6 +116,14 @@ def blocks_by_channel(
         )
         for a, b, low, high in zip(starts, [*starts[1:], len(channels)], least, most, strict=True)
     ]
+
+
+def grouped(keys: Int64Array) -> Iterator[tuple[int, Int64Array]]:
+    """Yield each key, rising, and where it stands, shape (M,) each: at the cost of one sort, however many keys there are."""
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[:1]] - 1))
+    for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(order)], strict=False):
+        yield int(keys[order[start]]), order[start:end]
 
 
 class LogPart(Protocol):
@@ -202,6 +218,8 @@ class ByteSource:
 
     def _some(self, offset: int, size: int) -> bytes:
         """Return up to ``size`` bytes at ``offset``, at least one unless the file ends there."""
+        if offset > self.size:  # also what no system call takes
+            return b""
         try:
             return os.pread(self._file.fileno(), size, offset)
         except OSError as error:
@@ -285,6 +303,47 @@ def is_bomb(compressed_bytes: int, size: int) -> bool:
     return size > _PLAUSIBLE_BYTES and size > _PLAUSIBLE_RATIO * compressed_bytes
 
 
+class Bounds:
+    """What one file may hold, by its size: `LogError` where it holds more, since it was made to take all memory or time.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Its size [byte].
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._path, self._size = path, size
+        self.most_records = max(_FEW_RECORDS, size // _LEAST_RECORD_BYTES)
+        self._seen: set[int] = set()
+        self._records = 0
+
+    def claim(self, chunk_sizes: Iterable[int]) -> None:
+        """Take what all chunks claim to hold [byte]."""
+        total = sum(min(size, MAX_CHUNK_BYTES) for size in chunk_sizes)
+        if total > _PLAUSIBLE_TOTAL and is_bomb(self._size, total):
+            raise self._bomb(f"its chunks claim to hold {total} bytes in {self._size}")
+
+    def walk(self, chunk: int, records: int) -> None:
+        """Take how many records the chunk at a byte of the file holds."""
+        if chunk not in self._seen:
+            self._seen.add(chunk)
+            self._records += records
+        if self._records > self.most_records:
+            raise self._bomb(f"it holds more than {self.most_records} records in {self._size} bytes")
+
+    def count(self, chunks: int, channels: int) -> None:
+        """Take how many chunks and channels there are."""
+        for count, most, what in ((chunks, MAX_CHUNKS, "chunks"), (channels, MAX_CHANNELS, "topics or connections")):
+            if count > most:
+                raise self._bomb(f"it holds more than {most} {what}")
+
+    def _bomb(self, why: str) -> LogError:
+        return LogError(f"{self._path}: {why}; it is taken for a bomb, not a log")
+
+
 def search_windows(start: int, end: int, overlap: int) -> Iterator[tuple[int, int, int]]:
     """Yield (start, size to search, size to read) of pieces to search one after the other, small at first.
 
@@ -352,15 +411,14 @@ def _lz4_content_bytes(frame: memoryview) -> int:
 def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
     """Return as many of the ``size`` bytes as the cut ``data`` still gives."""
     _refuse_unknown(codec)
-    pieces, found = [], 0
+    found = bytearray()
     try:
         with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
-            while found < min(size, MAX_CHUNK_BYTES) and (piece := stream.read(4096)):
-                pieces.append(piece)
-                found += len(piece)
+            while len(found) < min(size, MAX_CHUNK_BYTES) and (piece := stream.read(4096)):
+                found += piece
     except OSError:  # the cut is reached
         pass
-    return memoryview(b"".join(pieces)[:size])
+    return memoryview(found)[:size]
 
 
 def gathered(buffer: bytes | memoryview, offsets: Int64Array, code: str) -> Int64Array:

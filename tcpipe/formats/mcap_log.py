@@ -6,6 +6,7 @@ covers) is believed only as far as the chunk's own records bear it out.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -15,9 +16,11 @@ import numpy as np
 from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
+from tcpipe.errors import LogError
 from tcpipe.formats.chunk_runs import MAX_PLANNED_BYTES, Entries, Run, by_place, copy_pieces, excerpt, groups, runs
 from tcpipe.formats.log_part import (
     MAX_CHUNK_BYTES,
+    Bounds,
     ByteSource,
     Channel,
     DamageError,
@@ -26,6 +29,7 @@ from tcpipe.formats.log_part import (
     decompressed,
     decompressed_prefix,
     gathered,
+    grouped,
     in_order,
     listed,
 )
@@ -65,6 +69,8 @@ from tcpipe.formats.mcap_records import (
 )
 from tcpipe.logs.topics import Damage, normalized_type_name
 
+_DATA_END = RECORD_HEAD + 4
+"""Bytes of the record that ends the data, right before the summary."""
 _RUN_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
 
@@ -79,13 +85,12 @@ class _Contents:
     statistics: Statistics | None = None
 
     def note(self, opcode: int, content: bytes | memoryview) -> None:
-        """Remember a schema or channel; the first of a number holds."""
-        if opcode == OP_SCHEMA:
-            number, schema = parse_schema(content)
-            self.schemas.setdefault(number, schema)
-        elif opcode == OP_CHANNEL:
-            number, channel = parse_channel(content)
-            self.channels.setdefault(number, channel)
+        """Remember a schema or channel; the first of a number holds, and others are not looked at, however many there are."""
+        number = int.from_bytes(content[:2], "little")
+        if opcode == OP_SCHEMA and number not in self.schemas:
+            self.schemas.setdefault(*parse_schema(content))
+        elif opcode == OP_CHANNEL and number not in self.channels:
+            self.channels.setdefault(*parse_channel(content))
 
 
 @dataclass(slots=True)
@@ -105,13 +110,26 @@ class McapPart:
         self.damage: dict[Damage, None] = {}
         self._bytes = ByteSource(path)
         self._tallies: dict[int, _Tally] = {}
+        self._untimed = 0
         self._complete = False
         self._read_chunks: set[int] = set()
         self._without_crc: set[int] = set()
+        self._bounds = Bounds(path, self._bytes.size)
+        try:
+            self._read_index()
+            self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
+        except LogError:
+            self.close()
+            raise
+        self.channels = {number: self._channel(number) for number in sorted(self._contents.channels)}
+
+    def _read_index(self) -> None:
+        """Read the summary, or, where it cannot be used, walk the file."""
         try:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
                 self._note(0, "the file's first bytes are not those of an MCAP file", messages_lost=0)
             self._contents = self._summary()
+            self._bounds.claim(chunk.size for chunk in self._contents.chunks)
         except DamageError as error:
             if str(error):
                 self._note(self._bytes.size, f"{error}; it is read record by record")
@@ -119,8 +137,8 @@ class McapPart:
             if not self._walk(self._contents, len(MAGIC), self._bytes.size):
                 self._distrust_last_index(self._contents)
             self._complete = True
+            self._bounds.claim(chunk.size for chunk in self._contents.chunks)
             self._count_messages()
-        self.channels = {number: self._channel(number) for number in sorted(self._contents.channels)}
 
     def close(self) -> None:
         """Close the file."""
@@ -198,21 +216,27 @@ class McapPart:
             else:
                 offsets = self._walked_messages(chunk, data, noted)
                 heads = message_heads(data, offsets)
-                chosen = np.isin(heads["channel"], sorted(wanted))
+                chosen = _chosen(wanted)[heads["channel"]]
                 offsets, heads = offsets[chosen], heads[chosen]
-                if run.plan.entries is not None:
-                    noted += self._disagreement(chunk, offsets, heads, run.plan.entries.of_chunk(number))
+                entries = None if run.plan.entries is None else run.plan.entries.of_chunk(number)
+                noted += self._disagreement(chunk, offsets, heads, entries)
                 yield from self._in_time(data, offsets, heads, offsets + base, noted)
+
+    def _records(self, chunk: Chunk, data: memoryview) -> tuple[Int64Array, int]:
+        """Return where the records of a chunk begin, and where they end."""
+        records, end = record_offsets(data, self._bounds.most_records)
+        self._bounds.walk(chunk.offset, len(records))
+        return records, end
 
     def _walked_messages(self, chunk: Chunk, data: memoryview, noted: list[Damage]) -> Int64Array:
         """Return where the messages of a chunk begin, by its records; where these end too early, or are none, that is noted."""
-        records, end = record_offsets(data)
+        records, end = self._records(chunk, data)
         messages = message_offsets(data, records)
         lost = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) - len(messages) if len(records) else 0
         channels = message_heads(data, messages)["channel"]
         where = f"{self.name}, byte {chunk.offset}"
         if lost:
-            noted.append(Damage(where, "messages of a chunk have no times", messages_lost=lost))
+            noted.append(Damage(where, "messages without times", messages_lost=lost))
         if end < len(data) and not chunk.cut:
             noted.append(Damage(where, "the records of a chunk end before it does", bytes_lost=len(data) - end))
         unknown = [number for number in np.unique(channels).tolist() if number not in self._contents.channels]
@@ -223,16 +247,20 @@ class McapPart:
         return messages
 
     def _disagreement(
-        self, chunk: Chunk, offsets: Int64Array, heads: NDArray[np.void], entries: Entries
+        self, chunk: Chunk, offsets: Int64Array, heads: NDArray[np.void], entries: Entries | None
     ) -> list[Damage]:
-        """Return what to say where a chunk's index names other messages than its records; with a CRC the records are right."""
-        mine = np.stack([offsets, heads["channel"].astype(np.int64), heads["log_time_ns"]])
-        theirs = np.stack([entries.offset, entries.channel, entries.log_time_ns])
-        if np.array_equal(mine, theirs):
+        """Return what to say where a chunk's index is broken, or names other messages; with a CRC the chunk is right."""
+        checked, large = self._crc(chunk), chunk.size > MAX_PLANNED_BYTES
+        if entries is None and (checked or chunk.index is None or chunk.cut or large):
             return []
-        what = "the index of a chunk names other messages than the chunk holds, which are read"
-        lost = 0 if self._crc(chunk) else max(len(entries.offset) - len(offsets), 0) or None
-        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=lost)]
+        what, lost = "the index of a chunk is broken; its messages are read without it", 0
+        if entries is not None:
+            mine = np.stack([offsets, heads["channel"].astype(np.int64), heads["log_time_ns"]])
+            if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+                return []
+            what = "the index of a chunk names other messages than the chunk holds, which are read"
+            lost = max(len(entries.offset) - len(offsets), 0)
+        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=0 if checked else lost or None)]
 
     def _in_time(
         self, data: memoryview, offsets: Int64Array, heads: NDArray[np.void], ordinals: Int64Array, noted: list[Damage]
@@ -360,6 +388,8 @@ class McapPart:
         end = self._bytes.size - tail_bytes
         if not len(MAGIC) <= start <= end:
             raise DamageError("the footer points outside the file")
+        if self._bytes.peek(start - _DATA_END, RECORD_HEAD) != bytes([OP_DATA_END, _DATA_END - RECORD_HEAD, *bytes(7)]):
+            raise DamageError("the footer does not point behind the data")
         section = self._bytes.read(start, end - start + RECORD_HEAD + 16)
         if crc and crc32(section) != crc:
             raise DamageError("the summary's CRC does not match")
@@ -381,6 +411,8 @@ class McapPart:
             raise DamageError
         if any(chunk.end > self._bytes.size or chunk.offset < len(MAGIC) for chunk in contents.chunks):
             raise DamageError("the summary points outside the file")
+        if any(later.offset < chunk.end for chunk, later in itertools.pairwise(contents.chunks)):
+            raise DamageError("the summary names a chunk twice")
 
     def _fill_gaps(self) -> None:
         """Walk what lies between the chunks that the summary names: message indexes, and messages outside chunks."""
@@ -392,7 +424,7 @@ class McapPart:
             self._contents.chunks.append(chunk)
             position = chunk.end + chunk.index_bytes
         self._walk(self._contents, position, self._bytes.size)
-        self._note_undeclared()
+        self._note_odd_messages()
 
     def _check_data_section(self, contents: _Contents, end: int) -> None:
         """Compare the CRC of all data, where there is one, if messages lie outside chunks: nothing else covers these."""
@@ -449,6 +481,9 @@ class McapPart:
     def _take_record(self, contents: _Contents, opcode: int, position: int, after: int, end: int) -> None:
         if opcode == OP_CHUNK:
             contents.chunks.append(self._walked_chunk(position, after))
+            self._bounds.count(len(contents.chunks), 0)
+        elif opcode == OP_MESSAGE and after <= end:
+            self._untimed += 1
         elif not 1 <= opcode <= OP_LAST:
             raise DamageError(f"no record begins with opcode {opcode}")
         elif after > end:
@@ -477,7 +512,11 @@ class McapPart:
         self._index_entries(position, channel)
         chunk = contents.chunks[-1]
         index_bytes = after - chunk.end
-        contents.chunks[-1] = replace(chunk, index={**(chunk.index or {}), channel: position}, index_bytes=index_bytes)
+        index = (
+            {} if chunk.index is None else chunk.index
+        )  # which the chunk takes over: a copy for each entry would cost their square
+        index[channel] = position
+        contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
 
     def _distrust_last_index(self, contents: _Contents) -> None:
         """Forget the index of the last chunk: where the file breaks off behind it, some of it may be missing."""
@@ -515,9 +554,12 @@ class McapPart:
                     continue
                 if len(entries):
                     self._tally(channel, len(entries), int(entries[:, 0].min()), int(entries[:, 0].max()))
-        self._note_undeclared()
+        self._note_odd_messages()
 
-    def _note_undeclared(self) -> None:
+    def _note_odd_messages(self) -> None:
+        """Note messages outside chunks, or in an index, that are of no channel or have no times."""
+        if self._untimed:
+            self._note(0, "messages without times", messages_lost=self._untimed)
         if unknown := sorted(self._tallies.keys() - self._contents.channels.keys()):
             lost = sum(self._tallies[channel].count for channel in unknown)
             self._note(0, f"messages of {listed('channel', unknown)}, which nothing declares", messages_lost=lost)
@@ -528,7 +570,7 @@ class McapPart:
         except DamageError as error:
             self.damage[self._lost(chunk, str(error))] = None
             return
-        records, _ = record_offsets(data)
+        records, _ = self._records(chunk, data)
         self._declare(chunk, data, records)
         if chunk.index is None:
             self._tally_messages(data, message_offsets(data, records))
@@ -582,9 +624,9 @@ class McapPart:
         tally.end_ns = end_ns if tally.end_ns is None else max(end_ns, tally.end_ns)
 
     def _tally_messages(self, data: memoryview, messages: Int64Array) -> None:
-        channels = gathered(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.uint16)
-        for channel in np.unique(channels).tolist():
-            stamps = gathered(data, messages[channels == channel] + RECORD_HEAD + 6, "i8")
+        channels = gathered(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
+        for channel, of in grouped(channels):
+            stamps = gathered(data, messages[of] + RECORD_HEAD + 6, "i8")
             self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
 
     def _note(self, offset: int, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
@@ -639,9 +681,20 @@ class _MessageRun:
         self._start = self._end = 0
 
 
+@functools.lru_cache(maxsize=4)
+def _chosen(wanted: frozenset[int]) -> NDArray[np.bool_]:
+    """Return of every channel number whether it is wanted."""
+    found = np.zeros(1 << 16, np.bool_)
+    found[list(wanted)] = True
+    return found
+
+
 def _parse_summary(section: memoryview) -> _Contents:
     contents = _Contents()
-    for offset in record_offsets(section)[0].tolist():
+    records, end = record_offsets(section, len(section))
+    if end < len(section):
+        raise DamageError("the summary contradicts itself")
+    for offset in records.tolist():
         length = int.from_bytes(section[offset + 1 : offset + RECORD_HEAD], "little")
         content = section[offset + RECORD_HEAD : offset + RECORD_HEAD + length]
         if section[offset] == OP_CHUNK_INDEX:

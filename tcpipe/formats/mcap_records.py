@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from array import array
 from dataclasses import dataclass
 
 import numpy as np
@@ -281,11 +282,11 @@ def message_blocks(
     )
 
 
-def record_offsets(data: bytes | memoryview) -> tuple[Int64Array, int]:
-    """Walk the records in ``data`` and return where each begins, and where they end: one that does not fit ends the walk."""
-    size, position, found = len(data), 0, []
+def record_offsets(data: bytes | memoryview, most: int) -> tuple[Int64Array, int]:
+    """Walk the records in ``data`` and return where each begins, and where they end: one that does not fit, or is one too many, ends it."""
+    size, position, found = len(data), 0, array("q")
     length_at = struct.Struct("<Q").unpack_from
-    while position + RECORD_HEAD <= size:
+    while position + RECORD_HEAD <= size and len(found) <= most:
         end = position + RECORD_HEAD + length_at(data, position + 1)[0]
         if end > size:
             break

@@ -59,6 +59,8 @@ _CODES = {
     "float32": "f4",
     "float64": "f8",
 }
+MAX_DEFINITION_BYTES = 1 << 20
+"""A longer definition is not read; those of the largest messages of ROS, with all that they are made of, have some 20 KB."""
 _MAX_LENGTH = 1 << 31
 _MAX_DEPTH = 64
 _TYPE_NAME, _FIELD_NAME = re.compile(r"[A-Za-z0-9_]+(/[A-Za-z0-9_]+)*"), re.compile(r"[A-Za-z_][A-Za-z0-9_]*")
@@ -192,6 +194,9 @@ class TypeLibrary:
         given: Source = "given" if type_name in self._own else "bundled"
         if not definition.strip():
             return {}, given
+        if len(definition) > MAX_DEFINITION_BYTES:
+            what = f"its definition has {len(definition)} bytes, more than {MAX_DEFINITION_BYTES}"
+            raise DefinitionError(f"type {type_name}: {what}")
         try:
             return _parsed(type_name, definition, schema_encoding), "log"
         except DefinitionError:

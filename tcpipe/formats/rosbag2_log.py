@@ -22,7 +22,13 @@ METADATA = "metadata.yaml"
 STORAGE_SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
+MAX_FILES = 4096
+"""A bag of more files is refused: all are open at once. Split every minute, this is three days."""
+MAX_METADATA_BYTES = 1 << 20
+"""A longer metadata.yaml is passed over: its parser takes ten seconds for so much, and a bag is read as well without it."""
+
 _COPY_BYTES = 1 << 22
+_LISTED = 10
 _PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")
 """What the names of the files of a bag end with, and differ in."""
 
@@ -49,32 +55,43 @@ def rosbag2_files(directory: Path) -> Rosbag2Files:
         present = storage_files(directory)
     except OSError as error:
         raise LogError(f"{directory}: it cannot be read ({error.strerror})") from None
+    if len(present) > MAX_FILES:
+        raise LogError(f"{directory}: it holds {len(present)} files; bags of up to {MAX_FILES} are read")
     information = _bag_information(directory / METADATA)
-    if information is None:
-        kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
-        what = "is broken" if (directory / METADATA).is_file() else "is missing"
-        if len(kinds) != 1:
-            found = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
-            raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {what}, and {found}")
-        if len({_PART.sub("", path.name) for path in present}) > 1:
-            names = ", ".join(path.name for path in present)
-            raise LogError(
-                f"{directory}: not a ROS 2 bag: {METADATA} {what}, and its files are not named as parts of one ({names}); "
-                "give one of them"
-            )
-        why = f"{METADATA} {what}; files are read in the order of their names"
-        return Rosbag2Files(present, (Damage(directory.name, why, messages_lost=0),))
+    return _by_name(directory, present) if information is None else _by_metadata(directory, present, information)
+
+
+def _by_name(directory: Path, present: tuple[Path, ...]) -> Rosbag2Files:
+    kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
+    what = _trouble(directory / METADATA)
+    if len(kinds) != 1:
+        found = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
+        raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {what}, and {found}")
+    if len({_PART.sub("", path.name) for path in present}) > 1:
+        names = ", ".join(path.name for path in present[:_LISTED]) + (", …" if len(present) > _LISTED else "")
+        raise LogError(
+            f"{directory}: not a ROS 2 bag: {METADATA} {what}, and its files are not named as parts of one ({names}); "
+            "give one of them"
+        )
+    why = f"{METADATA} {what}; files are read in the order of their names"
+    return Rosbag2Files(present, (Damage(directory.name, why, messages_lost=0),))
+
+
+def _by_metadata(directory: Path, present: tuple[Path, ...], information: Mapping[str, Any]) -> Rosbag2Files:
     named = information.get("relative_file_paths")
+    if isinstance(named, list) and len(named) > MAX_FILES:
+        raise LogError(f"{directory}: {METADATA} names {len(named)} files; bags of up to {MAX_FILES} are read")
     listed = [Path(name).name for name in named if isinstance(name, str)] if isinstance(named, list) else []
     paths, damage = [], []
-    for name in listed:
-        path = next((p for p in (directory / name, directory / f"{name}.zstd") if p.is_file()), None)
+    for name in dict.fromkeys(listed):
+        path = next((p for p in (directory / name, directory / f"{name}.zstd") if _is_file(p)), None)
         if path is None:
             damage.append(Damage(f"{directory.name}/{name}", f"{METADATA} names this file, but it is not there"))
         else:
             paths.append(path)
+    taken = set(paths)
     for path in present:
-        if path not in paths and path.with_name(path.name.removesuffix(".zstd")) not in paths:
+        if path not in taken and path.with_name(path.name.removesuffix(".zstd")) not in taken:
             damage.append(
                 Damage(
                     f"{directory.name}/{path.name}",
@@ -84,12 +101,20 @@ def rosbag2_files(directory: Path) -> Rosbag2Files:
             )
             paths.append(path)
     if not paths:
-        raise LogError(
-            f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({', '.join(listed) or 'none'})"
-        )
+        names = ", ".join(listed[:_LISTED]) + (", …" if len(listed) > _LISTED else "")
+        raise LogError(f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({names or 'none'})")
     count = information.get("message_count")
-    count = count if isinstance(count, int) else None
-    return Rosbag2Files(tuple(paths), tuple(damage), count, _topic_counts(information))
+    return Rosbag2Files(tuple(paths), tuple(damage), count if _is_count(count) else None, _topic_counts(information))
+
+
+def _is_file(path: Path) -> bool:
+    with suppress(OSError):  # a name may be longer than any file's
+        return path.is_file()
+    return False
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and 0 <= value < 1 << 63
 
 
 def _topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
@@ -98,7 +123,7 @@ def _topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
     with suppress(KeyError, TypeError):
         for entry in information["topics_with_message_count"]:
             name, count = entry["topic_metadata"]["name"], entry["message_count"]
-            if isinstance(name, str) and isinstance(count, int):
+            if isinstance(name, str) and _is_count(count):
                 counts[name] = counts.get(name, 0) + count
     return counts
 
@@ -221,11 +246,21 @@ def _unframed(frame: memoryview) -> bytes | None:
 def _bag_information(path: Path) -> dict[str, Any] | None:
     """Return what metadata.yaml says of the bag; None where it is missing or broken, as a recorder that is killed leaves it."""
     try:
+        if path.stat().st_size > MAX_METADATA_BYTES:
+            return None
         document = YAML(typ="safe").load(path.read_text(errors="replace"))
         information = document["rosbag2_bagfile_information"]
     except (YAMLError, KeyError, TypeError, ValueError, OSError, RecursionError):
         return None
     return information if isinstance(information, dict) else None
+
+
+def _trouble(path: Path) -> str:
+    """Say why a metadata.yaml tells nothing."""
+    if not path.is_file():
+        return "is missing"
+    size = path.stat().st_size
+    return f"has {size} bytes, more than {MAX_METADATA_BYTES}" if size > MAX_METADATA_BYTES else "is broken"
 
 
 def _natural(path: Path) -> list[tuple[int, str]]:

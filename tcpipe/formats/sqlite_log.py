@@ -20,7 +20,19 @@ from urllib.parse import quote
 import numpy as np
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_part import Channel, DamageError, Int64Array, MessageBlock, in_order, listed, load_only, no_room
+from tcpipe.formats.log_part import (
+    MAX_CHANNELS,
+    Bounds,
+    Channel,
+    DamageError,
+    Int64Array,
+    MessageBlock,
+    grouped,
+    in_order,
+    listed,
+    load_only,
+    no_room,
+)
 from tcpipe.formats.sqlite_pages import MAGIC, MAX_COLUMNS, Leaves, PageReader, Rows, UnusualError
 from tcpipe.logs.topics import Damage, normalized_type_name
 
@@ -40,10 +52,8 @@ _FILLED_BYTES, _MAX_BYTES = 1 << 28, 1 << 42
 _BELOW, _ABOVE = -(2**63), 2**63 - 1
 _BEFORE_ALL, _BEHIND_ALL = -1e19, 1e19
 """Row ids lie between these: numbers of 64 bits do."""
-MAX_TOPICS = 1 << 16
-"""More topics than this are refused, as MCAP cannot number more; a robot has some hundred."""
-_LONGEST_BYTES, _ROW_BYTES = 1 << 30, 1 << 10
-"""A row that claims to be longer, or longer than its file, is not read: a chain of pages may lead back to itself."""
+_LONGEST_BYTES, _ROW_BYTES = 1 << 28, 1 << 10
+"""SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself."""
 _TABLES = ("topics", "messages", "message_definitions")
 _NOTHING = "rows that are no messages: a number, a time or the data is missing or of another kind"
 _BROKEN = (sqlite3.Error, UnicodeDecodeError)
@@ -156,10 +166,9 @@ class SqlitePart:
 
     def _channels(self, path: Path) -> dict[int, Channel]:
         rows = self._database.execute(
-            "SELECT id, name, type, serialization_format FROM topics ORDER BY id LIMIT ?", (MAX_TOPICS + 1,)
+            "SELECT id, name, type, serialization_format FROM topics ORDER BY id LIMIT ?", (MAX_CHANNELS + 1,)
         ).fetchall()
-        if len(rows) > MAX_TOPICS:
-            raise LogError(f"{path}: it names more than {MAX_TOPICS} topics; no more are read of one file")
+        Bounds(path, path.stat().st_size).count(0, len(rows))
         definitions = self._definitions()
         spans = self._spans()
         channels = {}
@@ -188,7 +197,8 @@ class SqlitePart:
         """Return encoding and text of each type's definition; files older than ROS 2 Iron hold none."""
         try:
             rows = self._database.execute(
-                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+                "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions LIMIT ?",
+                (MAX_CHANNELS,),
             )
             return {name: (str(encoding), str(text or "")) for name, encoding, text in rows}
         except _BROKEN:
@@ -361,8 +371,8 @@ class _MessageTable:
             if count_all <= _KEPT_ROWS:
                 found.append(rows)
             topic, log_time_ns, _ = rows.integers
-            for number in np.unique(topic).tolist():
-                stamps = log_time_ns[topic == number]
+            for number, of in grouped(topic):
+                stamps = log_time_ns[of]
                 count, start, end = spans.get(number, (0, _ABOVE, _BELOW))
                 spans[number] = count + len(stamps), min(start, int(stamps.min())), max(end, int(stamps.max()))
         self._kept = found if count_all <= _KEPT_ROWS else None
@@ -373,6 +383,7 @@ class _MessageTable:
 
         `UnusualError` ends it.
         """
+        self._pages.begin()
         for rows in self.rows(threads=threads):
             copied = np.where((rows.overflow > 0) & np.isin(rows.integers[0], topics), rows.lengths, 0)
             bounds = np.flatnonzero(np.diff(np.cumsum(copied) // _SPILLED_BYTES)) + 1
@@ -384,12 +395,14 @@ class _MessageTable:
     def _blocks(self, rows: Rows, topics: list[int]) -> tuple[list[MessageBlock], int]:
         """Return the messages of the topics, where they lie whole in the file, from there, else copied together; and the lost."""
         found, lost = [], 0
-        for topic in topics:
-            of = rows.integers[0] == topic
-            whole = of & (rows.overflow == 0)
-            if whole.any():
-                found.append(self._block(rows.chosen(np.flatnonzero(whole)), self._data, rows.offsets[whole]))
-            spilled = rows.chosen(np.flatnonzero(of & ~whole))
+        wanted = np.flatnonzero(np.isin(rows.integers[0], topics))
+        for _, of in grouped(rows.integers[0][wanted]):
+            here = wanted[of]
+            lies_whole = rows.overflow[here] == 0
+            whole = here[lies_whole]
+            if len(whole):
+                found.append(self._block(rows.chosen(whole), self._data, rows.offsets[whole]))
+            spilled = rows.chosen(here[~lies_whole])
             intact, buffer, offsets = self._copied(spilled)
             lost += len(spilled.ids) - len(intact.ids)
             if len(intact.ids):
@@ -406,7 +419,7 @@ class _MessageTable:
                 self._pages.blobs(rows.chosen(np.array([number])))
                 intact.append(number)
         rows = rows.chosen(np.array(intact, np.int64))
-        return rows, *self._pages.blobs(rows)
+        return rows, *self._pages.blobs(rows, again=True)
 
     def close(self) -> None:
         """Leave the file; views that are still held keep it mapped."""
@@ -457,6 +470,5 @@ def _blocks(rows: list[_Row]) -> Iterator[MessageBlock]:
     buffer = memoryview(b"".join(payloads))
     ordinal, channel = np.array(numbers, np.int64), np.array(channels, np.int64)
     log, publish = np.array(log_ns, np.int64), np.array(publish_ns, np.int64)
-    for topic in np.unique(channel).tolist():
-        of = channel == topic
+    for topic, of in grouped(channel):
         yield MessageBlock(topic, buffer, offsets[of], lengths[of], log[of], publish[of], ordinal[of], None)

@@ -105,6 +105,7 @@ class PageReader:
         )
         if not plain:
             raise UnusualError
+        self._chained = np.zeros(pages + 1, np.bool_)
         self._octets: NDArray[np.uint8] = np.frombuffer(data, np.uint8)
         self._pages = self._octets.reshape(pages, self.page_bytes)
 
@@ -192,8 +193,18 @@ class PageReader:
         every = Rows(ids, values, blobs, payloads + sizes - blobs, local_ends - blobs, overflow)
         return every if right.all() else replace(every.chosen(right), lost=int((~right).sum()))
 
-    def blobs(self, rows: Rows) -> tuple[memoryview, Int64Array]:
-        """Return the blobs of rows, overflow and all, in one buffer, and where each begins there."""
+    def begin(self) -> None:
+        """Begin to read blobs anew: from here on no overflow page may belong to two of them."""
+        self._chained[:] = False
+
+    def blobs(self, rows: Rows, *, again: bool = False) -> tuple[memoryview, Int64Array]:
+        """Return the blobs of rows, overflow and all, in one buffer, and where each begins there.
+
+        Raises
+        ------
+        UnusualError
+            A chain leads nowhere, does not end where its blob does, or shares a page with another one; with ``again`` it may.
+        """
         starts = np.cumsum(rows.lengths) - rows.lengths
         buffer = np.empty(int(rows.lengths.sum()), np.uint8)
         for start, offset, local in zip(starts.tolist(), rows.offsets.tolist(), rows.local.tolist(), strict=True):
@@ -204,8 +215,10 @@ class PageReader:
         pages, left, to = rows.overflow[going], (rows.lengths - rows.local)[going], (starts + rows.local)[going]
         self._load_chains(pages, -(-left // room))
         expected = pages
+        visited = []
         while len(pages):
             self._check(pages)
+            visited.append(pages)
             if (pages != expected).any():
                 self.load(pages[pages != expected])
             full = left >= room
@@ -216,11 +229,13 @@ class PageReader:
                 buffer[at : at + size] = self._pages[page - 1, 4 : 4 + size]
             going = left > room
             expected = pages[going] + 1
-            pages, left, to = (
-                _big_endian(self._data, (pages[going] - 1) * self.page_bytes),
-                left[going] - room,
-                to[going] + room,
-            )
+            following = _big_endian(self._data, (pages - 1) * self.page_bytes)
+            _expect((following == 0) | going)
+            pages, left, to = following[going], left[going] - room, to[going] + room
+        every = np.concatenate([pages, *visited])
+        if not again:
+            _expect(np.append(~self._chained[every], len(np.unique(every)) == len(every)))
+            self._chained[every] = True
         return buffer.data, starts
 
     def _load_chains(self, pages: Int64Array, counts: Int64Array) -> None:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+
+MAX_DAMAGE = 1000
+"""So many findings are told one by one."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,20 @@ class Damage:
             f"{count} {unit}" for count, unit in ((self.messages_lost, "messages"), (self.bytes_lost, "bytes")) if count
         ]
         return f"{self.where}{topic}: {self.what}" + (f" ({', '.join(lost)} lost)" if lost else "")
+
+
+def condensed(damage: Sequence[Damage]) -> list[Damage]:
+    """Return the first thousand findings, and one that sums up the others: a log that is made to be broken has one for some bytes of it."""
+    rest = damage[MAX_DAMAGE:]
+    if not rest:
+        return list(damage)
+    lost = [
+        sum(count or 0 for count in counts)
+        for counts in zip(*((of.messages_lost, of.bytes_lost) for of in rest), strict=True)
+    ]
+    unknown = any(of.is_loss for of in rest) and not any(lost)
+    what = f"{len(rest)} more findings like these"
+    return [*damage[:MAX_DAMAGE], Damage(rest[0].where, what, None, None if unknown else lost[0], lost[1] or None)]
 
 
 def normalized_type_name(name: str) -> str:

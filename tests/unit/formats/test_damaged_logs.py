@@ -1,5 +1,6 @@
 """Generated logs, broken in known places: what is intact before and after comes back, the rest is counted."""
 
+import itertools
 import sqlite3
 import struct
 from contextlib import closing
@@ -31,7 +32,7 @@ COMPRESSIONS = (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE)
 def chunks_of(path):
     """Byte range of every chunk of an intact .mcap."""
     data = path.read_bytes()
-    offsets = record_offsets(data[8:])[0] + 8
+    offsets = record_offsets(data[8:], len(data))[0] + 8
     lengths = [struct.unpack_from("<Q", data, offset + 1)[0] for offset in offsets.tolist()]
     return [
         (offset, offset + RECORD_HEAD + length)
@@ -293,13 +294,13 @@ def test_rows_that_are_no_messages_cost_only_themselves(tmp_path):
 WRONG_VALUES = ("NULL", "'text'", "x'00'", "2.5", "NULL, topic_id = 'x'", "NULL, data = NULL")
 
 
-@pytest.mark.parametrize("column", ["topic_id", "timestamp", "data"])
-@pytest.mark.parametrize("value", WRONG_VALUES)
+@pytest.mark.parametrize(
+    ("column", "value"),
+    sorted({*itertools.product(("topic_id", "timestamp", "data"), WRONG_VALUES)} - {("data", "x'00'")}),
+)
 @pytest.mark.parametrize("journal", [False, True])
 def test_every_row_of_a_db3_is_a_message_or_counted_as_lost(tmp_path, column, value, journal):
     """However a row is wrong, and whether pages are read here or by SQLite: what is read and what is lost is what was there."""
-    if (column, value) == ("data", "x'00'"):
-        pytest.skip("such a row is a message")
     path = tmp_path / "a.db3"
     with closing(sqlite3.connect(path)) as database, database:
         database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")

@@ -113,7 +113,9 @@ def test_a_chunk_that_claims_2_to_the_60_bytes(tmp_path, bounded, with_summary):
     messages = random_messages(2, count=200, types=TYPES)
     path = write_mcap(tmp_path / "a.mcap", messages, chunk_bytes=512)
     data = bytearray(path.read_bytes())
-    chunks = [offset + 8 for offset in record_offsets(bytes(data[8:]))[0].tolist() if data[offset + 8] == OP_CHUNK]
+    chunks = [
+        offset + 8 for offset in record_offsets(bytes(data[8:]), len(data))[0].tolist() if data[offset + 8] == OP_CHUNK
+    ]
     if not with_summary:
         del data[chunks[-1] :]
     struct.pack_into("<Q", data, chunks[1] + RECORD_HEAD + 16, 1 << 60)
