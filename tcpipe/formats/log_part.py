@@ -32,7 +32,7 @@ MAX_CHUNKS = 1 << 20
 """A file of more chunks is refused: of chunks of a megabyte, as writers make them, this is a terabyte."""
 MAX_CHANNELS = 1 << 16
 """More channels or connections of a file are refused: MCAP cannot number more."""
-_FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 22, 2
+_FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 20, 4
 """A file that holds more records than the first, and than one for so many of its bytes, is a bomb: a message alone has two times."""
 _PLAUSIBLE_TOTAL = 1 << 30
 SEARCH_BYTES = 1 << 20

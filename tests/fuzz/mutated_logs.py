@@ -418,7 +418,8 @@ def judged(clean: Clean, data: bytes, touched: set[int], wanted: str | None = No
         return "told", said
     lost, new = expected - found, found - expected
     mine = frozenset().union(*(clean.own[byte] for byte in touched if byte < len(clean.own)))
-    counted = lost.total() == new.total()
+    # one topic may lose a message to another, or get one, where a topic id is a message's own
+    counted = lost.total() == new.total() if wanted is None else new.total() <= len(mine)
     squeezed = any(start <= byte < end for byte in touched for start, end in clean.compressed)
     placed = not squeezed or Counter(row[:2] for row in lost.elements()) == Counter(row[:2] for row in new.elements())
     if counted and placed and lost.keys() <= mine:
