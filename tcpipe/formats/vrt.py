@@ -19,6 +19,7 @@ from tcpipe.errors import MapError
 MAX_BYTES = 32_000_000
 """Of a VRT, and of one with all VRTs in it; 20,000 tiles of three bands."""
 
+MAX_TAGS = 2_000_000
 MAX_SOURCES = 100_000
 _MAX_DEPTH = 32
 _MAX_NESTING = 8
@@ -132,6 +133,8 @@ def _parsed(path: Path) -> Element:
         text = re.sub(r"\A\s*<\?xml[^>]*\?>", "", path.read_bytes().decode("utf-8-sig"))
         if "<!DOCTYPE" in text:
             raise MapError(f"{path}: a VRT with a document type{_mended(path)}")
+        if text.count("<") > MAX_TAGS:
+            raise MapError(f"{path}: a VRT of {text.count('<')} tags, at most {MAX_TAGS}{_mended(path)}")
         root, depth = Element(""), 0
         events = iterparse(StringIO(text), ["start", "end"])  # noqa: S314  without entities, and never too deep
         for event, element in events:

@@ -111,6 +111,7 @@ def hostile(site, secret, address):
         "not a raster that is read|document type",
     )
     yield "deep.vrt", vrt("<Transformer>" * 99 + "</Transformer>" * 99), "nested more than 32 deep"
+    yield "long.vrt", vrt("<F/>" * 2_000_001), "a VRT of 2000007 tags, at most 2000000"
     yield "cut.vrt", simple("h.tif")[:-9], "damaged"
     yield "wms.tif", f"<GDAL_WMS><Service><ServerUrl>{address}</ServerUrl></Service></GDAL_WMS>", r"XML \(GDAL_WMS\)"
     yield "grid.tif", "ncols 2\nnrows 2\n", "an ASCII grid"
