@@ -148,4 +148,4 @@ def say_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> No
         for problem in problems:
             say(f"tcpipe: {problem}", err=True)
     if as_json:
-        click.echo(json.dumps({"exit_code": exit_code, "problems": list(problems)}, indent=2))
+        click.echo(json.dumps({"exit_code": exit_code, "problems": list(problems)}))
