@@ -30,8 +30,6 @@ from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
-_SECTIONS = ("segment", "label", "sample", "split", "dataset")
-
 
 @dataclass(frozen=True, slots=True)
 class Inputs:
@@ -71,19 +69,18 @@ def choose_inputs(
     runs = once.runs
     paths = tuple(store.map_path(name) for name in names)
     map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths, strict=True))
-    values = plain(asdict(recipe))
+    sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
     fingerprint = digest(
         {
             "versions": [__version__, DATA_MODEL_VERSION],
-            "recipe": {section: values[section] for section in _SECTIONS},
-            "runs": [_run_fingerprint(run) for run in runs],
+            "recipe": plain(asdict(recipe)),
+            "runs": sources,
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
             "format": file_format,
             **({} if earlier is None else {"kept_split": _table_digest(earlier)}),
         }
     )
-    sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
     warnings = (*chosen.warnings, *once.warnings)
     return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings)
 
@@ -148,11 +145,6 @@ def run_source(run: RunDirectory, log: Mapping[str, Any]) -> dict[str, Any]:
         "warnings": list(run.manifest["warnings"]),
         "energy_budget": run.manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget"),
     }
-
-
-def _run_fingerprint(run: RunDirectory) -> list[Any]:
-    written = run.manifest["checksums"]["segments.parquet"]
-    return [run.run_id, run.recipe_id, [written["size_bytes"], written["sha256"]], run.manifest["tags"]]
 
 
 def _table_digest(table: pa.Table) -> str:

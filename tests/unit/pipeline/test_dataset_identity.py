@@ -1,0 +1,64 @@
+"""A dataset is built again exactly when a fresh one would be another: every key that rules it, one by one."""
+
+import shutil
+
+import numpy as np
+import pytest
+from recipe_values import keys, with_value
+from synthetic_store import add_run, add_world, lanes, segments
+
+from tcpipe.pipeline.build import build_dataset
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+
+OTHER = {
+    "robot": "husky",
+    "sample.patch_m": 2.0,
+    "sample.patch_px": 20,
+    "sample.min_valid_fraction": 0.5,
+    "sample.max_position_std_m": 0.05,
+    "split.holdout": "sample",
+    "split.test_fraction": 0.4,
+    "split.block_m": 4.0,
+    "split.buffer_m": 0.5,
+    "split.folds": 3,
+    "split.seed": 1,
+    "dataset.name": "another",
+    "dataset.description": "another",
+    "dataset.licence": "CC0-1.0",
+    "dataset.creator": "another",
+    "dataset.compression": "lz4",
+}
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory):
+    """A store with a map and a run, and the dataset of the default recipe."""
+    directory = tmp_path_factory.mktemp("identity")
+    store = Store(directory / "store")
+    store.root.mkdir()
+    add_world(store, directory)
+    add_run(store, "a", segments("a", *lanes(np.array([-3.0, 3.0]), -8.0, 8.0)))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")
+        build_dataset(directory / "usual", store=store.root, recipe=Recipe())
+        yield directory, store
+
+
+def tree(directory):
+    return {path.relative_to(directory): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def test_every_key_of_a_dataset_is_tried():
+    assert set(OTHER) == {key for key in keys() if key == "robot" or key.startswith(("sample.", "split.", "dataset."))}
+
+
+@pytest.mark.parametrize("key", OTHER)
+def test_what_is_built_over_another_is_what_is_built_anew(places, tmp_path, key):
+    directory, store = places
+    recipe = with_value(Recipe(), key, OTHER[key])
+    shutil.copytree(directory / "usual", tmp_path / "over")
+    build_dataset(tmp_path / "over", store=store.root, recipe=recipe)
+    build_dataset(tmp_path / "anew", store=store.root, recipe=recipe)
+    assert tree(tmp_path / "over") == tree(tmp_path / "anew")
+    assert tree(tmp_path / "over") != tree(directory / "usual")
