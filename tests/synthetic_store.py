@@ -82,8 +82,8 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
     return LABELLED_SEGMENTS.table(**given, **rest)
 
 
-def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None):
-    """Put a run with these segments into the store, as ingestion would."""
+def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None, track=None):
+    """Put a run with these segments, and this gated track, into the store, as ingestion would."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother")
@@ -101,7 +101,7 @@ def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, se
         run_id,
         identity,
         track=Track(TRACK.empty(), REJECTIONS.empty(), info),
-        gated=GatedTrack(GATED_TRACK.empty(), info),
+        gated=GatedTrack(GATED_TRACK.empty() if track is None else track, info),
         labelled=LabelledSegments(table, info, ledger_m),
         manifest={
             "data_model_version": DATA_MODEL_VERSION,

@@ -6,7 +6,6 @@ import pytest
 from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, segments
 
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.formats.parquet import write_table
 from tcpipe.pipeline.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
@@ -15,8 +14,8 @@ from tcpipe.tables.levels import GATED_TRACK
 GEOID_M = 46.3
 
 
-def put_track(store, run_id, xy_m, ground_xy_m, *, std_m=0.02):
-    """Give a run a track at ``xy_m`` whose heights are those of the world's ground at ``ground_xy_m`` [m from its middle]."""
+def track_at(xy_m, ground_xy_m, *, std_m=0.02):
+    """Return a track at ``xy_m`` whose heights are those of the world's ground at ``ground_xy_m`` [m from its middle]."""
     count = len(xy_m)
     position = lonlat(xy_m)
     height = WORLD.height(WORLD.x_m + ground_xy_m[:, 0], WORLD.y_m + ground_xy_m[:, 1]) + GEOID_M
@@ -28,8 +27,7 @@ def put_track(store, run_id, xy_m, ground_xy_m, *, std_m=0.02):
         for column in GATED_TRACK.columns
         if column.name not in given
     }
-    (run,) = store.recipes_of(run_id)
-    write_table(GATED_TRACK.table(**given, **rest), run.path / "track.parquet")
+    return GATED_TRACK.table(**given, **rest)
 
 
 def winding(count=3000):
@@ -49,8 +47,8 @@ def built(tmp_path_factory):
         [("fits", (0.0, 0.0), 0.02), ("off", (-1.5, 0.8), 0.02), ("vague", (-1.5, 0.8), 0.5)]
     ):
         start, end = lanes([4.0 * number - 6.0], -10.0, 10.0)
-        add_run(store, run_id, segments(run_id, start, end, start_ns=number * 10**12))
-        put_track(store, run_id, xy, np.add(xy, shift_m), std_m=std_m)
+        track = track_at(xy, np.add(xy, shift_m), std_m=std_m)
+        add_run(store, run_id, segments(run_id, start, end, start_ns=number * 10**12), track=track)
     result = build_dataset(directory / "out", store=store.root, recipe=Recipe())
     return result, read_card(directory / "out")
 
