@@ -390,6 +390,8 @@ class BagPart:
             position = record.end
         if (len(self._connections), len(self._chunks)) != (header.number(b"conn_count"), header.number(b"chunk_count")):
             raise DamageError("the bag's index does not hold what its header counts")
+        if len({chunk.offset for chunk in self._chunks}) < len(self._chunks):
+            raise DamageError("the bag's index names a chunk twice")
         self._chunks.sort(key=lambda chunk: chunk.offset)
 
     def _take_chunk_info(self, record: _Record) -> None:

@@ -539,18 +539,19 @@ def _described(path: Path, magic: bytes) -> str:
 
 def _logs_below(directory: Path) -> Iterator[Path]:
     """Yield the logs in and below a directory; each directory is looked at once, whatever links lead to it."""
-    seen: set[Path] = set()
+    seen: set[tuple[int, int]] = set()
     waiting = [(directory, True)]
     while waiting:
         path, is_directory = waiting.pop()
-        if not is_directory:
-            yield path
-        elif (real := path.resolve()) not in seen:
-            seen.add(real)
-            try:
-                waiting += reversed(_entries(path))
-            except OSError:
+        try:
+            found = path.stat() if is_directory else None
+            if found is None:
                 yield path
+            elif (found.st_dev, found.st_ino) not in seen:
+                seen.add((found.st_dev, found.st_ino))
+                waiting += reversed(_entries(path))
+        except OSError:
+            yield path
 
 
 def _entries(directory: Path) -> list[tuple[Path, bool]]:

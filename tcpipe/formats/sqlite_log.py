@@ -56,8 +56,8 @@ _LONGEST_BYTES, _ROW_BYTES = 1 << 28, 1 << 10
 """SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself."""
 _TABLES = ("topics", "messages", "message_definitions")
 _NOTHING = "rows that are no messages: a number, a time or the data is missing or of another kind"
-_BROKEN = (sqlite3.Error, UnicodeDecodeError)
-"""What a broken database raises; the second where even the name in its complaint is broken."""
+_BROKEN = (sqlite3.Error, UnicodeDecodeError, MemoryError)
+"""What a broken database raises; the second where even the name in its complaint is broken, the third where a row claims to be endless."""
 _Row = tuple[int, int, int, int, bytes]
 """Row id, topic, log time, publish time, data."""
 
@@ -91,7 +91,7 @@ class SqlitePart:
         except _BROKEN as error:
             self.close()
             raise LogError(
-                f"{path}: its table of topics cannot be read ({error}); nothing can be had from it"
+                f"{path}: its table of topics cannot be read ({_why(error)}); nothing can be had from it"
             ) from None
 
     def close(self) -> None:
@@ -289,14 +289,14 @@ class SqlitePart:
         try:
             cursor = self._database.execute(query, (low, high))
         except _BROKEN as error:
-            self._broken = str(error)
+            self._broken = _why(error)
             return
         while not self._broken:
             rows: list[Any] = []
             try:
                 rows.extend(itertools.islice(cursor, _ROWS))  # what came before an error stays
             except _BROKEN as error:
-                self._broken = str(error)
+                self._broken = _why(error)
             if rows:
                 yield rows
             if len(rows) < _ROWS:
@@ -310,7 +310,7 @@ class SqlitePart:
             self._database.execute("PRAGMA ignore_check_constraints = ON")
             found = self._database.execute("PRAGMA quick_check(1)").fetchone()[0]
         except _BROKEN as error:
-            found = str(error)
+            found = _why(error)
         if found != "ok" and " value in " not in found:  # a value that is none is the row's own trouble, and counted
             self._note(f"its pages contradict one another ({found.splitlines()[-1]}); rows may be missing or wrong")
 
@@ -460,6 +460,10 @@ def _message_table(path: Path, database: sqlite3.Connection) -> _MessageTable | 
         return _MessageTable(path, int(found[0][0]), names)
     except UnusualError:
         return None
+
+
+def _why(error: Exception) -> str:
+    return str(error) or "a row claims more than memory holds"
 
 
 def _blocks(rows: list[_Row]) -> Iterator[MessageBlock]:

@@ -352,6 +352,22 @@ def test_a_row_that_is_missing_from_its_pages_list_is_damage(tmp_path):
         ]
 
 
+def test_a_row_that_claims_to_be_endless_costs_itself(tmp_path):
+    """Where SQLite itself has to read, it says that there is no memory for such a row, and no more than that."""
+    messages = random_messages(5, count=40, types=TYPES[1:])
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    data = bytearray(path.read_bytes())
+    at = (
+        data.index(struct.pack(">q", messages[20].log_time_ns)) - 4
+    )  # the row's head: its size, and a serial type for each column
+    data[at - 1 : at + 3] = b"\xff\xff\xff\x7f"
+    path.write_bytes(data)
+    with open_log(path) as log:
+        rows = log.table("/ColorRGBA").num_rows
+        assert any(finding.is_loss for finding in log.damage)
+    assert 15 < rows < 40
+
+
 def test_a_message_that_moves_to_another_topic_is_missed_by_metadata(tmp_path, messages):
     bag = write_rosbag2(tmp_path / "run", messages)
     with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
@@ -385,6 +401,19 @@ def test_messages_of_channels_that_nothing_declares_are_counted(tmp_path, messag
         assert sum(table.num_rows for table in log.tables(log.topics).values()) == len(messages) - 1
         said = [finding for finding in log.damage if finding.what == "messages of channel 77, which nothing declares"]
         assert [finding.messages_lost for finding in said] == [1]
+
+
+def test_a_bag_whose_index_names_a_chunk_twice_is_walked(tmp_path):
+    path = write_bag(tmp_path / "a.bag", random_messages(1, count=30, types=TYPES, store=ROS1), chunk_bytes=2000)
+    clean, _ = read(path)
+    data = path.read_bytes()
+    *_, before, last = [at for at in range(len(data)) if data.startswith(b"op=\x06", at)]
+    size = last - before
+    path.write_bytes(data[: last - 8] + data[before - 8 : before - 8 + size])
+    assert path.stat().st_size == len(data)
+    tables, damage = read(path)
+    assert [finding.what for finding in damage] == ["the bag's index names a chunk twice; it is read record by record"]
+    assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
 
 
 @pytest.mark.parametrize("number", [0, 1, 77])
