@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -118,6 +119,7 @@ class McapPart:
         try:
             self._read_index()
             self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
+            self._note_twins()
         except LogError:
             self.close()
             raise
@@ -286,6 +288,17 @@ class McapPart:
         if chunk.headless:
             return 0
         return int.from_bytes(self._bytes.read(chunk.offset + CHUNK_CRC, 4), "little")
+
+    def _note_twins(self) -> None:
+        """Note chunks of one content: one was written over another, where times, sizes and CRC are the same."""
+        heads: dict[tuple[int, int, int], Chunk] = {}
+        for chunk in self._contents.chunks:
+            if chunk.headless or chunk.cut:
+                continue
+            twin = heads.setdefault((chunk.start_ns, chunk.end_ns, chunk.uncompressed_bytes), chunk)
+            with suppress(DamageError):
+                if twin is not chunk and self._crc(chunk) and self._crc(chunk) == self._crc(twin):
+                    self._note(chunk.offset, f"a chunk holds the same as the one at byte {twin.offset}")
 
     def _note_odd_ones_without_crc(self) -> None:
         """Note the chunks that were read without a CRC where others of the file have one: it may have been overwritten."""

@@ -403,6 +403,22 @@ def test_messages_of_channels_that_nothing_declares_are_counted(tmp_path, messag
         assert [finding.messages_lost for finding in said] == [1]
 
 
+def test_a_chunk_that_was_written_over_another_is_damage(tmp_path, messages):
+    options = {"compression": CompressionType.NONE, "index_types": IndexType.NONE}
+    path = write_mcap(
+        tmp_path / "a.mcap", [replace(m, payload=bytes(40)) for m in messages], chunk_bytes=700, **options
+    )
+    data = path.read_bytes()
+    sizes = {}
+    for start, end in chunks_of(path):
+        sizes.setdefault(end - start, []).append((start, end))
+    (one, one_end), (other, other_end) = next(places for places in sizes.values() if len(places) > 1)[:2]
+    path.write_bytes(data[:other] + data[one:one_end] + data[other_end:])
+    with open_log(path) as log:
+        said = [finding.what for finding in log.damage if finding.is_loss]
+    assert said == [f"a chunk holds the same as the one at byte {one}"]
+
+
 def test_a_bag_whose_index_names_a_chunk_twice_is_walked(tmp_path):
     path = write_bag(tmp_path / "a.bag", random_messages(1, count=30, types=TYPES, store=ROS1), chunk_bytes=2000)
     clean, _ = read(path)
