@@ -26,8 +26,9 @@ from tcpipe.logs.topics import Damage
 
 MAX_CHUNK_BYTES = 1 << 29
 """A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
-_PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO = 1 << 26, 1000
-"""What claims to hold more than both so many bytes and so many times its compressed size is taken for damaged: a bomb."""
+_PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO, _PLAUSIBLE_CHUNK_RATIO = 1 << 26, 1000, 100
+"""What claims to hold more than both so many bytes and so many times its compressed size is taken for damaged: a bomb. A chunk or message
+is held as a whole, and more than once while it is decoded: of those less is believed than of a file."""
 MAX_CHUNKS = 1 << 20
 """A file of more chunks is refused: of chunks of a megabyte, as writers make them, this is a terabyte."""
 MAX_CHANNELS = 1 << 16
@@ -298,9 +299,10 @@ def no_room(error: Exception) -> str:
     return "no room for a copy here; TMPDIR names a place that has some" if full else ""
 
 
-def is_bomb(compressed_bytes: int, size: int) -> bool:
-    """Return whether compressed bytes claim to hold implausibly much."""
-    return size > _PLAUSIBLE_BYTES and size > _PLAUSIBLE_RATIO * compressed_bytes
+def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
+    """Return whether compressed bytes claim to hold implausibly much; ``whole``: what would be held in memory as a whole."""
+    ratio = _PLAUSIBLE_CHUNK_RATIO if whole else _PLAUSIBLE_RATIO
+    return size > _PLAUSIBLE_BYTES and size > ratio * compressed_bytes
 
 
 class Bounds:
@@ -377,7 +379,7 @@ def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = Fal
     """
     if size > MAX_CHUNK_BYTES:
         raise DamageError(f"it claims to hold {size} bytes, more than {MAX_CHUNK_BYTES}")
-    if is_bomb(len(data), size):
+    if is_bomb(len(data), size, whole=True):
         raise DamageError(f"it claims to hold {size} bytes in {len(data)}")
     _refuse_unknown(codec)
     try:

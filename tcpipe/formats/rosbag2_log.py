@@ -236,7 +236,7 @@ def _unframed(frame: memoryview) -> bytes | None:
             while piece := stream.read(_COPY_BYTES):
                 pieces.append(piece)
                 found += len(piece)
-                if found > MAX_CHUNK_BYTES or is_bomb(len(frame), found):
+                if found > MAX_CHUNK_BYTES or is_bomb(len(frame), found, whole=True):
                     return None
     except OSError:
         return None

@@ -28,7 +28,7 @@ from rosbags.rosbag2 import CompressionMode
 
 from tcpipe.errors import LogError
 from tcpipe.formats.log_file import open_log
-from tcpipe.formats.log_part import DamageError, decompressed
+from tcpipe.formats.log_part import DamageError, decompressed, is_bomb
 from tcpipe.formats.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
 
 TYPES = ("std_msgs/msg/ColorRGBA",)
@@ -137,6 +137,13 @@ def test_a_bomb_of_a_chunk_is_refused_by_what_it_claims_and_by_what_it_holds(bou
         with pytest.raises(DamageError, match=f"it claims to hold {BOMB_BYTES} bytes in {len(bomb)}"):
             decompressed(codec, memoryview(bomb), BOMB_BYTES)
     assert len(decompressed(codec, memoryview(bomb), len(piece))) == len(piece)
+
+
+def test_less_is_believed_of_what_is_held_as_a_whole():
+    assert is_bomb(1 << 20, 200 << 20, whole=True)
+    assert not is_bomb(1 << 20, 200 << 20)
+    assert not is_bomb(1 << 10, 1 << 26, whole=True)
+    assert not is_bomb(4 << 20, 200 << 20, whole=True)
 
 
 def test_bombs_of_messages_and_of_files(tmp_path, bounded):
