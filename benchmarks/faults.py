@@ -1,7 +1,9 @@
-"""What faults leave behind: ``python benchmarks/faults.py kills|signals|full-disk|all``; docs/explanation/faults.md says what is promised.
+"""What faults leave behind, and hostile inputs cost; docs/explanation/faults.md says what is promised.
 
-Every command that writes is broken at its steps (`fault_children`) and at random moments. Then everything it left is looked at, and it is
-called again. The exit code is 1 where something is not as promised. ``--only``, ``--steps`` and ``--times`` make it shorter.
+``python benchmarks/faults.py kills|signals|full-disk|hostile|mutations|all``: every command that writes is broken at its steps
+(`fault_children`), at random moments, and by disks of several sizes. Then everything it left is looked at, and it is called again.
+Hostile inputs (`hostile_inputs`) and mutated logs are read. The exit code is 1 where something is not as promised. ``--only``, ``--steps``
+and ``--times`` make it shorter.
 """
 
 import argparse
@@ -9,6 +11,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -18,10 +21,12 @@ from pathlib import Path
 
 os.environ |= {"OMP_NUM_THREADS": "1", "KERAS_BACKEND": "torch"}  # forked children have one thread
 
-from fault_cases import CASES, Case, make_inputs
+from fault_cases import CASES, LOG, Case, make_inputs
 from fault_children import INPUTS, LATEST_S, Ended, Fault, Tree, call, different, half_written, tree, without_unfinished
+from hostile_inputs import try_all
 
 FULL = 0
+_DISK_BYTES = 256 << 20
 STRIKES = {"kills": (signal.SIGKILL,), "signals": (signal.SIGTERM, signal.SIGINT, signal.SIGHUP), "full-disk": (FULL,)}
 PROMISES = """
 false if: a final path is neither whole as before nor whole as after, at the moment of the fault or later; the next identical call does not
@@ -40,6 +45,8 @@ class Undisturbed:
     after: Tree
     ended: Ended
     again: int
+    size_bytes: int
+    """Of what it leaves."""
 
 
 def undisturbed(case: Case, work: Path) -> Undisturbed:
@@ -58,7 +65,8 @@ def undisturbed(case: Case, work: Path) -> Undisturbed:
     _restore(state, work)
     ended = call(case.run, work)
     assert not different(after, tree(work)), f"{case.name}: not the same twice: {different(after, tree(work))}"
-    return Undisturbed(case, state, before, after, ended, again.code)
+    size_bytes = sum((work / path).stat().st_size for path in after if before.get(path) != after[path])
+    return Undisturbed(case, state, before, after, ended, again.code, size_bytes)
 
 
 def _assert_done(case: Case, ended: Ended) -> None:
@@ -80,20 +88,34 @@ def _restore(state: Path, work: Path) -> None:
 def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
     """Let a fault befall a case, look, call it again, look; return what is not as promised."""
     _restore(plain.state, work)
-    ended = call(plain.case.run, work, fault)
+    with _room(work, fault.room_bytes):
+        ended = call(plain.case.run, work, fault)
     now = tree(work)
     bad = half_written(plain.before, plain.after, now)
     bad += ["processes outlive it"] if ended.left_running else []
     if fault.signal != signal.SIGKILL:
         bad += _untrue(plain, fault, ended, now)
         left = [path for path in now.keys() - without_unfinished(now).keys() if ".tmp-" in path]
-        if different(without_unfinished(now), plain.after):  # else it was done, and what it replaced is half gone
-            bad += [f"left: {path}" for path in sorted(left)]
+        bad += [f"left: {path}" for path in sorted(left)]
     again = call(plain.case.run, work)
     if again.code not in (plain.ended.code, plain.again):
         bad.append(f"the next call ends with {again.code}: {again.said.strip()[-300:]}")
     bad += [f"the next call leaves other bytes: {path}" for path in different(plain.after, tree(work))[:3]]
     return [f"{plain.case.name}, {fault}: {line}" for line in bad]
+
+
+@contextmanager
+def _room(work: Path, size_bytes: int) -> Iterator[None]:
+    """Leave so much room on the disk, for 0 all of it."""
+    ballast = work.parent / "ballast"
+    if size_bytes:
+        free = os.statvfs(work)
+        with ballast.open("wb") as stream:
+            os.posix_fallocate(stream.fileno(), 0, max(1, free.f_bavail * free.f_bsize - size_bytes))
+    try:
+        yield
+    finally:
+        ballast.unlink(missing_ok=True)
 
 
 def _untrue(plain: Undisturbed, fault: Fault, ended: Ended, now: Tree) -> Iterator[str]:
@@ -118,19 +140,30 @@ def faults_of(plain: Undisturbed, campaign: str, options: argparse.Namespace) ->
     every = max(1.0, count / options.steps) if options.steps else 1.0
     for at in range(int(count / every)):
         yield Fault(strikes[at % len(strikes)], step=1 + int(at * every))
-    for at in range(options.times if campaign != "full-disk" else 0):
-        yield Fault(strikes[at % len(strikes)], after_s=rng.uniform(0.001, 1.05 * plain.ended.seconds))
+    if campaign != "full-disk":
+        yield from (
+            Fault(strikes[at % len(strikes)], after_s=rng.uniform(0.001, 1.05 * plain.ended.seconds))
+            for at in range(options.times)
+        )
+    elif plain.state.parent.is_mount():
+        yield from (Fault(FULL, room_bytes=1 + (at * plain.size_bytes) // options.times) for at in range(options.times))
 
 
 @contextmanager
 def workplace(wanted: set[str]) -> Iterator[Path]:
-    """Yield a directory in memory, if the system has one, with inputs in it."""
+    """Yield a directory with inputs in it: a small disk of its own in memory, where this user can mount one."""
     memory = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None  # noqa: S108
     place = Path(tempfile.mkdtemp(dir=memory, prefix="faults-")).resolve()  # no finalizer: children would run it
+    mount = ["mount", "-t", "tmpfs", "-o", f"size={_DISK_BYTES}", "tmpfs", place]
+    mounted = subprocess.run(mount, capture_output=True, check=False).returncode == 0
+    if not mounted:
+        print("no disk of a chosen size can be mounted: full disks are played at steps alone")
     try:
         make_inputs(place / "work" / INPUTS, wanted)
         yield place / "work"
     finally:
+        if mounted:
+            subprocess.run(["umount", "--lazy", place], check=True)
         shutil.rmtree(place)
 
 
@@ -167,17 +200,47 @@ def run(campaigns: list[str], cases: list[Case], options: argparse.Namespace) ->
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("campaign", choices=[*STRIKES, "all"])
+    parser.add_argument("campaign", choices=[*STRIKES, "hostile", "mutations", "all"])
     parser.add_argument("--only", default="", help="these calls alone, by commas")
     parser.add_argument("--steps", type=int, default=0, help="at most so many steps of each call (0: every one)")
     parser.add_argument("--times", type=int, default=15, help="so many random moments of each call")
     parser.add_argument("--seed", type=int, default=1, help="of the random moments")
+    parser.add_argument("--mutations", type=int, default=10_000, help="so many mutated logs")
     parser.add_argument("--shown", type=int, default=5, help="findings shown of each call")
     options = parser.parse_args()
+    fine = True
+    if options.campaign in ("hostile", "all"):
+        fine = hostile(options)
+    if options.campaign in ("mutations", "all"):
+        fine &= mutated(options)
+    if options.campaign in STRIKES or options.campaign == "all":
+        fine &= faulted(options)
+    return 0 if fine else 1
+
+
+def faulted(options: argparse.Namespace) -> bool:
+    """Break the commands, as options say."""
     only = options.only.split(",") if options.only else [case.name for case in CASES]
     cases = [case for case in CASES if case.name in only]
     campaigns = list(STRIKES) if options.campaign == "all" else [options.campaign]
-    return 0 if run(campaigns, cases, options) else 1
+    return run(campaigns, cases, options)
+
+
+def hostile(options: argparse.Namespace) -> bool:
+    """Try hostile inputs; recipes are tried on a simulated log."""
+    with workplace({"log"}) as work:
+        return try_all(work / LOG, options.only)
+
+
+def mutated(options: argparse.Namespace) -> bool:
+    """Read mutated logs: each loss and each change is told."""
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fuzz"))
+    from mutated_logs import mutations
+
+    verdicts = mutations(options.mutations, options.seed)
+    print(*(f"{verdict:32} {count:6}" for verdict, count in verdicts.items()), sep="\n")
+    print("\nfalse if: a mutated log is read otherwise than the whole one, and nothing of it is told (silent)")
+    return not verdicts["silent"]
 
 
 if __name__ == "__main__":

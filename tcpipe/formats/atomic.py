@@ -200,8 +200,11 @@ def _holder_beside(place: Path) -> Iterator[Path]:
     try:
         yield holder
     finally:
-        os.close(lock)
-        shutil.rmtree(holder, ignore_errors=True)
+        try:
+            shutil.rmtree(holder, ignore_errors=True)
+        finally:  # also where a signal came in the midst of it
+            shutil.rmtree(holder, ignore_errors=True)
+            os.close(lock)
 
 
 def _locked_directory(parent: Path, prefix: str) -> tuple[Path, int]:
