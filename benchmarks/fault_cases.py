@@ -91,7 +91,7 @@ CASES = (
     Case("export", command("export", LOG, "table"), wants=_LOG),
     Case("ingest", _RUN, wants=_LOG),
     Case("ingest --force", command("ingest", LOG, "--force", "--quiet"), (_RUN,), _LOG),
-    Case("ingest, another recipe", command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q"), (_RUN,), _LOG),
+    Case("ingest by another recipe", command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q"), (_RUN,), _LOG),
     Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
     Case("ingest --jobs 2", command("ingest", f"{INPUTS}/logs", "--jobs", "2", "--quiet"), wants=_LOG),
     Case("report", command("report", "tcpipe-store"), (_RUN,), _LOG),

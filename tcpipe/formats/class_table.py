@@ -12,12 +12,12 @@
 from __future__ import annotations
 
 import csv
-import tomllib
 from io import StringIO
 from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import MapError
+from tcpipe.formats.toml_text import parse_toml
 from tcpipe.terrain.classes import MAX_ID, ClassScheme, ClassTable, TerrainClass
 
 MAX_BYTES = 2_000_000
@@ -46,7 +46,7 @@ def read_class_scheme(path: Path) -> ClassScheme:
             )
         text = path.read_text(encoding="utf-8-sig")
         rows = _toml_rows(text) if path.suffix.lower() == ".toml" else _csv_rows(text, path)
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError, csv.Error, RecursionError) as error:
+    except (OSError, ValueError, csv.Error) as error:
         raise MapError(f"{path}: the class table cannot be read ({error})") from error
     problems: list[str] = []
     classes: dict[int, TerrainClass] = {}
@@ -88,7 +88,7 @@ def _csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
 
 
 def _toml_rows(text: str) -> list[tuple[str, dict[str, Any]]]:
-    rows = tomllib.loads(text).get("class", [])
+    rows = parse_toml(text).get("class", [])
     return [(f"class {number}", row) for number, row in enumerate(rows if isinstance(rows, list) else [rows], 1)]
 
 

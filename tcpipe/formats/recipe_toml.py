@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -12,6 +11,7 @@ from typing import Any
 
 from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import digest
+from tcpipe.formats.toml_text import parse_toml
 from tcpipe.recipe import IngestSections, Recipe
 from tcpipe.recipe.checking import as_toml, from_values, kinds_of, range_of
 
@@ -40,7 +40,7 @@ def load_recipe(path: Path | None) -> Recipe:
             data = stream.read(_MOST_BYTES + 1)
         if len(data) > _MOST_BYTES:
             raise RecipeError(f"{path}: is larger than {_MOST_BYTES / 1e6:g} MB, which no recipe is")
-        return parse_recipe(tomllib.loads(data.decode("utf-8")), where=str(path))
+        return parse_recipe(parse_toml(data.decode("utf-8")), where=str(path))
     except (OSError, UnicodeDecodeError) as error:
         raise RecipeError(f"{path}: the recipe cannot be read ({getattr(error, 'strerror', None) or error})") from None
     except RecursionError:

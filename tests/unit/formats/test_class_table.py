@@ -84,3 +84,14 @@ def test_the_papers_classes():
     values = np.array([[-3, 0, 1, 7], [8, 255, 4, 4]], np.int16)
     valid = np.array([[True, True, True, True], [True, True, True, False]])
     assert PAPER_SCHEME.ids(values, valid).tolist() == [[0, 0, 1, 7], [0, 0, 4, 0]]
+
+
+def test_toml_that_would_take_for_ever_is_refused(tmp_path):
+    for name, text, told in (
+        ("dots", "a" + ".a" * 900_000, "dots, at most 1000"),
+        ("deep", "a = " + "[" * 100_000, "nested too deep"),
+    ):
+        path = tmp_path / f"{name}.toml"
+        path.write_text(text)
+        with pytest.raises(MapError, match=told):
+            read_class_scheme(path)

@@ -178,3 +178,10 @@ def test_dataset_keys_do_not_rename_runs_but_ingest_keys_do() -> None:
     plain = read_key(default, None, definitions="")
     assert plain == read_key(fused, None, definitions="")
     assert plain not in (read_key(default, "husky", definitions=""), read_key(default, None, definitions="ab"))
+
+
+def test_a_key_of_many_parts_is_refused_before_it_takes_for_ever(tmp_path):
+    path = tmp_path / "tcpipe.toml"
+    path.write_text("[" + ".".join("a" * 450_000) + "]\n")
+    with pytest.raises(RecipeError, match="line 1 has 449999 dots, at most 1000"):
+        load_recipe(path)
