@@ -67,6 +67,9 @@ def remember_earlier(store: Store) -> None:
                 if "paths" in origin:
                     log = LogSource(tuple(map(Path, origin["paths"])), (), urls=tuple(origin["paths"]))
                     store.remember(f"{log.lineage}/{run_id[-8:]}", log.sighting(origin["sha256"]))
+        (store.records_path / "logs").mkdir(
+            parents=True, exist_ok=True
+        )  # what a killed first ingest leaves is of no earlier version
 
 
 def _elsewhere(store: Store, run_id: str, source: LogSource) -> str:

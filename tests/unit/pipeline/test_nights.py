@@ -14,6 +14,7 @@ from tcpipe.pipeline import known_trouble
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.known_trouble import accept
+from tcpipe.pipeline.supersession import remember_earlier
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
@@ -298,3 +299,13 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     known = [Store(tmp_path / "store").run_json(result.run_id)["remarks"] for result in summary.results]
     taken = [sum("run_0.bag ends, whose static transforms are taken" in line for line in lines) for lines in known]
     assert taken == [0, 1]
+
+
+def test_a_store_whose_first_ingest_was_killed_is_of_no_earlier_version(tmp_path):
+    store = Store(tmp_path / "store")
+    remember_earlier(store)
+    store.write_run_json(
+        "run-12345678", {"source": {"paths": ["/gone/run.mcap"], "sha256": "1" * 64}}
+    )  # and then it is killed
+    remember_earlier(store)
+    assert not any(store.records_path.rglob("*.json"))
