@@ -1,6 +1,6 @@
 """What faults leave behind, and hostile inputs cost; docs/explanation/faults.md says what is promised.
 
-``python benchmarks/faults.py kills|signals|full-disk|hostile|mutations|all``: every command that writes is broken at its steps
+``python benchmarks/faults.py kills|signals|full-disk|faults|hostile|mutations|all``: every command that writes is broken at its steps
 (`fault_children`), at random moments, and by disks of several sizes. Then everything it left is looked at, and it is called again.
 Hostile inputs (`hostile_inputs`) and mutated logs are read. The exit code is 1 where something is not as promised. ``--only``, ``--steps``
 and ``--times`` make it shorter.
@@ -200,7 +200,7 @@ def run(campaigns: list[str], cases: list[Case], options: argparse.Namespace) ->
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("campaign", choices=[*STRIKES, "hostile", "mutations", "all"])
+    parser.add_argument("campaign", choices=[*STRIKES, "faults", "hostile", "mutations", "all"])
     parser.add_argument("--only", default="", help="these calls alone, by commas")
     parser.add_argument("--steps", type=int, default=0, help="at most so many steps of each call (0: every one)")
     parser.add_argument("--times", type=int, default=15, help="so many random moments of each call")
@@ -213,7 +213,7 @@ def main() -> int:
         fine = hostile(options)
     if options.campaign in ("mutations", "all"):
         fine &= mutated(options)
-    if options.campaign in STRIKES or options.campaign == "all":
+    if options.campaign in (*STRIKES, "faults", "all"):
         fine &= faulted(options)
     return 0 if fine else 1
 
@@ -222,7 +222,7 @@ def faulted(options: argparse.Namespace) -> bool:
     """Break the commands, as options say."""
     only = options.only.split(",") if options.only else [case.name for case in CASES]
     cases = [case for case in CASES if case.name in only]
-    campaigns = list(STRIKES) if options.campaign == "all" else [options.campaign]
+    campaigns = [options.campaign] if options.campaign in STRIKES else list(STRIKES)
     return run(campaigns, cases, options)
 
 
