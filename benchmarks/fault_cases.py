@@ -20,7 +20,7 @@ Run = Callable[[], object]
 
 STORE = ("--store", f"{INPUTS}/store")
 LAYERS = tuple(word for name in ("height", "ortho", "terrain") for word in (f"--{name}", f"{INPUTS}/{name}.tif"))
-LOG = f"{INPUTS}/logs/tiny.mcap"
+LOG, CUT = f"{INPUTS}/logs/tiny.mcap", f"{INPUTS}/cut.mcap"
 MODEL, DATASET = f"{INPUTS}/model", f"{INPUTS}/dataset"
 FROM, TO = "15.434471784,47.069643821", "15.434788601,47.069732605"
 
@@ -94,6 +94,7 @@ CASES = (
     Case("ingest by another recipe", command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q"), (_RUN,), _LOG),
     Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
     Case("ingest --jobs 2", command("ingest", f"{INPUTS}/logs", "--jobs", "2", "--quiet"), wants=_LOG),
+    Case("accept", command("accept", CUT), (command("ingest", CUT, "--quiet"),), _LOG),
     Case("report", command("report", "tcpipe-store"), (_RUN,), _LOG),
     Case("add-map", command(*_MAP), wants=_WORLD),
     Case("add-map --force", command(*_MAP, "--force"), (command("add-map", "site", *LAYERS[:2], "-q"),), _WORLD),
@@ -142,6 +143,7 @@ def _make_logs(place: Path) -> None:
         site = simulate(place / "simulated", scenario="tiny", seed=seed)
         shutil.copyfile(site.logs[0], place / "logs" / f"{name}.mcap")
         shutil.rmtree(place / "simulated")
+    (place / "cut.mcap").write_bytes((place / "logs" / "tiny.mcap").read_bytes()[:-100_000])
     (place / "other.toml").write_text("[gate]\nmax_acceleration_mps2 = 0.31\n")
     ingest([place / "logs" / "tiny.mcap"], store=place / "warm")
     shutil.rmtree(place / "warm")

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, put_file
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, put_file
 from tcpipe.formats.json_files import to_json
 from tcpipe.formats.seals import read_sealed, sealed, write_sealed
 
@@ -45,6 +45,7 @@ def put_record(root: Path, name: str, value: Mapping[str, Any]) -> bool:
 
     """
     path = root / f"{name}.json"
+    clear(root)
     if read_record(root, name) is not None:
         return False
     if put_file(path, to_json(sealed(value)), staging=root):

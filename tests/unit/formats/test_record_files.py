@@ -22,6 +22,14 @@ def test_a_fact_is_written_once_and_never_changed(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["kind"]
 
 
+def test_what_a_killed_writer_of_a_record_left_goes_with_the_next_who_looks(tmp_path):
+    put_record(tmp_path, "kind/fact", {"a": 1})
+    (tmp_path / ".tmp-new-0123abcd").mkdir()
+    (tmp_path / ".tmp-new-0123abcd" / "new").touch()
+    assert not put_record(tmp_path, "kind/fact", {"a": 1})
+    assert [path.name for path in tmp_path.iterdir()] == ["kind"]
+
+
 @pytest.mark.parametrize("broken", ["", "{", "[]", '{"a": 1}'])
 def test_a_broken_record_is_named_left_out_and_written_again(tmp_path, caplog, broken):
     put_record(tmp_path, "kind/one", {"a": 1})
