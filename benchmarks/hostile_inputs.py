@@ -387,7 +387,7 @@ def try_all(good: Path, only: str) -> bool:
             print(f"    {line}", flush=True)
     print(
         f"\nfalse if: a command needs more than {MOST_BYTES / 1e9:g} GB or {MOST_S:g} s of CPU, or {HANGS_S:g} s in all; ends with"
-        "\nanother code than those documented; tells a traceback or an internal error; prints a control character."
+        "\nanother code than those documented; tells a traceback or an internal error; prints a control character, or 1 MB."
     )
     return fine
 
@@ -416,7 +416,7 @@ def _tried(hostile: Hostile, arguments: Arguments, place: Path) -> tuple[int, fl
         wrong.append("is not told plainly")
     if any(byte < 32 and byte not in b"\n\t" for byte in said):
         wrong.append("prints control characters")
-    if len(said) > 20_000:
+    if len(said) > 1_000_000:
         wrong.append(f"prints {len(said)} bytes")
     told = said.decode(errors="replace").strip()[-300:]
     return (

@@ -110,7 +110,8 @@ class _Lines(logging.Handler):
         self._shown = shown
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._shown.line(record.getMessage())
+        said = self._shown.problem if record.levelno >= logging.ERROR else self._shown.line
+        said(record.getMessage())
 
 
 def say(text: str, *, err: bool = False) -> None:
