@@ -90,7 +90,7 @@ def test_diff_names_cause_and_effect(work):
 def test_what_cannot_be_asked_is_said_in_a_line(work):
     plain_lines(tcpipe("verify", "nowhere", cwd=work), 2)
     plain_lines(tcpipe("explain", "no-such-sample", cwd=work), 1)
-    plain_lines(tcpipe("diff", "dataset", "tcpipe-store", cwd=work), 1)
+    plain_lines(tcpipe("diff", "dataset", "tcpipe-store", cwd=work), 2)
 
 
 def test_a_build_that_is_killed_leaves_what_the_next_one_clears_away(work):
