@@ -226,7 +226,7 @@ def test_definitions_that_a_log_lacks_can_be_given(undefined):
     [
         ("broken", 1, "its definition cannot be parsed"),
         ("none", 1, "no .msg or .idl file below it"),
-        ("nowhere", 2, "does not exist"),
+        ("nowhere", 2, "no such directory"),
         ("a.mcap", 2, "is a file"),
     ],
 )
