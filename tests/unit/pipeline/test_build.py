@@ -252,7 +252,7 @@ def test_what_is_no_dataset_is_left_alone(store, tmp_path, kind):
     else:
         build(store, tmp_path)
         (out / "notes.txt").write_text("precious")
-    line = refused(store, tmp_path, holdout="sample")
+    line = refused(store, tmp_path, UsageError, holdout="sample")
     assert "give another OUT" in line
     assert (out if kind == "file" else out / "notes.txt").read_text() == "precious"
 
