@@ -32,6 +32,7 @@ def progress(what: str, total: int, *, quiet: bool) -> Iterator[Progress]:
     shown = Progress(what, total, quiet=quiet)
     handler = _Lines(shown)
     logger = logging.getLogger("tcpipe")
+    before = logger.level
     logger.setLevel(logging.ERROR if quiet else logging.INFO)
     logger.addHandler(handler)
     try:
@@ -39,6 +40,7 @@ def progress(what: str, total: int, *, quiet: bool) -> Iterator[Progress]:
             yield shown
     finally:
         logger.removeHandler(handler)
+        logger.setLevel(before)
 
 
 class Progress:
