@@ -13,6 +13,7 @@ import fcntl
 import os
 import re
 import shutil
+import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -34,6 +35,9 @@ _BEFORE = ".before"
 
 _UNWRITABLE = {errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG}
 """Errors that only writing can meet, whatever file they name."""
+
+_LAST_WRITE_S = 0.05
+"""Where writing is broken off by a signal, a thread of zarr still finishes the small file it is at."""
 
 _AT_FDCWD = -100
 _RENAME_EXCHANGE = 2
@@ -199,6 +203,10 @@ def _holder_beside(place: Path) -> Iterator[Path]:
     holder, lock = _locked_directory(place.parent, _prefix(place.name))
     try:
         yield holder
+    except BaseException:
+        shutil.rmtree(holder, ignore_errors=True)
+        time.sleep(_LAST_WRITE_S)
+        raise
     finally:
         try:
             shutil.rmtree(holder, ignore_errors=True)
