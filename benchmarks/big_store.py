@@ -7,7 +7,7 @@ import numpy as np
 from pyproj import Geod, Transformer
 
 from tcpipe import __version__
-from tcpipe.formats.map_files import open_map
+from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe

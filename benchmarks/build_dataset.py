@@ -20,9 +20,9 @@ from big_store import store_of
 from sample_patches import gather
 
 from tcpipe.formats.dataset_files import CHUNK_ROWS
-from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.shards import open_sharded
-from tcpipe.pipeline import build, dataset_content
+from tcpipe.pipeline.dataset import build, content
 from tcpipe.recipe import Recipe
 
 LAYERS = ("ortho", "terrain", "height")
@@ -181,7 +181,7 @@ def measure(directory, samples):
 
 def main():
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    timed(dataset_content, "sample_all_segments")
+    timed(content, "sample_all_segments")
     timed(build, "_write_patches")
     counted()
     threading.Thread(target=watch, daemon=True).start()

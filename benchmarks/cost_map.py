@@ -24,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from made_models import CARD, made_model
 from map_worlds import World
 
-from tcpipe.formats.map_building import build_map
-from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.learning.model_card import Seen
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.network import Architecture

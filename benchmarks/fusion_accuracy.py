@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import chi2
 
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.standing import standing_intervals

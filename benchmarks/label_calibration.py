@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, Truth, read_truth, scenario, simulate, true_cost
 from tcpipe.simulation.messages import Recorder

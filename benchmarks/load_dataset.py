@@ -25,7 +25,7 @@ import numpy as np
 from big_store import store_of
 
 from tcpipe import open_dataset
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import DatasetConfig, Recipe
 
 SIZE = 64

@@ -16,7 +16,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 from rosbags.typesys import Stores, get_typestore
 
-from tcpipe.formats.log_writing import MessageStream, _payloads
+from tcpipe.formats.logs.writing import MessageStream, _payloads
 
 RATES_HZ = (
     ("/imu/data", "sensor_msgs/msg/Imu", 200, "angular_velocity.z"),

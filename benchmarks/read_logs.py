@@ -35,9 +35,9 @@ from made_logs import (
 )
 from rosbags.highlevel import AnyReader
 
-from tcpipe.formats.log_file import open_log
-from tcpipe.formats.log_part import ByteSource, decompressed
-from tcpipe.formats.mcap_log import McapPart
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.log_part import ByteSource, decompressed
+from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.pipeline.export import export
 
 MINUTES, QUICK_MINUTES, REPEATS = 10.0, 1.0, 5
@@ -57,9 +57,9 @@ for line in sys.stdin:
 MEMORY = """
 import sys
 from pathlib import Path
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 import pyarrow.parquet, rosbags.typesys
-import tcpipe.formats.arrow_columns, tcpipe.formats.bag_log, tcpipe.formats.mcap_log
+import tcpipe.formats.logs.arrow_columns, tcpipe.formats.logs.bag_file, tcpipe.formats.logs.mcap_file
 peak = lambda: int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0]) / 1024
 before, rows, largest = peak(), 0, 0
 with open_log(Path(sys.argv[1])) as log:

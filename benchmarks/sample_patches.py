@@ -23,9 +23,9 @@ from rasterio.windows import Window
 from scipy.ndimage import map_coordinates
 
 from tcpipe.compiled import kernel
-from tcpipe.formats.geotiff import write_geotiff
-from tcpipe.formats.map_building import build_map
-from tcpipe.formats.map_files import open_map
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.geotiff import write_geotiff
+from tcpipe.formats.maps.map_files import open_map
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.patches import map_px_from_patch, patch_frames

@@ -12,10 +12,10 @@ from typing import Any
 __version__ = "0.2.0"
 
 _HOMES = {
-    "read_log": ("tcpipe.formats.log_file", "open_log"),
+    "read_log": ("tcpipe.formats.logs.log_file", "open_log"),
     "ingest": ("tcpipe.pipeline.ingest", "ingest"),
     "add_map": ("tcpipe.pipeline.maps", "add_map"),
-    "build_dataset": ("tcpipe.pipeline.build", "build_dataset"),
+    "build_dataset": ("tcpipe.pipeline.dataset.build", "build_dataset"),
     "open_dataset": ("tcpipe.dataset", "open_dataset"),
 }
 

@@ -3,7 +3,7 @@
 from dataclasses import replace
 from pathlib import Path
 
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.recipe import ReadConfig
 from tcpipe.simulation import simulate
 from tcpipe.simulation.scenarios import DriveSpec, RasterSpec, Scenario

@@ -9,7 +9,7 @@ import pyproj
 from map_worlds import World
 
 from tcpipe import __version__
-from tcpipe.formats.map_building import build_map
+from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store

@@ -6,7 +6,7 @@ With SITE, the OUT of an earlier call, its log and rasters are taken. `make test
 import sys
 from pathlib import Path
 
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, simulate, tiny

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tcpipe.formats.log_writing import MessageStream, write_mcap
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
 
 START_NS = 1_700_000_000_000_000_000
 

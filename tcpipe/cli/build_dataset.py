@@ -92,7 +92,7 @@ def build_dataset(
     from dataclasses import asdict, replace
 
     from tcpipe.cli.output import print_json, progress, ruling_recipe, say, say_lines
-    from tcpipe.pipeline.build import build_dataset as run
+    from tcpipe.pipeline.dataset.build import build_dataset as run
 
     ruling, source = ruling_recipe(recipe)
     if not as_json:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_part import no_room
+from tcpipe.formats.logs.log_part import no_room
 
 if TYPE_CHECKING:
     from obstore.store import ObjectStore

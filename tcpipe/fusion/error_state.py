@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import error_state_kernel as kernel
 from tcpipe.fusion.gates import chi_square_gate
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements, part
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD, process_noise, turn_scale_std, turn_sources
 from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.timeline import Timeline, build_timeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
-from tcpipe.fusion.windows import part
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix
 
 _WIDTH = 30  # of a row of outputs, see `error_state_kernel._saved`; 81 more with covariances

@@ -8,7 +8,8 @@ and floored. Rows are sorted by stamp, without repetitions. Both estimators take
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -128,3 +129,26 @@ class InitialState:
     gyro_bias_radps: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     gyro_bias_std_radps: float = 0.02
     heading_from: str = "unknown"
+
+
+_Source = TypeVar("_Source", Positions, BodyVelocities, InertialMeasurements)
+
+
+def part(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
+    """Return the measurements between two stamps, both included; a sensor without any is None."""
+    return replace(
+        whole,
+        gnss=_part(whole.gnss, start_ns, end_ns),
+        imu=_part(whole.imu, start_ns, end_ns),
+        wheels=_part(whole.wheels, start_ns, end_ns),
+        visual=_part(whole.visual, start_ns, end_ns),
+    )
+
+
+def _part(source: _Source | None, start_ns: int, end_ns: int) -> _Source | None:
+    if source is None:
+        return None
+    rows = slice(*np.searchsorted(source.stamp_ns, (start_ns, end_ns + 1)))
+    values = {field.name: getattr(source, field.name) for field in fields(source)}
+    inside: dict[str, Any] = {name: value[rows] for name, value in values.items() if isinstance(value, np.ndarray)}
+    return replace(source, **inside) if rows.stop > rows.start else None

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import Measurements
+from tcpipe.fusion.measurements import Measurements, part
 from tcpipe.fusion.signals import in_gap, median_period_ns
-from tcpipe.fusion.windows import part
 
 _PAUSE_NS = 5_000_000_000
 

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from tcpipe.errors import ModelError
-from tcpipe.formats.class_table import table_from_json, table_to_json
+from tcpipe.formats.maps.class_table import table_from_json, table_to_json
 from tcpipe.learning.network import Architecture
 from tcpipe.terrain.classes import ClassTable
 

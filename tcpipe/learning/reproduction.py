@@ -22,7 +22,7 @@ from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.plant_floor import plant_costs
 from tcpipe.learning.reproduction_page import reproduction_page
 from tcpipe.learning.training import train
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe

@@ -15,8 +15,8 @@ import pyarrow as pa
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError, UsageError
 from tcpipe.formats.atomic import clear_beside
-from tcpipe.formats.class_table import table_from_json
 from tcpipe.formats.json_files import digest
+from tcpipe.formats.maps.class_table import table_from_json
 from tcpipe.learning.checkpoint import Progress, read_checkpoint
 from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
 from tcpipe.learning.keras_backend import device_name

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.atomic import clear
-from tcpipe.pipeline.build import BuildResult, build_dataset
+from tcpipe.pipeline.dataset.build import BuildResult, build_dataset
 from tcpipe.pipeline.ingest import IngestSummary, ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.pipeline.report import report

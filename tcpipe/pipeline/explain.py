@@ -24,7 +24,7 @@ from tcpipe.formats.dataset_files import (
     sample_columns,
 )
 from tcpipe.formats.json_files import plain
-from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
 from tcpipe.formats.recipe_toml import parse_recipe, read_key
 from tcpipe.formats.seals import file_checksum

@@ -16,7 +16,7 @@ from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.json_files import read_json, write_json
-from tcpipe.formats.log_file import Log, open_log
+from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.parquet import parquet_rows, read_schema, storable
 from tcpipe.logs.power_sources import bare_unit
 from tcpipe.pipeline.log_sources import definitions_key

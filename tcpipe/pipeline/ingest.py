@@ -18,8 +18,8 @@ from typing import Any, Literal, TypeVar
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, plain_line
 from tcpipe.execution import run_all
-from tcpipe.formats.joined_log import open_logs
 from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, read_key, recipe_id
 from tcpipe.formats.record_files import record_name

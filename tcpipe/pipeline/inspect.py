@@ -7,7 +7,7 @@ from typing import Any
 
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats.json_files import plain
-from tcpipe.formats.log_file import belongs_to_a_log, logs_below, open_log
+from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below, open_log
 from tcpipe.formats.object_storage import copied, is_url
 from tcpipe.pipeline.log_inspection import inspect_log
 from tcpipe.recipe import Recipe
@@ -54,7 +54,7 @@ def inspect(
     if found:
         return _run(path, *found)
     if path.suffix == ".zarr":
-        from tcpipe.formats.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
+        from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
 
         return {"kind": "map", "path": str(path), **plain(open_map(path).summary())}
     return _logs_at(path, recipe, **how)

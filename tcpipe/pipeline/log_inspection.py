@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from tcpipe.formats.log_file import Log
+from tcpipe.formats.logs.log_file import Log
 from tcpipe.logs.clocks import SIMULATED_NS, is_simulated, settle_clocks
 from tcpipe.logs.roles import assign_roles
 from tcpipe.logs.topics import Topic

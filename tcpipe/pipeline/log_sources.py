@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import LogError, TcpipeError, plain_line
-from tcpipe.formats.joined_log import open_logs
 from tcpipe.formats.json_files import digest
-from tcpipe.formats.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs
+from tcpipe.formats.logs.joined import open_logs
+from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs
+from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, storage_files
 from tcpipe.formats.object_storage import copied, is_url, stand_ins
 from tcpipe.formats.record_files import record_name
-from tcpipe.formats.rosbag2_log import STORAGE_SUFFIXES, is_one_bag, storage_files
 from tcpipe.pipeline.transience import is_transient
 
 _LONGEST_STEM_BYTES = 200

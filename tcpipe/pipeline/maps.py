@@ -12,12 +12,12 @@ from typing import Any
 
 from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import place_state
-from tcpipe.formats.geotiff import raster_files
-from tcpipe.formats.map_building import build_map
-from tcpipe.formats.map_files import MapFile, open_map
-from tcpipe.formats.map_text import map_lines
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.geotiff import raster_files
+from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.maps.terrain_polygons import is_drawn
+from tcpipe.formats.maps.text import map_lines
 from tcpipe.formats.seals import file_checksum, seal_of
-from tcpipe.formats.terrain_polygons import is_drawn
 from tcpipe.report.overview import quick_look, shows_map, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.terrain.classes import ClassScheme
@@ -38,7 +38,7 @@ class AddedMap:
     status: str
     """``done`` or ``unchanged``."""
     map: Mapping[str, Any]
-    """What the map is: `tcpipe.formats.map_files.MapFile.summary`."""
+    """What the map is: `tcpipe.formats.maps.map_files.MapFile.summary`."""
     picture: Path
     """A quick look at it: orthophoto or shaded relief, tinted by class, white where a layer has no data."""
 

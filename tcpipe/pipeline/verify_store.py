@@ -12,11 +12,11 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal, read_sealed
-from tcpipe.pipeline.dataset_segments import KEPT
+from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers

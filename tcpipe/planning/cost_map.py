@@ -26,10 +26,10 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive
-from tcpipe.formats.geotiff import read_bands, write_cog
 from tcpipe.formats.json_files import digest, read_json, write_json
-from tcpipe.formats.map_files import MapFile
-from tcpipe.formats.nav2_map import HIGHEST, LETHAL, write_nav2_map
+from tcpipe.formats.maps.geotiff import read_bands, write_cog
+from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.seals import broken_checksums, checksums_to_json, read_sealed, write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from tcpipe.errors import MapError, UsageError
-from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.store import open_store
 
 

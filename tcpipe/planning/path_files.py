@@ -11,7 +11,7 @@ from tcpipe.errors import StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import read_line
 from tcpipe.formats.json_files import digest
-from tcpipe.formats.map_files import MapFile
+from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import file_checksum, read_sealed, write_sealed
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.intervals import COVERAGE

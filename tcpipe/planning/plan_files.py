@@ -13,7 +13,7 @@ from tcpipe.errors import ModelError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import check_lonlat, write_lines
 from tcpipe.formats.json_files import digest, read_json
-from tcpipe.formats.map_files import MapFile
+from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import broken_seal, file_checksum
 from tcpipe.planning.cost_map import CARD, cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model

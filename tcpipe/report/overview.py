@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from tcpipe.formats.atomic import atomic_file
-from tcpipe.formats.map_files import MapFile
+from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import picture_text, seal_of
 from tcpipe.report.figures import CLASS_COLOURS
 

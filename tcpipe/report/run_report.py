@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from tcpipe.errors import TcpipeError, plain_line
-from tcpipe.formats.map_files import MapFile, open_map
+from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import DROPPED, KEPT, histograms, ledger_bars, over_distance, path_on_map
 from tcpipe.report.overview import map_overview

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.log_writing import MessageStream
+from tcpipe.formats.logs.writing import MessageStream
 from tcpipe.simulation.sensors import Gnss, Imu, Mounting, Power, Reading, Sensors, Visual, Wheels
 
 Dialect = Literal["ros1", "ros2"]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
-from tcpipe.formats.geotiff import write_geotiff
 from tcpipe.formats.json_files import to_json, write_json
-from tcpipe.formats.log_writing import write_bag, write_mcap, write_rosbag2
+from tcpipe.formats.logs.writing import write_bag, write_mcap, write_rosbag2
+from tcpipe.formats.maps.geotiff import write_geotiff
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.simulation.drive import drive
 from tcpipe.simulation.messages import streams

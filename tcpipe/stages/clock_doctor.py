@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.clock_offsets import POWER, ClockOffsets, Offset, Pair, PowerSignal, find_clock_offsets
+from tcpipe.fusion.checks.clock_offsets import POWER, ClockOffsets, Offset, Pair, PowerSignal, find_clock_offsets
 from tcpipe.fusion.rails import power_at
 from tcpipe.stages.fuse_inputs import Inputs, rails_of
 from tcpipe.stages.fuse_sanity import longest_epoch

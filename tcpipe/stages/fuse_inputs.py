@@ -12,10 +12,10 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
+from tcpipe.fusion.checks.stamp_jitter import steadied
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
 from tcpipe.fusion.rails import RailSamples
-from tcpipe.fusion.stamp_jitter import steadied
 from tcpipe.recipe import FuseConfig
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import FloatColumns, floats, integers

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from tcpipe.fusion.checks.sensors import Command, Refusal, check_sensors
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
-from tcpipe.fusion.sensor_checks import Command, Refusal, check_sensors
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import Inputs
 from tcpipe.tables.arrays import rows_where

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from tcpipe.errors import FusionError, RoleError
-from tcpipe.formats.log_file import open_log
-from tcpipe.formats.log_writing import MessageStream, write_mcap
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.pipeline.ingest import run_stages
 from tcpipe.recipe import Placement, ReadConfig, Recipe
 from tcpipe.simulation import Faults, Truth, scenario, simulated_drive, true_cost

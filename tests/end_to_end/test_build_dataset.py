@@ -13,7 +13,7 @@ import shapely
 from synthetic_store import WORLD, box, lonlat, region_file, small_store
 
 from tcpipe.dataset import open_dataset
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 
 REGION = box(-20, -20, 5, 20)
@@ -161,7 +161,7 @@ def test_croissant_names_every_file_and_column(built, samples):
 
 
 def test_the_same_bytes_whatever_the_jobs_and_whatever_the_batches(built, tmp_path, monkeypatch):
-    from tcpipe.pipeline import dataset_sampling
+    from tcpipe.pipeline.dataset import sampling as dataset_sampling
 
     directory, store, region, _ = built
     monkeypatch.setattr(dataset_sampling, "_BATCH_ROWS", 150)

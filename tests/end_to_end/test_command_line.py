@@ -21,7 +21,7 @@ from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from tcpipe.formats.log_writing import MessageStream, write_mcap
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, simulate, tiny
 
 _SECONDS = (32.0, 17.0, 17.0)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from shared_data import shared_data
 
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.recipe import FuseConfig, Placement, ReadConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.recipe import FuseConfig, GateConfig, LabelConfig, ReadConfig, SegmentConfig
 from tcpipe.simulation import Faults, read_truth, scenario, simulate, tiny, true_cost
 from tcpipe.simulation.messages import Recorder

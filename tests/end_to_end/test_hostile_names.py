@@ -12,7 +12,7 @@ from installed_command import tcpipe
 from mcap.writer import Writer
 
 from tcpipe.errors import MapError
-from tcpipe.formats.class_table import read_class_scheme
+from tcpipe.formats.maps.class_table import read_class_scheme
 from tcpipe.simulation import simulate
 
 TERMINAL = "\x1b]0;owned\x07\x1b[31m\u202e\x9b2J"

@@ -14,7 +14,7 @@ from mcap.writer import Writer
 from storage_server import FORBIDDEN, object_store
 from wheel_drives import drive_at
 
-from tcpipe.formats.log_writing import MessageStream, write_mcap, write_rosbag2
+from tcpipe.formats.logs.writing import MessageStream, write_mcap, write_rosbag2
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 START_NS = 1_700_000_000_000_000_000

@@ -8,7 +8,7 @@ import pytest
 from synthetic_store import box, region_file, small_store
 
 from tcpipe.dataset import open_dataset
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import DatasetConfig, Recipe
 
 not_ours = pytest.mark.filterwarnings("ignore")

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, read_truth, simulate

@@ -21,7 +21,7 @@ if __name__ == "__main__":
 
     sys.path.insert(0, str(Path(__file__).parents[1]))
     with atheris.instrument_imports(include=["tcpipe.formats", "tcpipe.logs"]):
-        import tcpipe.formats.log_file  # noqa: F401
+        import tcpipe.formats.logs.log_file  # noqa: F401
 
 import numpy as np
 from mcap.writer import CompressionType, IndexType
@@ -29,10 +29,10 @@ from random_messages import ROS1, ROS2, random_messages, write_bag, write_mcap, 
 from rosbags.rosbag1 import Writer as BagWriter
 
 from tcpipe.errors import LogError
-from tcpipe.formats.arrow_columns import TopicTable
-from tcpipe.formats.log_file import Log, open_log
-from tcpipe.formats.log_part import MessageBlock
-from tcpipe.formats.ros_types import DefinitionError, MessageType, RowError, TypeLibrary
+from tcpipe.formats.logs.arrow_columns import TopicTable
+from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.formats.logs.log_part import MessageBlock
+from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, RowError, TypeLibrary
 
 TYPES = (
     "std_msgs/msg/ColorRGBA",

@@ -37,7 +37,7 @@ from random_messages import ROS1, ROS2, START_NS, Message, write_bag, write_mcap
 from rosbags.rosbag1 import Writer as BagWriter
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 
 VERDICTS = ("refused", "same", "told", "value", "silent")
 _PIECE = 4

@@ -7,7 +7,7 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.cost.power import rail, recorded_energy_joule, samples
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages.label_power import rails_of
 from tcpipe.stages.read import read_run

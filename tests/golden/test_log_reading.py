@@ -11,8 +11,8 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from shared_data import shared_data
 
-from tcpipe.formats.log_file import find_logs, open_log
-from tcpipe.formats.mcap_log import McapPart
+from tcpipe.formats.logs.log_file import find_logs, open_log
+from tcpipe.formats.logs.mcap_file import McapPart
 
 PEERS = (
     "peers/rosbags-rs/tests/test_bags/test_bag_mcap",

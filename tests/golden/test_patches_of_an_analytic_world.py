@@ -8,8 +8,8 @@ import pytest
 from map_worlds import World, segment_table, segments_from, write_tif
 from rasterio import Affine
 
-from tcpipe.formats.map_building import build_map
-from tcpipe.formats.map_files import open_map
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_files import open_map
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import sample_segments
 

@@ -9,7 +9,7 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.errors import RoleError
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams

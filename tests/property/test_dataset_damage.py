@@ -11,7 +11,7 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.formats.json_files import MOST_BYTES, digest, to_json
 from tcpipe.formats.seals import SEAL
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 
@@ -27,7 +27,7 @@ def made(tmp_path_factory):
     add_world(store, directory / "rasters")
     add_run(store, "a", segments("a", *lanes(0.0, -6.0, 6.0)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")
+        patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda _: "<!doctype html>")
         for name in FORMATS:
             build_dataset(directory / name, store=store.root, recipe=Recipe(), holdout="sample", file_format=name)
     return directory

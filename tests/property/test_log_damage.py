@@ -11,7 +11,7 @@ from random_messages import ROS1, random_messages, write_bag, write_mcap, write_
 from rosbags.rosbag1 import Writer as BagWriter
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 
 TYPES = ("std_msgs/msg/ColorRGBA", "diagnostic_msgs/msg/DiagnosticArray")
 MESSAGES = random_messages(1, count=25, types=TYPES)

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import get_types_from_msg
 
-from tcpipe.formats.arrow_columns import TopicTable
-from tcpipe.formats.log_part import MessageBlock
-from tcpipe.formats.ros_types import MessageType
+from tcpipe.formats.logs.arrow_columns import TopicTable
+from tcpipe.formats.logs.log_part import MessageBlock
+from tcpipe.formats.logs.ros_types import MessageType
 from tcpipe.logs.wire_layout import LayoutError, layout_of
 from tcpipe.logs.wire_types import WIDE_FORMS, Array, Record, Scalar, Text, in_form, record
 

@@ -13,7 +13,7 @@ from synthetic_store import box, region_file, small_store
 
 from tcpipe.cli import cli
 from tcpipe.formats.recipe_toml import parse_recipe
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 
 ROOT = Path(__file__).parents[2]

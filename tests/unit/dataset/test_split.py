@@ -10,7 +10,7 @@ from tcpipe.dataset import batches as batches_module
 from tcpipe.dataset import open_dataset, pixels
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.terrain.layers import LAYERS, paper_tensor
 

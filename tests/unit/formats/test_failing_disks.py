@@ -18,8 +18,8 @@ from random_messages import ROS1, random_messages, write_bag, write_mcap
 from rosbags.rosbag1 import Writer as BagWriter
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_file import open_log
-from tcpipe.formats.sqlite_log import SqlitePart
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.sqlite_file import SqlitePart
 
 TYPES = ("sensor_msgs/msg/Imu", "std_msgs/msg/ColorRGBA")
 MESSAGES = random_messages(1, count=400, types=TYPES)

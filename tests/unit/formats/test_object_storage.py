@@ -7,7 +7,7 @@ from random_messages import assert_same, expected_columns, random_messages, writ
 from storage_server import FORBIDDEN, object_store
 
 from tcpipe.errors import LogError
-from tcpipe.formats.log_file import belongs_to_a_log, open_log
+from tcpipe.formats.logs.log_file import belongs_to_a_log, open_log
 from tcpipe.formats.object_storage import copied, is_url, stand_ins
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe

@@ -7,9 +7,9 @@ from unit.fusion import dense_reference, drive
 
 from tcpipe.fusion import error_state, error_state_kernel
 from tcpipe.fusion.initial import find_initial_state
+from tcpipe.fusion.measurements import part
 from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.timeline import build_timeline
-from tcpipe.fusion.windows import part
 
 RNG = np.random.default_rng(5)
 X = np.concatenate((Rotation.from_euler("ZYX", [1.0, 0.2, -0.3]).as_matrix().ravel(), 0.1 * RNG.normal(size=14)))

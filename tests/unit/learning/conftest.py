@@ -3,7 +3,7 @@
 import pytest
 from synthetic_store import box, region_file, small_store
 
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 
 

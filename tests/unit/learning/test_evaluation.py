@@ -16,7 +16,7 @@ from tcpipe.learning.evaluation import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.models import load_model
 from tcpipe.learning.predictions import predicted_costs
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 

@@ -8,7 +8,7 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import Recipe

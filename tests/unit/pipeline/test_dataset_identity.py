@@ -7,7 +7,7 @@ import pytest
 from recipe_values import keys, with_value
 from synthetic_store import add_run, add_world, lanes, segments
 
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 
@@ -40,7 +40,7 @@ def places(tmp_path_factory):
     add_world(store, directory)
     add_run(store, "a", segments("a", *lanes(np.array([-3.0, 3.0]), -8.0, 8.0)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")
+        patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda _: "<!doctype html>")
         build_dataset(directory / "usual", store=store.root, recipe=Recipe())
         yield directory, store
 

@@ -5,8 +5,8 @@ import pyarrow as pa
 import pytest
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.log_file import open_log
-from tcpipe.formats.log_writing import MessageStream, write_mcap
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.pipeline import log_stamps
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.log_inspection import inspect_log

@@ -13,7 +13,7 @@ from rasterio import Affine
 
 from tcpipe.cli import cli
 from tcpipe.errors import MapError, StoreError, UsageError
-from tcpipe.formats.map_files import open_map
+from tcpipe.formats.maps.map_files import open_map
 from tcpipe.pipeline import maps
 from tcpipe.pipeline.maps import add_map
 from tcpipe.pipeline.verify import verify

@@ -9,7 +9,7 @@ from wheel_drives import START_NS, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest as ingestion
 from tcpipe.errors import UsageError
-from tcpipe.formats.log_writing import MessageStream, write_bag
+from tcpipe.formats.logs.writing import MessageStream, write_bag
 from tcpipe.pipeline import known_trouble
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect

@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from tcpipe.formats.log_file import open_log
+from tcpipe.formats.logs.log_file import open_log
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.report.run_report import run_report

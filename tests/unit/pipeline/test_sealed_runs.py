@@ -9,7 +9,7 @@ from synthetic_store import add_run, add_world, box, lanes, region_file, segment
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.seals import write_sealed
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
@@ -31,7 +31,9 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def store(made, tmp_path, monkeypatch):
-    monkeypatch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")  # nine tenths of the time
+    monkeypatch.setattr(
+        "tcpipe.pipeline.dataset.build.dataset_report", lambda _: "<!doctype html>"
+    )  # nine tenths of the time
     shutil.copytree(made.root, tmp_path / "store")
     return Store(tmp_path / "store")
 

@@ -14,10 +14,10 @@ from tcpipe.cli import cli
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError
 from tcpipe.formats.dataset_files import read_card, read_samples
-from tcpipe.formats.map_building import build_map
-from tcpipe.formats.map_files import open_map
-from tcpipe.pipeline import dataset_sampling
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_files import open_map
+from tcpipe.pipeline.dataset import sampling as dataset_sampling
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.report.overview import joint_bounds_m, maps_overview
 from tcpipe.store import Store
@@ -57,7 +57,7 @@ def store(tmp_path_factory):
 def build(store, out, names, **keywords):
     """Build without the page, which takes nine tenths of the time; the last test draws it."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcpipe.pipeline.build.dataset_report", lambda _: "<!doctype html>")
+        patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda _: "<!doctype html>")
         return build_dataset(out, store=store.root, map_name=names, recipe=Recipe(), **keywords)
 
 
@@ -119,7 +119,7 @@ def test_the_page_shows_all_maps_in_their_places(store, order):
 
 
 def test_the_same_bytes_however_the_segments_are_cut_into_batches(store, tmp_path, monkeypatch):
-    monkeypatch.setattr("tcpipe.pipeline.dataset_sampling._BATCH_ROWS", 97)
+    monkeypatch.setattr("tcpipe.pipeline.dataset.sampling._BATCH_ROWS", 97)
     build(store, tmp_path / "cut", ("west", "east"))
     monkeypatch.undo()
     build(store, tmp_path / "whole", ("west", "east"))

@@ -11,11 +11,11 @@ from synthetic_store import WORLD, add_run, box, lanes, region_file, segments, s
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats.map_building import build_map
-from tcpipe.formats.map_files import open_map
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.parquet import write_table
 from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_checksums, write_sealed
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect

@@ -6,7 +6,7 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
-from tcpipe.pipeline.build import build_dataset
+from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.unknown_robots import alike
 from tcpipe.store import Store
 

@@ -1,0 +1,210 @@
+"""Chunks whose messages are few among what is not wanted, read as if they were one chunk.
+
+In a log with cameras most bytes of a chunk are not wanted. What is wanted of several such chunks is laid together, and looked at once
+for all of them: what a look costs, however short, is paid once for thousands of messages instead of for each chunk.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.formats.logs.log_part import DamageError, Int64Array
+
+GROUP_BYTES = 1 << 23
+"""Chunks of about this size together are planned at once."""
+_GAP_BYTES = 1 << 13
+"""Messages no further apart are copied, or read from the disk, in one piece."""
+_PLACE_BITS = 40
+MAX_PLANNED_BYTES = (1 << _PLACE_BITS) - 1
+"""A larger chunk is not planned, but read on its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Entries:
+    """Where messages lie, by the index: of each its chunk's number in the group, its channel, offset and log time, shape (N,) each.
+
+    They rise by chunk and offset. ``end`` is where in the chunk the next message begins, or the chunk ends.
+    """
+
+    chunk: Int64Array
+    channel: Int64Array
+    offset: Int64Array
+    end: Int64Array
+    log_time_ns: Int64Array
+
+    def at(self, chosen: slice | Int64Array | NDArray[np.bool_]) -> Entries:
+        """Return some of them."""
+        of = (self.chunk, self.channel, self.offset, self.end, self.log_time_ns)
+        return Entries(*(values[chosen] for values in of))
+
+    def of_chunk(self, number: int) -> Entries:
+        """Return those of one chunk."""
+        return self.at(self.chunk == number)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """Chunks to read at once: their numbers in the group, and the wanted messages (None: only the chunk's records can tell).
+
+    Of a ``compact`` one only the pieces with wanted messages are kept; others are single chunks, kept whole.
+    """
+
+    chunks: range
+    entries: Entries | None
+    compact: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Pieces:
+    """The parts of a run's chunks that hold wanted messages, laid one after the other: ``size`` bytes in all.
+
+    ``places`` gives of each chunk, by its number, where a piece starts and stops in it, and where it is laid; ``offset`` where each
+    message then begins, in the order of their entries, shape (N,).
+    """
+
+    places: dict[int, list[tuple[int, int, int]]]
+    offset: Int64Array
+    size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Excerpt:
+    """Bytes in which a run's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,).
+
+    ``lost`` lists the chunks, by number, of which there is none, and why.
+    """
+
+    data: memoryview
+    offset: Int64Array
+    entries: Entries
+    lost: list[tuple[int, DamageError]]
+
+    def without(self, chunks: Sequence[int]) -> Excerpt:
+        """Return it without the messages of some chunks."""
+        left = ~np.isin(self.entries.chunk, chunks)
+        return Excerpt(self.data, self.offset[left], self.entries.at(left), self.lost)
+
+
+def groups(sizes: Iterable[int]) -> Iterator[range]:
+    """Yield which of successive chunks of these sizes [byte] to plan together."""
+    first = last = held = 0
+    for size in sizes:
+        last += 1
+        held += size
+        if held >= GROUP_BYTES:
+            yield range(first, last)
+            first, held = last, 0
+    if first < last:
+        yield range(first, last)
+
+
+def by_place(
+    chunk: Int64Array,
+    channel: Int64Array,
+    offset: Int64Array,
+    log_time_ns: Int64Array,
+    sizes: Int64Array,
+    *,
+    least_bytes: int,
+) -> tuple[Entries, NDArray[np.bool_]]:
+    """Return index entries (shape (N,) each) in the order in which they lie in chunks of ``sizes`` bytes, and which chunks' are sound.
+
+    Of those that are not, a message would begin outside the chunk, or have less than ``least_bytes`` before the next.
+    """
+    outside = (offset < 0) | (offset >= sizes[chunk])
+    sound = np.ones(len(sizes), np.bool_)
+    sound[chunk[outside]] = False
+    order = np.argsort((chunk << _PLACE_BITS) + np.where(outside, 0, offset), kind="stable")
+    chunk, channel, offset, log_time_ns = chunk[order], channel[order], offset[order], log_time_ns[order]
+    end = sizes[chunk]
+    follows = chunk[1:] == chunk[:-1]
+    end[:-1][follows] = offset[1:][follows]
+    sound[chunk[end - offset < least_bytes]] = False
+    entries = Entries(chunk, channel, offset, end, log_time_ns)
+    return (entries if sound.all() else entries.at(sound[chunk])), sound
+
+
+def runs(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted: Sequence[int]) -> Iterator[Run]:
+    """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
+
+    Parameters
+    ----------
+    entries
+        The messages of those chunks whose index is sound.
+    sizes
+        The chunks' decompressed sizes, shape (M,) [byte].
+    sound
+        Which chunks have a sound index, shape (M,).
+    wanted
+        The channels to read.
+    """
+    entries = entries.at(np.isin(entries.channel, wanted))
+    wanted_bytes = np.bincount(entries.chunk, entries.end - entries.offset, len(sizes))
+    sparse = (sound & (2 * wanted_bytes <= sizes)).tolist()
+    bounds = np.searchsorted(entries.chunk, np.arange(len(sizes) + 1)).tolist()
+    first = 0
+    while first < len(sparse):
+        after = first + 1
+        while sparse[first] and after < len(sparse) and sparse[after]:
+            after += 1
+        chosen = entries.at(slice(bounds[first], bounds[after])) if sound[first] else None
+        yield Run(range(first, after), chosen, sparse[first])
+        first = after
+
+
+def pieces(entries: Entries) -> Pieces:
+    """Return the pieces of a run's chunks that hold its messages."""
+    begins = np.ones(len(entries.offset), np.bool_)
+    far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
+    begins[1:] = far | (entries.chunk[1:] != entries.chunk[:-1])
+    at = np.flatnonzero(begins)
+    start, stop = entries.offset[at], entries.end[np.append(at[1:], len(begins)) - 1] if len(at) else at
+    to = np.cumsum(stop - start) - (stop - start)
+    offset = entries.offset + (to - start)[np.cumsum(begins) - 1] if len(at) else entries.offset
+    places: dict[int, list[tuple[int, int, int]]] = {}
+    for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
+        places.setdefault(chunk, []).append((place[0], place[1], place[2]))
+    return Pieces(places, offset, int((stop - start).sum()))
+
+
+def excerpt(
+    run: Run,
+    entries: Entries,
+    *,
+    load: Callable[[int], memoryview],
+    copy: Callable[[int, list[tuple[int, int, int]], memoryview], None],
+) -> Excerpt:
+    """Read what a run wants.
+
+    Parameters
+    ----------
+    run, entries
+        The run, and its messages.
+    load
+        Returns all records of a chunk by its number.
+    copy
+        Copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
+    """
+    kept = pieces(entries) if run.compact else None
+    data = np.empty(kept.size if kept else 0, np.uint8).data
+    lost = []
+    for number in run.chunks:
+        try:
+            if kept:
+                copy(number, kept.places.get(number, []), data)
+            else:
+                data = load(number)
+        except DamageError as error:
+            lost.append((number, error))
+    found = Excerpt(data, kept.offset if kept else entries.offset, entries, lost)
+    return found.without([number for number, _ in lost]) if lost else found
+
+
+def copy_pieces(data: memoryview, places: list[tuple[int, int, int]], to: memoryview) -> None:
+    """Copy pieces (start, stop, place) of ``data``."""
+    for start, stop, place in places:
+        to[place : place + stop - start] = data[start:stop]

@@ -1,0 +1,582 @@
+"""Robot logs of every container behind one face: topics from the index, tables in one pass, damage listed."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import resource
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import pyarrow as pa
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs import bag_file, mcap_records, sqlite_file
+from tcpipe.formats.logs.arrow_columns import TopicTable
+from tcpipe.formats.logs.bag_file import BagPart
+from tcpipe.formats.logs.log_part import Channel, LogPart, MessageBlock
+from tcpipe.formats.logs.mcap_file import McapPart
+from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
+from tcpipe.formats.logs.rosbag2 import (
+    METADATA,
+    STORAGE_SUFFIXES,
+    ZSTD_MAGIC,
+    MessageDecompressing,
+    decompressed_file,
+    is_one_bag,
+    rosbag2_files,
+)
+from tcpipe.formats.logs.sqlite_file import SqlitePart
+from tcpipe.formats.object_storage import copied, is_url
+from tcpipe.logs.topics import Damage, Topic, condensed
+
+LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd")
+
+BATCH_BYTES = 1 << 25
+"""About how much a piece of a log takes in memory."""
+
+MAX_TOPICS = 10_000
+"""A log of more topics is refused; a robot has some hundred. A topic costs a millisecond, however small."""
+MAX_COLUMNS = 200_000
+"""Topics that unfold to more columns together are not read at once; five hundred topics of a robot have some 20,000."""
+
+_WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
+_HASH_BYTES = 1 << 20
+_LISTED = 5
+_OTHER_FILES = 256
+_FILE_SYSTEMS_OWN = ("lost+found",)
+_KNOWN_MAGIC = (
+    (b"PK\x03\x04", "a zip archive"),
+    (b"\x1f\x8b", "a gzip file"),
+    (b"BZh", "a bzip2 file"),
+    (b"\xfd7zXZ", "an xz file"),
+    (b"\x89HDF", "an HDF5 file"),
+    (b"PAR1", "a Parquet file"),
+    (b"%PDF", "a PDF"),
+    (b"II*\0", "a TIFF"),
+    (b"MM\0*", "a TIFF"),
+)
+
+
+def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
+    """Open a log, whatever its container.
+
+    Parameters
+    ----------
+    path
+        A .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``), which
+        is copied to a temporary directory until the log is closed.
+    message_definitions
+        A directory of .msg files for types that the log does not define.
+
+    Raises
+    ------
+    LogError
+        The path is no log: one line with what was found there and what was wanted.
+    """
+    with ExitStack() as stack:
+        if is_url(path):
+            path = stack.enter_context(copied(str(path), wanted=belongs_to_a_log))
+        path = Path(path)
+        _refuse_what_is_no_file(path)
+        opened = _open_directory(path, stack) if path.is_dir() else _open_file(path, stack)
+        return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
+
+
+def _refuse_what_is_no_file(path: Path) -> None:
+    _refuse_what_is_not_there(path)
+    if not path.is_file() and not path.is_dir():
+        raise LogError(f"{path}: it is a pipe or a device; {_WANTED}")
+
+
+def _refuse_what_is_not_there(path: Path) -> None:
+    if path.is_symlink() and not path.exists():
+        raise LogError(f"{path}: is a link to {path.readlink()}, which is not there")
+    if not path.exists():
+        raise LogError(f"{path}: there is no such file or directory")
+
+
+def belongs_to_a_log(name: str) -> bool:
+    """Return whether a file of this name is a log or part of one."""
+    return name.lower().endswith((*LOG_SUFFIXES, ".db3-wal")) or name == METADATA
+
+
+def find_logs(path: Path) -> list[Path]:
+    """Return the logs at or below a path, in a fixed order; a ROS 2 bag directory is one log, hidden files are skipped.
+
+    A directory that cannot be read stands in the list itself: whoever opens it says why.
+
+    Raises
+    ------
+    LogError
+        There is no log.
+    """
+    path = Path(path)
+    _refuse_what_is_not_there(path)
+    if not path.is_dir():
+        return [path]
+    found = logs_below(path)
+    if not found:
+        raise LogError(f"{path}: no log in this directory or below it; {_WANTED}")
+    return found
+
+
+def logs_below(directory: Path) -> list[Path]:
+    """Return the logs in a directory as `find_logs` does; none where there is none."""
+    return list(_logs_below(directory))
+
+
+@dataclass(frozen=True, slots=True)
+class _OpenFiles:
+    """The files of a log, open; ``message_count`` is what metadata.yaml says they hold, ``topic_counts`` what of each topic."""
+
+    container: str
+    files: tuple[Path, ...]
+    parts: tuple[LogPart, ...]
+    damage: tuple[Damage, ...] = ()
+    message_count: int | None = None
+    topic_counts: Mapping[str, int] = field(default_factory=dict)
+
+
+class Log:
+    """A log, open for reading. Use as a context manager, or close it."""
+
+    def __init__(self, path: Path, opened: _OpenFiles, types: TypeLibrary, stack: ExitStack) -> None:
+        self.path = path
+        self.container = opened.container
+        """``mcap``, ``bag`` or ``rosbag2``."""
+        self._files, self._parts, self._types, self._stack = opened.files, opened.parts, types, stack
+        self._damage: dict[Damage, None] = dict.fromkeys(opened.damage)
+        self.topics = self._merged_topics()
+        """Every topic by name, as the index tells."""
+        self._compare_counts(opened)
+
+    def _compare_counts(self, opened: _OpenFiles) -> None:
+        """Note where metadata.yaml counts more messages than the files hold, in all or of a topic."""
+        held = {name: topic.message_count or 0 for name, topic in self.topics.items()}
+        short = {
+            name: (count, held.get(name, 0)) for name, count in opened.topic_counts.items() if held.get(name, 0) < count
+        }
+        found = sum(held.values())
+        every = opened.message_count if opened.message_count is not None else found
+        lost = max(every - found, sum(count - there for count, there in short.values()))
+        if lost > 0:
+            of = ", ".join(f"{name} {there} of {count}" for name, (count, there) in list(short.items())[:_LISTED])
+            what = f"metadata.yaml counts {every} messages, the files hold {found}{f': of {of}' if of else ''}"
+            self._damage[Damage(self.path.name, what, messages_lost=lost)] = None
+
+    def __enter__(self) -> Self:
+        """Return the log, which is open already."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Close the log."""
+        self.close()
+
+    def close(self) -> None:
+        """Close its files and remove temporary copies."""
+        self._stack.close()
+
+    @property
+    def damage(self) -> list[Damage]:
+        """What was found broken so far; tables that are read later may find more."""
+        found = dict(self._damage)
+        for part in self._parts:
+            found.update(part.damage)
+        return condensed(list(found))
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is worth saying of what was read so far, and costs nothing: `damage` without loss, and what no checksum covers."""
+        harmless = [str(damage) for damage in self.damage if not damage.is_loss]
+        return [*harmless, *(f"{part.name}: unchecked: {part.unchecked}" for part in self._parts if part.unchecked)]
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the log's files together."""
+        return sum(file.stat().st_size for file in self._files)
+
+    @property
+    def size_and_time(self) -> list[list[int]]:
+        """Size [byte] and modification time [ns] of each file, by name: what tells whether a log is still the same."""
+        found = [file.stat() for file in sorted(self._files, key=lambda file: file.name)]
+        return [[stat.st_size, stat.st_mtime_ns] for stat in found]
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name.
+
+        Raises
+        ------
+        LogError
+            The disk does not give all of it.
+        """
+        digest = hashlib.sha256()
+        for file in sorted(self._files, key=lambda file: file.name):
+            try:
+                with file.open("rb") as stream:
+                    while block := stream.read(_HASH_BYTES):
+                        digest.update(block)
+            except OSError as error:
+                raise LogError(
+                    f"{file}: it cannot be read to its end ({error.strerror}); rescue what can be read into a copy "
+                    "(ddrescue does), and give that"
+                ) from None
+        return digest.hexdigest()
+
+    def definition(self, topic: str) -> tuple[str, str]:
+        """Return the text of a topic's message definition, and where it is from: ``log``, or ``given`` or ``bundled`` in its stead.
+
+        Both are empty where the type is not known.
+        """
+        found = self._resolved(self._channel_of[topic])
+        if isinstance(found, DefinitionError):
+            return self.topics[topic].definition, ""
+        text = (
+            self.topics[topic].definition
+            if found.source == "log"
+            else found.text(ros1=self.topics[topic].encoding == "ros1")
+        )
+        return text, found.source
+
+    def table(self, topic: str) -> pa.Table:
+        """Return one topic's messages; `LogError` where the topic is unknown or cannot be decoded."""
+        tables = self.tables([topic])
+        if topic not in tables:
+            reasons = [damage.what for damage in self.damage if damage.topic == topic]
+            raise LogError(f"{self.path}: topic {topic} cannot be read: {'; '.join(reasons)}")
+        return tables[topic]
+
+    def tables(self, topics: Iterable[str], *, threads: int = 1) -> dict[str, pa.Table]:
+        """Return the tables of several topics, read in one pass.
+
+        Parameters
+        ----------
+        topics
+            Names of topics. One that cannot be decoded is missing from the result and listed in `damage`.
+        threads
+            How many threads read and decompress; the result does not depend on it.
+
+        Returns
+        -------
+        dict of pyarrow.Table
+            One row a message in the order of log time: ``log_time_ns``, ``publish_time_ns``, then the fields by dotted name.
+
+        Raises
+        ------
+        LogError
+            A topic is not in the log.
+        """
+        (tables,) = self.batches(topics, batch_bytes=None, threads=threads)
+        return tables
+
+    def batches(
+        self, topics: Iterable[str], *, batch_bytes: int | None = BATCH_BYTES, threads: int = 1
+    ) -> Iterator[dict[str, pa.Table]]:
+        """Yield the tables of several topics piece by piece, read in one pass, in memory that does not grow with the log.
+
+        Each dict holds the next rows of some topics (those that hold most); the last one names every topic. Rows are in the order of
+        log time, also from piece to piece, as long as no message lies in the log further than half a piece behind its time; `damage`
+        counts those that do.
+
+        Parameters
+        ----------
+        topics
+            Names of topics. One that cannot be decoded is missing and listed in `damage`.
+        batch_bytes
+            How much is gathered over all topics before some is yielded; None yields everything at once.
+        threads
+            How many threads read and decompress; the pieces do not depend on it.
+
+        Raises
+        ------
+        LogError
+            A topic is not in the log.
+        """
+        collected = self._collectors(topics, in_pieces=batch_bytes is not None)
+        most = math.inf if batch_bytes is None else batch_bytes
+        given = dict.fromkeys(collected, 0)
+        held = 0
+        for index in range(len(self._parts)):
+            for topic_table, block in self._blocks(index, collected, threads):
+                held -= topic_table.held_bytes
+                topic_table.add(block)
+                held += topic_table.held_bytes
+                if held > most:
+                    fullest = {name: of for name, of in collected.items() if of.held_bytes * len(collected) >= held}
+                    tables = {name: of.take(share=0.5) for name, of in fullest.items()}
+                    for name, table in tables.items():
+                        given[name] += table.num_rows
+                    yield tables
+                    held = sum(of.held_bytes for of in collected.values())
+        tables = {name: of.take() for name, of in collected.items()}
+        for name, of in collected.items():
+            self._note_losses(name, of, given[name] + tables[name].num_rows)
+        yield tables
+
+    def _collectors(self, topics: Iterable[str], *, in_pieces: bool) -> dict[str, TopicTable]:
+        """Return an empty table for each topic that can be decoded."""
+        wanted = list(dict.fromkeys(topics))
+        unknown = [name for name in wanted if name not in self.topics]
+        if unknown:
+            raise LogError(
+                *(f"{self.path}: there is no topic {name}; it has {_listed(self.topics)}" for name in unknown)
+            )
+        types, columns = {}, 0
+        for name in wanted:
+            types[name] = of = self._message_type(name)
+            columns += of.wire.leaves if of is not None else 0
+            if columns > MAX_COLUMNS:
+                raise LogError(
+                    f"{self.path}: its topics unfold to more than {MAX_COLUMNS} columns; read fewer of them at once"
+                )
+        return {
+            name: TopicTable(
+                of,
+                self.topics[name].encoding,
+                expected_rows=self.topics[name].message_count or 0,
+                in_pieces=in_pieces,
+            )
+            for name, of in types.items()
+            if of is not None
+        }
+
+    def _blocks(
+        self, index: int, collected: Mapping[str, TopicTable], threads: int
+    ) -> Iterator[tuple[TopicTable, MessageBlock]]:
+        """Yield one file's blocks, each with its topic's table; channels that differ from their topic's type are set aside."""
+        part, channels = self._parts[index], {}
+        for number, channel in part.channels.items():
+            if channel.topic in collected:
+                if self._agrees(channel):
+                    channels[number] = collected[channel.topic]
+                else:
+                    what = f"the topic changes its type to {channel.type_name} ({channel.encoding}); these messages are left out"
+                    self._damage[Damage(part.name, what, channel.topic, channel.message_count)] = None
+        if channels:
+            for block in part.blocks(frozenset(channels), threads=threads):
+                later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
+                yield channels[block.channel], later
+
+    def _agrees(self, channel: Channel) -> bool:
+        topic = self.topics[channel.topic]
+        if (channel.type_name, channel.encoding) != (topic.type_name, topic.encoding):
+            return False
+        if channel.definition in ("", topic.definition):
+            return True
+        mine, theirs = self._message_type(topic.name), self._resolved(channel)
+        return isinstance(theirs, MessageType) and mine is not None and mine.wire == theirs.wire
+
+    def _message_type(self, name: str) -> MessageType | None:
+        """Return a topic's type; None, and a line in `damage`, where it has none."""
+        channel = self._channel_of[name]
+        topic = self.topics[name]
+        found = DefinitionError(topic.problem) if topic.problem else self._resolved(channel)
+        if isinstance(found, MessageType):
+            return found
+        self._damage[Damage(self.path.name, str(found), name, topic.message_count)] = None
+        return None
+
+    def _resolved(self, channel: Channel) -> MessageType | DefinitionError:
+        try:
+            return self._types.message_type(
+                channel.type_name,
+                definition=channel.definition,
+                schema_encoding=channel.schema_encoding,
+                ros1=channel.encoding == "ros1",
+            )
+        except DefinitionError as error:
+            return error
+
+    def _note_losses(self, name: str, topic_table: TopicTable, rows: int) -> None:
+        missing = (self.topics[name].message_count or 0) - rows - sum(topic_table.undecodable.values())
+        if missing > 0 and not self.damage:
+            what = f"the index counts {missing} messages more than the file holds"
+            self._damage[Damage(self.path.name, what, name, missing)] = None
+        if missing < 0 and not self.damage:
+            what = f"the file holds {-missing} messages more than its index counts; they may be another topic's"
+            self._damage[Damage(self.path.name, what, name)] = None
+        for reason, count in topic_table.undecodable.items():
+            what = f"messages do not fit their definition: {reason}"
+            self._damage[Damage(self.path.name, what, name, count)] = None
+        if topic_table.late:
+            what = f"{topic_table.late} messages lie in the log far behind their time; they are read where they lie"
+            self._damage[Damage(self.path.name, what, name, 0)] = None
+        if topic_table.replaced_texts:
+            what = f"{topic_table.replaced_texts} texts are not UTF-8; what is no character in them was replaced"
+            self._damage[Damage(self.path.name, what, name, 0)] = None
+
+    def _merged_topics(self) -> dict[str, Topic]:
+        """Merge the channels of all files by topic; where types differ, the one with most messages holds."""
+        self._channel_of: dict[str, Channel] = {}
+        topics: dict[str, Topic] = {}
+        channels = [channel for part in self._parts for channel in part.channels.values()]
+        for channel in sorted(channels, key=lambda c: (c.topic, -(c.message_count or 0), not c.definition)):
+            topic = _topic(channel, self._types)
+            first = self._channel_of.setdefault(channel.topic, channel)
+            if channel is first:
+                topics[channel.topic] = topic
+                if len(topics) > MAX_TOPICS:
+                    raise LogError(f"{self.path}: it holds more than {MAX_TOPICS} topics; no such log is read")
+            elif (channel.type_name, channel.encoding) == (first.type_name, first.encoding):
+                topics[channel.topic] = topics[channel.topic].joined(topic)
+        return topics
+
+
+def _topic(channel: Channel, types: TypeLibrary) -> Topic:
+    problem = None
+    if channel.encoding not in ("cdr", "ros1"):
+        problem = f"its messages are encoded as {channel.encoding or 'nothing known'}; cdr and ros1 are read"
+    elif not channel.type_name:
+        problem = "the log does not say of which type its messages are"
+    elif not channel.definition.strip() and not types.knows(channel.type_name):
+        problem = f"type {channel.type_name} is unknown: the log holds no definition of it, and none is bundled; give its .msg files"
+    return Topic(
+        channel.topic,
+        channel.type_name,
+        channel.message_count,
+        channel.start_ns,
+        channel.end_ns,
+        channel.encoding,
+        channel.definition,
+        problem,
+    )
+
+
+def _open_file(path: Path, stack: ExitStack) -> _OpenFiles:
+    return _OpenFiles(_container(path), (path,), (_open_part(path, path.name, stack),))
+
+
+def _open_directory(directory: Path, stack: ExitStack) -> _OpenFiles:
+    """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
+    found = rosbag2_files(directory)
+    _allow_files(len(found.paths))
+    parts, damage, errors = [], list(found.damage), []
+    for file in found.paths:
+        try:
+            parts.append(_open_part(file, f"{directory.name}/{file.name}", stack))
+        except LogError as error:
+            errors.append(error)
+            damage.append(Damage(f"{directory.name}/{file.name}", f"a file of the bag is lost: {error}"))
+    if not parts:
+        raise LogError(*(problem for error in errors for problem in error.problems))
+    return _OpenFiles("rosbag2", found.paths, tuple(parts), tuple(damage), found.message_count, found.topic_counts)
+
+
+def _allow_files(count: int) -> None:
+    """Let this process hold so many files open, where the system lets it: 1024 is usual, and many more are allowed."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = 2 * count + _OTHER_FILES
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
+
+
+def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
+    magic, given = _magic(path), path
+    if magic.startswith(ZSTD_MAGIC):
+        path = decompressed_file(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tcpipe-"))))
+        magic = _magic(path)
+    part: LogPart
+    if magic.startswith(mcap_records.MAGIC) or _tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
+        part = MessageDecompressing(McapPart(path, name))
+    elif magic.startswith(bag_file.MAGIC):
+        part = BagPart(path, name)
+    elif magic.startswith(sqlite_file.MAGIC):
+        part = MessageDecompressing(SqlitePart(path, name))
+    else:
+        held = "" if path == given else "what it holds, decompressed: "
+        raise LogError(f"{given}: not a log: {held}{_described(path, magic)}; {_WANTED}")
+    stack.callback(part.close)
+    return part
+
+
+def _container(path: Path) -> str:
+    name = path.name.removesuffix(".zstd")
+    magic = _magic(path)
+    if magic.startswith(bag_file.MAGIC):
+        return "bag"
+    return "mcap" if magic.startswith(mcap_records.MAGIC) or name.endswith(".mcap") else "rosbag2"
+
+
+def _magic(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except OSError as error:
+        raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
+
+
+def _tail(path: Path, size: int) -> bytes:
+    """Return a file's last bytes; nothing where they cannot be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - size, 0))
+            return file.read(size)
+    except OSError:
+        return b""
+
+
+def _described(path: Path, magic: bytes) -> str:
+    """Say what a file that is no log seems to be."""
+    if not magic:
+        return "it is empty (0 bytes)"
+    if magic.startswith(b"#ROSBAG V"):
+        return f"it is a ROS bag of version {magic[9:12].decode(errors='replace')} (rosbag fix converts it)"
+    for start, kind in _KNOWN_MAGIC:
+        if magic.startswith(start):
+            return f"it is {kind}"
+    if not any(magic):
+        return "it begins with zeros"
+    return f"it is {path.stat().st_size} bytes that begin with {magic[:8]!r}"
+
+
+def _logs_below(directory: Path) -> Iterator[Path]:
+    """Yield the logs in and below a directory; each directory is looked at once, whatever links lead to it."""
+    seen: set[tuple[int, int]] = set()
+    waiting = [(directory, True)]
+    while waiting:
+        path, is_directory = waiting.pop()
+        try:
+            found = path.stat() if is_directory else None
+            if found is None:
+                yield path
+            elif (found.st_dev, found.st_ino) not in seen:
+                seen.add((found.st_dev, found.st_ino))
+                waiting += reversed(_entries(path))
+        except OSError:
+            yield path
+
+
+def _entries(directory: Path) -> list[tuple[Path, bool]]:
+    """Return what may be a log in a directory, and whether it is one that has to be looked into; the directory itself where it is a bag."""
+    entries = [(entry, _is_directory(entry)) for entry in sorted(directory.iterdir(), key=lambda entry: entry.name)]
+    one_bag = is_one_bag(directory)
+    found = [(directory, False)] if one_bag else []
+    for entry, is_directory in entries:
+        if entry.name.startswith((".", "~")) or entry.name in _FILE_SYSTEMS_OWN:
+            continue
+        if is_directory:
+            found.append((entry, True))
+        elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
+            continue
+        elif entry.name.lower().endswith(LOG_SUFFIXES) and (entry.is_symlink() or entry.is_file()):
+            found.append((entry, False))
+    return found
+
+
+def _is_directory(path: Path) -> bool:
+    """Return whether a path is, or leads to, a directory that may be looked at."""
+    with suppress(OSError):
+        return path.is_dir()
+    return False
+
+
+def _listed(topics: Iterable[str]) -> str:
+    return ", ".join(sorted(topics)) or "no topics"

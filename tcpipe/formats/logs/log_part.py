@@ -1,0 +1,434 @@
+"""What every log container gives: channels, and blocks of serialised messages with their times.
+
+A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts of a log and turns their blocks into tables.
+"""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import struct
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import LogError
+from tcpipe.logs.topics import Damage
+
+MAX_CHUNK_BYTES = 1 << 29
+"""A chunk that claims to hold more than this is taken for damaged: it is held as a whole. Writers make chunks of some megabytes."""
+_PLAUSIBLE_BYTES, _PLAUSIBLE_RATIO, _PLAUSIBLE_CHUNK_RATIO = 1 << 26, 1000, 100
+"""What claims to hold more than both so many bytes and so many times its compressed size is taken for damaged: a bomb. A chunk or message
+is held as a whole, and more than once while it is decoded: of those less is believed than of a file."""
+MAX_CHUNKS = 1 << 20
+"""A file of more chunks is refused: of chunks of a megabyte, as writers make them, this is a terabyte."""
+MAX_CHANNELS = 1 << 16
+"""More channels or connections of a file are refused: MCAP cannot number more."""
+_FEW_RECORDS, _LEAST_RECORD_BYTES = 1 << 20, 4
+"""A file that holds more records than the first, and than one for so many of its bytes, is a bomb: a message alone has two times."""
+_PLAUSIBLE_TOTAL = 1 << 30
+SEARCH_BYTES = 1 << 20
+
+_LZ4_HEAD = struct.Struct("<4sBBQ")
+"""An LZ4 frame's first fields: magic, flags, block size, size of the content."""
+_LZ4_MAGIC, _LZ4_HAS_CONTENT_SIZE = b"\x04\x22\x4d\x18", 0x08
+_PEEK_BYTES = 1 << 13
+_LISTED = 5
+_GAP_BYTES = 1 << 15
+"""Pieces of a file that lie no further apart are read as one."""
+_MADV_POPULATE_READ = 22
+"""Linux 5.14 and newer: have these pages in memory now, or say that it cannot be. Python has no name for it."""
+
+Int64Array = NDArray[np.int64]
+
+_Piece = TypeVar("_Piece")
+_Result = TypeVar("_Result")
+
+
+class DamageError(Exception):
+    """A piece of a file cannot be used; the text says why, plainly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Channel:
+    """One source of messages in a file: a connection, channel or topic row. None where the index does not say."""
+
+    topic: str
+    type_name: str
+    encoding: str
+    schema_encoding: str
+    definition: str
+    message_count: int | None = None
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MessageBlock:
+    """Messages of one channel inside one buffer; arrays have shape (N,). ``ordinal`` is their order within the file.
+
+    ``length`` is their length where all are equally long, else None.
+    """
+
+    channel: int
+    buffer: memoryview
+    offsets: Int64Array
+    lengths: Int64Array
+    log_time_ns: Int64Array
+    publish_time_ns: Int64Array
+    ordinal: Int64Array
+    length: int | None
+
+
+def blocks_by_channel(
+    buffer: memoryview,
+    channels: Int64Array,
+    offsets: Int64Array,
+    lengths: Int64Array,
+    *,
+    log_time_ns: Int64Array,
+    publish_time_ns: Int64Array,
+    ordinals: Int64Array,
+) -> list[MessageBlock]:
+    """Return messages as one block a channel; each channel's must lie in one piece. All arrays have shape (N,)."""
+    if not len(channels):
+        return []
+    starts = [0, *((channels[1:] != channels[:-1]).nonzero()[0] + 1).tolist()]
+    least, most = np.minimum.reduceat(lengths, starts).tolist(), np.maximum.reduceat(lengths, starts).tolist()
+    return [
+        MessageBlock(
+            int(channels[a]),
+            buffer,
+            offsets[a:b],
+            lengths[a:b],
+            log_time_ns[a:b],
+            publish_time_ns[a:b],
+            ordinals[a:b],
+            low if low == high else None,
+        )
+        for a, b, low, high in zip(starts, [*starts[1:], len(channels)], least, most, strict=True)
+    ]
+
+
+def grouped(keys: Int64Array) -> Iterator[tuple[int, Int64Array]]:
+    """Yield each key, rising, and where it stands, shape (M,) each: at the cost of one sort, however many keys there are."""
+    order = np.argsort(keys, kind="stable")
+    starts = np.flatnonzero(np.diff(keys[order], prepend=keys[order[:1]] - 1))
+    for start, end in zip(starts.tolist(), [*starts[1:].tolist(), len(order)], strict=False):
+        yield int(keys[order[start]]), order[start:end]
+
+
+class LogPart(Protocol):
+    """One file of a log, open for reading."""
+
+    name: str
+    damage: dict[Damage, None]
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Return every channel by its number."""
+
+    @property
+    def unchecked(self) -> str:
+        """What of that which was read no checksum covers, in plain words; "" where there is nothing."""
+
+    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over.
+
+        The blocks, their order and what is noted do not depend on ``threads``.
+        """
+
+    def close(self) -> None:
+        """Close the file."""
+
+
+class ByteSource:
+    """A file read by position."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+        self.size = os.fstat(self._file.fileno()).st_size
+        self._peeked = 0, b""
+        self._scratch = threading.local()
+
+    def read(self, offset: int, size: int) -> memoryview:
+        """Return ``size`` bytes at ``offset``; raise `DamageError` where the file ends before."""
+        if size < 0 or offset + size > self.size:
+            raise DamageError(f"the file ends at byte {self.size}, inside a piece of {size} bytes")
+        data = self._some(offset, size)
+        while len(data) < size:
+            more = self._some(offset + len(data), size - len(data))
+            if not more:
+                raise DamageError(f"the file became shorter while it was read (byte {offset + len(data)})")
+            data += more
+        return memoryview(data)
+
+    def read_once(self, offset: int, size: int) -> memoryview:
+        """Return bytes as `read` does, valid only until this thread reads again: their memory, still in the cache, is used again."""
+        if size < 0 or offset + size > self.size:
+            raise DamageError(f"the file ends at byte {self.size}, inside a piece of {size} bytes")
+        held = getattr(self._scratch, "held", b"")
+        if len(held) < size:
+            held = self._scratch.held = bytearray(size)
+        view = memoryview(held)[:size]
+        return view if self._fill(view, offset) else self.read(offset, size)
+
+    def read_pieces(self, pieces: Sequence[tuple[int, memoryview]]) -> None:
+        """Fill each view with the bytes at its offset; what lies between them is not read. `DamageError` as `read`."""
+        self.skips()
+        for offset, view in pieces:
+            os.posix_fadvise(self._file.fileno(), offset, len(view), os.POSIX_FADV_WILLNEED)
+        for offset, view in pieces:
+            if not self._fill(view, offset):
+                view[:] = self.read(offset, len(view))
+
+    def peek(self, offset: int, size: int) -> bytes:
+        """Return up to ``size`` bytes at ``offset`` (fewer at the end); cheap for many small, mostly ascending reads."""
+        at, held = self._peeked  # one assignment below: threads may lose each other's piece, never mix two
+        if offset < at or offset + size > at + len(held):
+            at, held = self._peeked = offset, self._some(offset, max(size, _PEEK_BYTES))
+            if len(held) < size and offset + len(held) < self.size:  # what can be read ends here
+                return bytes(self.read(offset, min(size, self.size - offset)))
+        return held[offset - at : offset - at + size]
+
+    def windows(self, start: int, end: int, overlap: int) -> Iterator[tuple[int, int, memoryview]]:
+        """Yield (start, size to search, bytes) of pieces to search one after the other; what cannot be read is left out."""
+        for piece_start, size, read_bytes in search_windows(start, end, overlap):
+            try:
+                piece = self.read(piece_start, read_bytes)
+            except DamageError:
+                continue
+            yield piece_start, size, piece
+
+    def skips(self) -> None:
+        """Tell the system that this file is read in pieces: what follows a piece need not be read ahead."""
+        os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def _some(self, offset: int, size: int) -> bytes:
+        """Return up to ``size`` bytes at ``offset``, at least one unless the file ends there."""
+        if offset > self.size:  # also what no system call takes
+            return b""
+        try:
+            return os.pread(self._file.fileno(), size, offset)
+        except OSError as error:
+            raise _unreadable(offset, error) from None
+
+    def _fill(self, view: memoryview, offset: int) -> bool:
+        """Read the bytes at ``offset`` into a view; return whether there were enough."""
+        try:
+            return os.preadv(self._file.fileno(), [view], offset) == len(view)
+        except OSError as error:
+            raise _unreadable(offset, error) from None
+
+
+def _unreadable(offset: int, error: OSError) -> DamageError:
+    return DamageError(f"the disk does not give what lies at byte {offset} ({error.strerror})")
+
+
+def load_only(window: mmap.mmap, starts: Int64Array, ends: Int64Array) -> None:
+    """Have the system load these pieces of a mapped file, shape (N,), by rising start, and nothing between them but short gaps.
+
+    Raises
+    ------
+    DamageError
+        The disk does not give them, or the file has become shorter. Whoever looked at them would be ended by a signal (SIGBUS).
+    """
+    window.madvise(mmap.MADV_RANDOM)
+    if not len(starts):
+        return
+    ends = np.minimum(np.maximum.accumulate(ends), len(window))
+    apart = np.flatnonzero(starts[1:] - ends[:-1] > _GAP_BYTES)
+    first, last = starts[np.append(0, apart + 1)], ends[np.append(apart, len(ends) - 1)]
+    first -= first % mmap.PAGESIZE
+    pieces = [
+        (start, end - start) for start, end in zip(first.tolist(), last.tolist(), strict=True) if 0 <= start < end
+    ]
+    for start, size in pieces:
+        window.madvise(mmap.MADV_WILLNEED, start, size)
+    for start, size in pieces:
+        try:
+            window.madvise(_MADV_POPULATE_READ, start, size)
+        except OSError as error:
+            if error.errno != errno.EINVAL:  # which an older system says: it does not know this advice
+                raise _unreadable(start, error) from None
+
+
+def in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, threads: int) -> Iterator[_Result]:
+    """Yield ``work(piece)`` of each piece in their order; several threads run ahead by one piece each."""
+    if threads <= 1:
+        yield from map(work, pieces)
+        return
+    ahead: deque[Future[_Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            for piece in pieces:
+                ahead.append(pool.submit(work, piece))
+                if len(ahead) > threads:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        finally:
+            for waiting in ahead:
+                waiting.cancel()
+
+
+def listed(what: str, numbers: Sequence[int]) -> str:
+    """Return a short list of numbered things: ``topic 3``, ``2 topics (3, 7)``."""
+    if len(numbers) == 1:
+        return f"{what} {numbers[0]}"
+    shown = ", ".join(map(str, numbers[:_LISTED]))
+    return f"{len(numbers)} {what}s ({shown}{', …' if len(numbers) > _LISTED else ''})"
+
+
+def no_room(error: Exception) -> str:
+    """Say that there is no room for a copy of a log, where that is the error; else nothing."""
+    full = isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+    return "no room for a copy here; TMPDIR names a place that has some" if full else ""
+
+
+def is_bomb(compressed_bytes: int, size: int, *, whole: bool = False) -> bool:
+    """Return whether compressed bytes claim to hold implausibly much; ``whole``: what would be held in memory as a whole."""
+    ratio = _PLAUSIBLE_CHUNK_RATIO if whole else _PLAUSIBLE_RATIO
+    return size > _PLAUSIBLE_BYTES and size > ratio * compressed_bytes
+
+
+class Bounds:
+    """What one file may hold, by its size: `LogError` where it holds more, since it was made to take all memory or time.
+
+    Parameters
+    ----------
+    path
+        The file.
+    size
+        Its size [byte].
+    """
+
+    def __init__(self, path: Path, size: int) -> None:
+        self._path, self._size = path, size
+        self.most_records = max(_FEW_RECORDS, size // _LEAST_RECORD_BYTES)
+        self._seen: set[int] = set()
+        self._records = 0
+
+    def claim(self, chunk_sizes: Iterable[int]) -> None:
+        """Take what all chunks claim to hold [byte]."""
+        total = sum(min(size, MAX_CHUNK_BYTES) for size in chunk_sizes)
+        if total > _PLAUSIBLE_TOTAL and is_bomb(self._size, total):
+            raise self._bomb(f"its chunks claim to hold {total} bytes in {self._size}")
+
+    def walk(self, chunk: int, records: int) -> None:
+        """Take how many records the chunk at a byte of the file holds."""
+        if chunk not in self._seen:
+            self._seen.add(chunk)
+            self._records += records
+        if self._records > self.most_records:
+            raise self._bomb(f"it holds more than {self.most_records} records in {self._size} bytes")
+
+    def count(self, chunks: int, channels: int) -> None:
+        """Take how many chunks and channels there are."""
+        for count, most, what in ((chunks, MAX_CHUNKS, "chunks"), (channels, MAX_CHANNELS, "topics or connections")):
+            if count > most:
+                raise self._bomb(f"it holds more than {most} {what}")
+
+    def _bomb(self, why: str) -> LogError:
+        return LogError(f"{self._path}: {why}; it is taken for a bomb, not a log")
+
+
+def search_windows(start: int, end: int, overlap: int) -> Iterator[tuple[int, int, int]]:
+    """Yield (start, size to search, size to read) of pieces to search one after the other, small at first.
+
+    A search that succeeds soon stays cheap, however many there are in a file that is made to need them.
+    """
+    size = 1 << 12
+    while start < end:
+        size = min(size, end - start)
+        yield start, size, min(size + overlap, end - start)
+        start, size = start + size, min(2 * size, SEARCH_BYTES)
+
+
+def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = False) -> memoryview:
+    """Return the ``size`` bytes that ``data`` holds.
+
+    Parameters
+    ----------
+    codec
+        ``lz4`` (frames), ``zstd`` or ``bz2``.
+    data
+        The compressed bytes.
+    size
+        How many bytes they hold.
+    checked
+        A checksum of the result is compared afterwards.
+
+    Raises
+    ------
+    DamageError
+        The bytes do not decompress, or not to ``size``.
+    """
+    if size > MAX_CHUNK_BYTES:
+        raise DamageError(f"it claims to hold {size} bytes, more than {MAX_CHUNK_BYTES}")
+    if is_bomb(len(data), size, whole=True):
+        raise DamageError(f"it claims to hold {size} bytes in {len(data)}")
+    _refuse_unknown(codec)
+    try:
+        if codec == "zstd" or (codec == "lz4" and (checked or _lz4_content_bytes(data) == size)):
+            return memoryview(pa.decompress(pa.py_buffer(data), size, codec=codec)).cast("B")
+        with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
+            found = stream.read_buffer(size)
+            more = stream.read(1)  # also brings the reading to the end, where checksums are compared
+    except OSError as error:
+        raise DamageError(f"it does not decompress ({error})") from None
+    if len(found) != size or more:
+        raise DamageError(f"it holds {'more' if more else f'{len(found)} bytes'}, not the {size} bytes it claims")
+    return memoryview(found).cast("B")
+
+
+def _refuse_unknown(codec: str) -> None:
+    if codec not in ("lz4", "zstd", "bz2"):
+        raise DamageError(f"its compression {codec!r} is unknown (lz4, zstd and bz2 are read)")
+
+
+def _lz4_content_bytes(frame: memoryview) -> int:
+    """Return what an LZ4 frame says of its content's size, which decompressing proves; -1 where it says nothing.
+
+    Without either this or a checksum, what a frame lacks of the size that a chunk claims would be whatever lay in memory before.
+    """
+    if len(frame) < _LZ4_HEAD.size or frame[:4] != _LZ4_MAGIC or not frame[4] & _LZ4_HAS_CONTENT_SIZE:
+        return -1
+    return int(_LZ4_HEAD.unpack_from(frame)[3])
+
+
+def decompressed_prefix(codec: str, data: memoryview, size: int) -> memoryview:
+    """Return as many of the ``size`` bytes as the cut ``data`` still gives."""
+    _refuse_unknown(codec)
+    found = bytearray()
+    try:
+        with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(data)), codec) as stream:
+            while len(found) < min(size, MAX_CHUNK_BYTES) and (piece := stream.read(4096)):
+                found += piece
+    except OSError:  # the cut is reached
+        pass
+    return memoryview(found)[:size]
+
+
+def gathered(buffer: bytes | memoryview, offsets: Int64Array, code: str) -> Int64Array:
+    """Return the little-endian integers (numpy's ``code``: ``u2``, ``u4``, ``i8``) that lie at ``offsets``, of any alignment.
+
+    The caller has checked the bounds. Unsigned 64-bit values are read as ``i8``: no length or time in a log reaches the sign bit, and
+    one that claims to is negative, which every check refuses.
+    """
+    kind = np.dtype("<" + code)
+    windows: NDArray[np.generic] = np.ndarray((len(buffer) - kind.itemsize + 1,), kind, buffer, 0, (1,))
+    return windows[offsets].astype(np.int64)

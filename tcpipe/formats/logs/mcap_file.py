@@ -1,0 +1,731 @@
+"""MCAP files: by their summary where it can be trusted, record by record where not, and past what is broken.
+
+A chunk is decompressed only when it holds a wanted channel, its CRC is checked, and the message index beside it (which no checksum
+covers) is believed only as far as the chunk's own records bear it out.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from isal.isal_zlib import crc32
+from numpy.typing import NDArray
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.chunk_runs import MAX_PLANNED_BYTES, Entries, Run, by_place, copy_pieces, excerpt, groups, runs
+from tcpipe.formats.logs.log_part import (
+    MAX_CHUNK_BYTES,
+    Bounds,
+    ByteSource,
+    Channel,
+    DamageError,
+    Int64Array,
+    MessageBlock,
+    decompressed,
+    decompressed_prefix,
+    gathered,
+    grouped,
+    in_order,
+    listed,
+)
+from tcpipe.formats.logs.mcap_records import (
+    CHUNK_CRC,
+    CHUNK_HEAD,
+    FOOTER,
+    MAGIC,
+    MESSAGE_HEAD,
+    OP_CHANNEL,
+    OP_CHUNK,
+    OP_CHUNK_INDEX,
+    OP_DATA_END,
+    OP_FOOTER,
+    OP_LAST,
+    OP_MESSAGE,
+    OP_MESSAGE_INDEX,
+    OP_SCHEMA,
+    OP_STATISTICS,
+    RECORD_HEAD,
+    ChannelRecord,
+    Chunk,
+    Schema,
+    Statistics,
+    borne_out,
+    index_entries,
+    index_messages,
+    message_blocks,
+    message_heads,
+    message_offsets,
+    parse_channel,
+    parse_chunk_head,
+    parse_chunk_index,
+    parse_schema,
+    parse_statistics,
+    record_offsets,
+)
+from tcpipe.logs.topics import Damage, normalized_type_name
+
+_DATA_END = RECORD_HEAD + 4
+"""Bytes of the record that ends the data, right before the summary."""
+_RUN_BYTES = 1 << 22
+"""Messages outside chunks are read in runs of about this size."""
+
+
+@dataclass(slots=True)
+class _Contents:
+    """What is known of a file so far."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, ChannelRecord] = field(default_factory=dict)
+    chunks: list[Chunk] = field(default_factory=list)
+    statistics: Statistics | None = None
+
+    def note(self, opcode: int, content: bytes | memoryview) -> None:
+        """Remember a schema or channel; the first of a number holds, and others are not looked at, however many there are."""
+        number = int.from_bytes(content[:2], "little")
+        if opcode == OP_SCHEMA and number not in self.schemas:
+            self.schemas.setdefault(*parse_schema(content))
+        elif opcode == OP_CHANNEL and number not in self.channels:
+            self.channels.setdefault(*parse_channel(content))
+
+
+@dataclass(slots=True)
+class _Tally:
+    """Messages of a channel met on a walk."""
+
+    count: int = 0
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+
+class McapPart:
+    """One .mcap file, open for reading."""
+
+    def __init__(self, path: Path, name: str) -> None:
+        self.name = name
+        self.damage: dict[Damage, None] = {}
+        self._bytes = ByteSource(path)
+        self._tallies: dict[int, _Tally] = {}
+        self._untimed = 0
+        self._complete = False
+        self._read_chunks: set[int] = set()
+        self._without_crc: set[int] = set()
+        self._bounds = Bounds(path, self._bytes.size)
+        try:
+            self._read_index()
+            self._bounds.count(len(self._contents.chunks), len(self._contents.channels))
+            self._note_twins()
+        except LogError:
+            self.close()
+            raise
+        self.channels = {number: self._channel(number) for number in sorted(self._contents.channels)}
+
+    def _read_index(self) -> None:
+        """Read the summary, or, where it cannot be used, walk the file."""
+        try:
+            if self._bytes.peek(0, len(MAGIC)) != MAGIC:
+                self._note(0, "the file's first bytes are not those of an MCAP file", messages_lost=0)
+            self._contents = self._summary()
+            self._bounds.claim(chunk.size for chunk in self._contents.chunks)
+        except DamageError as error:
+            if str(error):
+                self._note(self._bytes.size, f"{error}; it is read record by record")
+            self._contents = _Contents()
+            if not self._walk(self._contents, len(MAGIC), self._bytes.size):
+                self._distrust_last_index(self._contents)
+            self._complete = True
+            self._bounds.claim(chunk.size for chunk in self._contents.chunks)
+            self._count_messages()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._bytes.close()
+
+    @property
+    def unchecked(self) -> str:
+        """What was read that no checksum covers."""
+        if not self._without_crc:
+            return ""
+        return f"{len(self._without_crc)} of {len(self._read_chunks)} chunks read carry no CRC"
+
+    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+        if not self._complete:
+            self._fill_gaps()
+
+        if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
+            self._bytes.skips()
+
+        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[Damage]]:
+            noted: list[Damage] = []
+            return list(self._run_blocks(run, wanted, noted)), noted
+
+        for blocks, noted in in_order(read, self._runs(wanted), threads=threads):
+            self.damage.update(dict.fromkeys(noted))
+            yield from blocks
+        self._note_odd_ones_without_crc()
+
+    def _wanted_chunks(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
+        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
+        base, found = 0, []
+        for chunk in self._contents.chunks:
+            if chunk.index is None or not wanted.isdisjoint(chunk.index):
+                found.append((base, chunk))
+            base += min(chunk.size, MAX_CHUNK_BYTES)
+        return found
+
+    def _runs(self, wanted: frozenset[int]) -> Iterator[_ChunkRun]:
+        """Yield what to read at once; the indexes of some chunks are read ahead."""
+        chunks = self._wanted_chunks(wanted)
+        for group in groups(chunk.size for _, chunk in chunks):
+            members = chunks[group.start : group.stop]
+            sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
+            entries, sound = self._entries([chunk for _, chunk in members], sizes)
+            bases = np.array([base for base, _ in members], np.int64)
+            for run in runs(entries, sizes, sound, sorted(wanted)):
+                yield _ChunkRun(run, members, bases)
+
+    def _run_blocks(self, run: _ChunkRun, wanted: frozenset[int], noted: list[Damage]) -> Iterator[MessageBlock]:
+        """Yield the wanted messages of a run; what is lost or contradicts itself is added to ``noted``."""
+        doubtful = list(run.plan.chunks)
+        if run.plan.entries is not None:
+            found = excerpt(
+                run.plan,
+                run.plan.entries,
+                load=lambda number: self._load(run.members[number][1]),
+                copy=lambda number, places, to: self._copy(run.members[number][1], places, to),
+            )
+            noted += [self._lost(run.members[number][1], str(error)) for number, error in found.lost]
+            heads = message_heads(found.data, found.offset)
+            true = borne_out(heads, found.entries)
+            doubtful = np.unique(found.entries.chunk[~true]).tolist()
+            if doubtful:
+                found = found.without(doubtful)
+                heads = message_heads(found.data, found.offset)
+            ordinals = run.bases[found.entries.chunk] + found.entries.offset
+            yield from self._in_time(found.data, found.offset, heads, ordinals, noted)
+        for number in doubtful:
+            base, chunk = run.members[number]
+            try:
+                data = self._load(chunk)
+            except DamageError as error:
+                noted.append(self._lost(chunk, str(error)))
+            else:
+                offsets = self._walked_messages(chunk, data, noted)
+                heads = message_heads(data, offsets)
+                chosen = _chosen(wanted)[heads["channel"]]
+                offsets, heads = offsets[chosen], heads[chosen]
+                entries = None if run.plan.entries is None else run.plan.entries.of_chunk(number)
+                noted += self._disagreement(chunk, offsets, heads, entries)
+                yield from self._in_time(data, offsets, heads, offsets + base, noted)
+
+    def _records(self, chunk: Chunk, data: memoryview) -> tuple[Int64Array, int]:
+        """Return where the records of a chunk begin, and where they end."""
+        records, end = record_offsets(data, self._bounds.most_records)
+        self._bounds.walk(chunk.offset, len(records))
+        return records, end
+
+    def _walked_messages(self, chunk: Chunk, data: memoryview, noted: list[Damage]) -> Int64Array:
+        """Return where the messages of a chunk begin, by its records; where these end too early, or are none, that is noted."""
+        records, end = self._records(chunk, data)
+        messages = message_offsets(data, records)
+        lost = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) - len(messages) if len(records) else 0
+        channels = message_heads(data, messages)["channel"]
+        where = f"{self.name}, byte {chunk.offset}"
+        if lost:
+            noted.append(Damage(where, "messages without times", messages_lost=lost))
+        if end < len(data) and not chunk.cut:
+            noted.append(Damage(where, "the records of a chunk end before it does", bytes_lost=len(data) - end))
+        unknown = [number for number in np.unique(channels).tolist() if number not in self._contents.channels]
+        counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
+        if unknown and not counted:
+            what = f"messages of {listed('channel', unknown)}, which nothing declares"
+            noted.append(Damage(where, what, messages_lost=int(np.isin(channels, unknown).sum())))
+        return messages
+
+    def _disagreement(
+        self, chunk: Chunk, offsets: Int64Array, heads: NDArray[np.void], entries: Entries | None
+    ) -> list[Damage]:
+        """Return what to say where a chunk's index is broken, or names other messages; with a CRC the chunk is right."""
+        checked, large = self._crc(chunk), chunk.size > MAX_PLANNED_BYTES
+        if entries is None and (checked or chunk.index is None or chunk.cut or large):
+            return []
+        what, lost = "the index of a chunk is broken; its messages are read without it", 0
+        if entries is not None:
+            mine = np.stack([offsets, heads["channel"].astype(np.int64), heads["log_time_ns"]])
+            if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+                return []
+            what = "the index of a chunk names other messages than the chunk holds, which are read"
+            lost = max(len(entries.offset) - len(offsets), 0)
+        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=0 if checked else lost or None)]
+
+    def _in_time(
+        self, data: memoryview, offsets: Int64Array, heads: NDArray[np.void], ordinals: Int64Array, noted: list[Damage]
+    ) -> list[MessageBlock]:
+        """Return messages as blocks, without those whose time is past what 63 bits hold."""
+        times = (heads["log_time_ns"] >= 0) & (heads["publish_time_ns"] >= 0)
+        if not times.all():
+            what = "messages of times after the year 2262"
+            noted.append(Damage(self.name, what, messages_lost=int((~times).sum())))
+            offsets, heads, ordinals = offsets[times], heads[times], ordinals[times]
+        return message_blocks(data, offsets, heads, ordinals)
+
+    def _copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
+        """Copy pieces (start, stop, place) of a chunk; what need not be read as a whole, to check or decompress it, is not."""
+        if chunk.compression or self._crc(chunk):
+            copy_pieces(self._load(chunk, once=True), places, to)
+            return
+        self._note_read(chunk, checked=False)
+        self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in places])
+
+    def _crc(self, chunk: Chunk) -> int:
+        """Return the CRC of a chunk's records; 0 where there is none."""
+        if chunk.headless:
+            return 0
+        return int.from_bytes(self._bytes.read(chunk.offset + CHUNK_CRC, 4), "little")
+
+    def _note_twins(self) -> None:
+        """Note chunks of one content: one was written over another, where times, sizes and CRC are the same."""
+        heads: dict[tuple[int, int, int], Chunk] = {}
+        for chunk in self._contents.chunks:
+            if chunk.headless or chunk.cut:
+                continue
+            twin = heads.setdefault((chunk.start_ns, chunk.end_ns, chunk.uncompressed_bytes), chunk)
+            with suppress(DamageError):
+                if twin is not chunk and self._crc(chunk) and self._crc(chunk) == self._crc(twin):
+                    self._note(chunk.offset, f"a chunk holds the same as the one at byte {twin.offset}")
+
+    def _note_odd_ones_without_crc(self) -> None:
+        """Note the chunks that were read without a CRC where others of the file have one: it may have been overwritten."""
+        odd = [chunk for chunk in self._contents.chunks if chunk.offset in self._without_crc and not chunk.headless]
+        others = (chunk for chunk in self._contents.chunks if chunk.offset not in self._without_crc)
+        if odd and any(self._crc(chunk) for chunk in others):
+            for chunk in odd:
+                self._note(chunk.offset, "a chunk has no CRC, others of the file have one; it is read unchecked")
+
+    def _note_read(self, chunk: Chunk, *, checked: bool) -> None:
+        self._read_chunks.add(chunk.offset)
+        if not checked:
+            self._without_crc.add(chunk.offset)
+
+    def _load(self, chunk: Chunk, *, once: bool = False) -> memoryview:
+        """Return the chunk's records, its CRC checked; of a chunk that the file's end cuts, what can still be had.
+
+        With ``once`` they may be overwritten when this thread reads again.
+        """
+        crc = self._crc(chunk)
+        self._note_read(chunk, checked=bool(crc))
+        if chunk.cut:
+            return self._load_cut(chunk, self._bytes.read(chunk.data_offset, chunk.data_bytes))
+        if chunk.compression:
+            data = self._bytes.read_once(chunk.data_offset, chunk.data_bytes)
+            data = decompressed(chunk.compression, data, chunk.uncompressed_bytes, checked=bool(crc))
+        else:
+            data = (self._bytes.read_once if once else self._bytes.read)(chunk.data_offset, chunk.data_bytes)
+        if crc and crc32(data) != crc:
+            raise DamageError("its CRC does not match")
+        return data
+
+    def _load_cut(self, chunk: Chunk, data: memoryview) -> memoryview:
+        kept = decompressed_prefix(chunk.compression, data, chunk.uncompressed_bytes) if chunk.compression else data
+        lost = chunk.uncompressed_bytes - len(kept)
+        self._note(
+            chunk.offset, f"the file ends inside a chunk; {len(kept)} bytes of it are read, unchecked", bytes_lost=lost
+        )
+        return kept
+
+    def _entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+        """Return the messages of several chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+        regions: list[memoryview | bytes] = []
+        places: list[tuple[int, int, int, int]] = []
+        unsound, before = [], 0
+        for number, chunk in enumerate(chunks):
+            if chunk.index is None or chunk.cut or chunk.size > MAX_PLANNED_BYTES:
+                unsound.append(number)
+                continue
+            try:
+                region, records = self._index_region(chunk, chunk.index)
+            except DamageError:
+                unsound.append(number)
+                continue
+            end = before + len(region)
+            places += [(number, channel, before + at, end) for channel, at in records]
+            regions.append(region)
+            before = end
+        of, channels, at, ends = np.array(places, np.int64).reshape(-1, 4).T
+        right, record, stamps, offsets = index_messages(b"".join(regions), at, ends, channels)
+        entries, sound = by_place(
+            of[record], channels[record], offsets, stamps, sizes, least_bytes=RECORD_HEAD + MESSAGE_HEAD
+        )
+        sound[unsound] = False
+        sound[of[~right]] = False
+        return entries, sound
+
+    def _index_region(self, chunk: Chunk, index: dict[int, int]) -> tuple[memoryview | bytes, list[tuple[int, int]]]:
+        """Return bytes that hold a chunk's message indexes, and of each channel's where it begins in them.
+
+        As a rule they lie together, right behind the chunk.
+        """
+        last = chunk.index_bytes - RECORD_HEAD
+        places = [(channel, at - chunk.end) for channel, at in index.items()]
+        if all(0 <= at <= last for _, at in places):
+            return self._bytes.read(chunk.end, chunk.index_bytes), places
+        records = [self._index_record(at) for at in index.values()]
+        starts = itertools.accumulate((len(record) for record in records), initial=0)
+        return b"".join(records), list(zip(index, starts, strict=False))
+
+    def _index_entries(self, offset: int, channel: int) -> Int64Array:
+        """Return a message index as (log time, offset), shape (N, 2)."""
+        return index_entries(self._index_record(offset), channel)
+
+    def _index_record(self, offset: int) -> memoryview:
+        length = int.from_bytes(self._bytes.peek(offset, RECORD_HEAD)[1:], "little")
+        if offset + RECORD_HEAD + length > self._bytes.size:
+            raise DamageError("a message index runs past the file's end")
+        return self._bytes.read(offset, RECORD_HEAD + length)
+
+    def _summary(self) -> _Contents:
+        """Read the summary section; `DamageError` (without text where there simply is none) when it cannot be used."""
+        tail_bytes = RECORD_HEAD + FOOTER + len(MAGIC)
+        tail = bytes(self._bytes.read(max(self._bytes.size - tail_bytes, 0), min(tail_bytes, self._bytes.size)))
+        if not tail.endswith(MAGIC) or tail[0] != OP_FOOTER or int.from_bytes(tail[1:9], "little") != FOOTER:
+            raise DamageError("the file is not closed (no footer)")
+        start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
+        if not start:
+            raise DamageError
+        end = self._bytes.size - tail_bytes
+        if not len(MAGIC) <= start <= end:
+            raise DamageError("the footer points outside the file")
+        if self._bytes.peek(start - _DATA_END, RECORD_HEAD) != bytes([OP_DATA_END, _DATA_END - RECORD_HEAD, *bytes(7)]):
+            raise DamageError("the footer does not point behind the data")
+        section = self._bytes.read(start, end - start + RECORD_HEAD + 16)
+        if crc and crc32(section) != crc:
+            raise DamageError("the summary's CRC does not match")
+        contents = _parse_summary(section[: end - start])
+        self._check_summary(contents)
+        return contents
+
+    def _check_summary(self, contents: _Contents) -> None:
+        """Raise `DamageError` when the summary does not name what a reader needs."""
+        indexed = {channel for chunk in contents.chunks for channel in chunk.index or ()}
+        counted = contents.statistics.messages_by_channel if contents.statistics else {}
+        if not (indexed | counted.keys()) <= contents.channels.keys() or not contents.channels:
+            raise DamageError
+        if any(channel.schema and channel.schema not in contents.schemas for channel in contents.channels.values()):
+            raise DamageError
+        if contents.statistics is None or contents.statistics.chunks != len(contents.chunks):
+            raise DamageError
+        if contents.statistics.messages != sum(counted.values()):  # a writer need not count them by channel
+            raise DamageError
+        if any(chunk.end > self._bytes.size or chunk.offset < len(MAGIC) for chunk in contents.chunks):
+            raise DamageError("the summary points outside the file")
+        if any(later.offset < chunk.end for chunk, later in itertools.pairwise(contents.chunks)):
+            raise DamageError("the summary names a chunk twice")
+
+    def _fill_gaps(self) -> None:
+        """Walk what lies between the chunks that the summary names: message indexes, and messages outside chunks."""
+        self._complete = True
+        listed, self._contents.chunks = self._contents.chunks, []
+        position = len(MAGIC)
+        for chunk in listed:
+            self._walk(self._contents, position, chunk.offset)
+            self._contents.chunks.append(chunk)
+            position = chunk.end + chunk.index_bytes
+        self._walk(self._contents, position, self._bytes.size)
+        self._note_odd_messages()
+
+    def _check_data_section(self, contents: _Contents, end: int) -> None:
+        """Compare the CRC of all data, where there is one, if messages lie outside chunks: nothing else covers these."""
+        crc = int.from_bytes(self._bytes.peek(end + RECORD_HEAD, 4), "little")
+        if not crc or not any(chunk.headless for chunk in contents.chunks):
+            return
+        found = 0
+        for start in range(0, end, _RUN_BYTES):
+            found = crc32(self._bytes.read_once(start, min(_RUN_BYTES, end - start)), found)
+        if found != crc:
+            self._note(end, "the CRC of the data does not match; messages outside chunks may be wrong or missing")
+
+    def _walk(self, contents: _Contents, start: int, end: int) -> bool:
+        """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
+        position = start
+        run = _MessageRun()
+        closed = False
+        while position + RECORD_HEAD <= end:
+            try:
+                head = self._bytes.peek(position, RECORD_HEAD + CHUNK_HEAD + 4)
+            except DamageError as error:
+                run.finish(contents.chunks)
+                position = self._stepped_over(contents, position, end, error)
+                continue
+            opcode, length = head[0], int.from_bytes(head[1:9], "little")
+            after = position + RECORD_HEAD + length
+            if opcode in (OP_FOOTER, OP_DATA_END) and length <= FOOTER:
+                closed = True
+                break
+            if opcode == OP_MESSAGE and after <= end and length >= MESSAGE_HEAD:
+                stamp = int.from_bytes(head[15:23], "little")
+                self._tally(int.from_bytes(head[9:11], "little"), 1, stamp, stamp)
+                run.extend(position, after, contents.chunks)
+                position = after
+                continue
+            run.finish(contents.chunks)
+            try:
+                self._take_record(contents, opcode, position, after, end)
+            except DamageError as error:
+                after = self._stepped_over(contents, position, end, error)
+            position = after
+        run.finish(contents.chunks)
+        if closed and opcode == OP_DATA_END:
+            self._check_data_section(contents, position)
+        return closed
+
+    def _stepped_over(self, contents: _Contents, position: int, end: int, error: DamageError) -> int:
+        """Note what cannot be at ``position``; return where the next chunk begins."""
+        after = self._next_chunk(position + 1, end)
+        self._note(position, str(error), bytes_lost=after - position)
+        self._distrust_last_index(contents)
+        return after
+
+    def _take_record(self, contents: _Contents, opcode: int, position: int, after: int, end: int) -> None:
+        if opcode == OP_CHUNK:
+            contents.chunks.append(self._walked_chunk(position, after))
+            self._bounds.count(len(contents.chunks), 0)
+        elif opcode == OP_MESSAGE and after <= end:
+            self._untimed += 1
+        elif not 1 <= opcode <= OP_LAST:
+            raise DamageError(f"no record begins with opcode {opcode}")
+        elif after > end:
+            raise DamageError(f"a record (opcode {opcode}) of {after - position} bytes runs past the end")
+        elif opcode in (OP_SCHEMA, OP_CHANNEL):
+            contents.note(opcode, self._bytes.read(position + RECORD_HEAD, after - position - RECORD_HEAD))
+        elif opcode == OP_MESSAGE_INDEX and contents.chunks and not contents.chunks[-1].headless:
+            self._take_message_index(contents, position, after)
+
+    def _walked_chunk(self, position: int, after: int) -> Chunk:
+        chunk = parse_chunk_head(self._bytes.peek(position + RECORD_HEAD, CHUNK_HEAD + 4), position)
+        if chunk.compression not in ("", "lz4", "zstd") or chunk.end != after:
+            raise DamageError("the head of a chunk contradicts itself")
+        if chunk.uncompressed_bytes > MAX_CHUNK_BYTES:
+            raise DamageError(f"a chunk claims to hold {chunk.uncompressed_bytes} bytes")
+        if after > self._bytes.size:
+            if self._next_chunk(position + 1, self._bytes.size) < self._bytes.size:
+                raise DamageError("the head of a chunk contradicts what follows")
+            return replace(chunk, data_bytes=self._bytes.size - chunk.data_offset, cut=True)
+        return chunk
+
+    def _take_message_index(self, contents: _Contents, position: int, after: int) -> None:
+        if after - position < RECORD_HEAD + 6:
+            raise DamageError("a message index contradicts itself")
+        channel = int.from_bytes(self._bytes.peek(position + RECORD_HEAD, 2), "little")
+        self._index_entries(position, channel)
+        chunk = contents.chunks[-1]
+        index_bytes = after - chunk.end
+        index = (
+            {} if chunk.index is None else chunk.index
+        )  # which the chunk takes over: a copy for each entry would cost their square
+        index[channel] = position
+        contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
+
+    def _distrust_last_index(self, contents: _Contents) -> None:
+        """Forget the index of the last chunk: where the file breaks off behind it, some of it may be missing."""
+        if contents.chunks:
+            contents.chunks[-1] = replace(contents.chunks[-1], index=None)
+
+    def _next_chunk(self, start: int, end: int) -> int:
+        """Return where the next plausible chunk begins: its lengths agree with one another and with the file's."""
+        for block_start, size, block in self._bytes.windows(start, end, RECORD_HEAD + CHUNK_HEAD + 4):
+            for candidate in _possible_chunks(block, size):
+                length = int.from_bytes(block[candidate + 1 : candidate + RECORD_HEAD], "little")
+                try:
+                    chunk = parse_chunk_head(block[candidate + RECORD_HEAD :], block_start + candidate)
+                except DamageError:
+                    continue
+                whole = chunk.end == chunk.offset + RECORD_HEAD + length <= end
+                plausible = chunk.start_ns <= chunk.end_ns and chunk.uncompressed_bytes <= MAX_CHUNK_BYTES
+                if whole and plausible and chunk.compression in ("", "lz4", "zstd"):
+                    return chunk.offset
+        return end
+
+    def _count_messages(self) -> None:
+        """Count the messages of a walked file by its message indexes; load what has none, or what may declare unknown channels."""
+        contents = self._contents
+        for chunk in contents.chunks:
+            if chunk.headless:
+                continue
+            if chunk.index is None or not chunk.index.keys() <= contents.channels.keys():
+                self._declare_and_count(chunk)
+            for channel, offset in (chunk.index or {}).items():
+                try:
+                    entries = self._index_entries(offset, channel)
+                except DamageError as error:
+                    self._note(offset, str(error))
+                    continue
+                if len(entries):
+                    self._tally(channel, len(entries), int(entries[:, 0].min()), int(entries[:, 0].max()))
+        self._note_odd_messages()
+
+    def _note_odd_messages(self) -> None:
+        """Note messages outside chunks, or in an index, that are of no channel or have no times."""
+        if self._untimed:
+            self._note(0, "messages without times", messages_lost=self._untimed)
+        if unknown := sorted(self._tallies.keys() - self._contents.channels.keys()):
+            lost = sum(self._tallies[channel].count for channel in unknown)
+            self._note(0, f"messages of {listed('channel', unknown)}, which nothing declares", messages_lost=lost)
+
+    def _declare_and_count(self, chunk: Chunk) -> None:
+        try:
+            data = self._load(chunk)
+        except DamageError as error:
+            self.damage[self._lost(chunk, str(error))] = None
+            return
+        records, _ = self._records(chunk, data)
+        self._declare(chunk, data, records)
+        if chunk.index is None:
+            self._tally_messages(data, message_offsets(data, records))
+
+    def _declare(self, chunk: Chunk, data: memoryview, records: Int64Array) -> None:
+        for offset in records.tolist():
+            if data[offset] in (OP_SCHEMA, OP_CHANNEL):
+                length = int.from_bytes(data[offset + 1 : offset + RECORD_HEAD], "little")
+                try:
+                    self._contents.note(data[offset], data[offset + RECORD_HEAD : offset + RECORD_HEAD + length])
+                except DamageError as error:
+                    self._note(chunk.offset, f"a schema or channel in this chunk is broken: {error}")
+
+    def _channel(self, number: int) -> Channel:
+        channel = self._contents.channels[number]
+        schema = self._contents.schemas.get(channel.schema, Schema("", "", ""))
+        statistics = self._contents.statistics
+        if statistics:
+            count, (start_ns, end_ns) = statistics.messages_by_channel.get(number, 0), self._times(number)
+        else:
+            tally = self._tallies.get(number, _Tally())
+            count, start_ns, end_ns = tally.count, tally.start_ns, tally.end_ns
+        return Channel(
+            channel.topic,
+            normalized_type_name(schema.name),
+            channel.encoding,
+            schema.encoding,
+            schema.definition,
+            count,
+            start_ns,
+            end_ns,
+        )
+
+    def _times(self, channel: int) -> tuple[int | None, int | None]:
+        """Return the channel's first and last log time, from the message indexes of the chunks at both ends."""
+        holding = [chunk for chunk in self._contents.chunks if chunk.index and channel in chunk.index]
+        if not holding:
+            return None, None
+        first, last = min(holding, key=lambda c: c.start_ns), max(holding, key=lambda c: c.end_ns)
+        try:
+            begin = self._index_entries((first.index or {})[channel], channel)
+            end = self._index_entries((last.index or {})[channel], channel)
+        except DamageError:
+            return None, None
+        return (int(begin[:, 0].min()), int(end[:, 0].max())) if len(begin) and len(end) else (None, None)
+
+    def _tally(self, channel: int, count: int, start_ns: int, end_ns: int) -> None:
+        tally = self._tallies.setdefault(channel, _Tally())
+        tally.count += count
+        tally.start_ns = start_ns if tally.start_ns is None else min(start_ns, tally.start_ns)
+        tally.end_ns = end_ns if tally.end_ns is None else max(end_ns, tally.end_ns)
+
+    def _tally_messages(self, data: memoryview, messages: Int64Array) -> None:
+        channels = gathered(data, messages + RECORD_HEAD, "u2") if len(messages) else np.zeros(0, np.int64)
+        for channel, of in grouped(channels):
+            stamps = gathered(data, messages[of] + RECORD_HEAD + 6, "i8")
+            self._tally(channel, len(stamps), int(stamps.min()), int(stamps.max()))
+
+    def _note(self, offset: int, what: str, *, messages_lost: int | None = None, bytes_lost: int | None = None) -> None:
+        where = f"{self.name}, byte {offset}"
+        self.damage[Damage(where, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
+
+    def _lost(self, chunk: Chunk, what: str) -> Damage:
+        """Return what to say of a chunk that is lost as a whole, counted by the message index beside it."""
+        try:
+            lost = sum(len(self._index_entries(at, channel)) for channel, at in (chunk.index or {}).items())
+        except DamageError:
+            lost = 0
+        return Damage(
+            f"{self.name}, byte {chunk.offset}",
+            f"a chunk is lost: {what}",
+            messages_lost=lost or None,
+            bytes_lost=chunk.uncompressed_bytes,
+            start_ns=chunk.start_ns,
+            end_ns=chunk.end_ns,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _ChunkRun:
+    """A run of chunks to read: its plan, and the chunks of its group, each with the number of bytes in all chunks before it."""
+
+    plan: Run
+    members: list[tuple[int, Chunk]]
+    bases: Int64Array
+    """These numbers once more, shape (members,)."""
+
+
+class _MessageRun:
+    """Messages outside chunks that follow one another: read together, as if they were a chunk."""
+
+    def __init__(self) -> None:
+        self._start = self._end = 0
+
+    def extend(self, start: int, end: int, chunks: list[Chunk]) -> None:
+        """Add one message."""
+        if self._end - self._start > _RUN_BYTES:
+            self.finish(chunks)
+        if self._end == self._start:
+            self._start = start
+        self._end = end
+
+    def finish(self, chunks: list[Chunk]) -> None:
+        """Append the run to the chunks."""
+        size = self._end - self._start
+        if size:
+            chunks.append(Chunk(self._start, self._start, size, "", size, 0, 0, headless=True))
+        self._start = self._end = 0
+
+
+@functools.lru_cache(maxsize=4)
+def _chosen(wanted: frozenset[int]) -> NDArray[np.bool_]:
+    """Return of every channel number whether it is wanted."""
+    found = np.zeros(1 << 16, np.bool_)
+    found[list(wanted)] = True
+    return found
+
+
+def _parse_summary(section: memoryview) -> _Contents:
+    contents = _Contents()
+    records, end = record_offsets(section, len(section))
+    if end < len(section):
+        raise DamageError("the summary contradicts itself")
+    for offset in records.tolist():
+        length = int.from_bytes(section[offset + 1 : offset + RECORD_HEAD], "little")
+        content = section[offset + RECORD_HEAD : offset + RECORD_HEAD + length]
+        if section[offset] == OP_CHUNK_INDEX:
+            contents.chunks.append(parse_chunk_index(content))
+        elif section[offset] == OP_STATISTICS:
+            contents.statistics = parse_statistics(content)
+        else:
+            contents.note(section[offset], content)
+    contents.chunks.sort(key=lambda chunk: chunk.offset)
+    return contents
+
+
+def _possible_chunks(block: memoryview, size: int) -> list[int]:
+    """Return where in ``size`` bytes a chunk's opcode is followed, at the right distance, by the length of a compression's name."""
+    opcodes = np.frombuffer(block, np.uint8)[: max(min(size, len(block) - RECORD_HEAD - CHUNK_HEAD), 0)]
+    candidates = np.flatnonzero(opcodes == OP_CHUNK)
+    if not len(candidates):
+        return []
+    name_bytes = gathered(block, candidates + RECORD_HEAD + 28, "u4")
+    found: list[int] = candidates[np.isin(name_bytes, (0, 3, 4))].tolist()
+    return found

@@ -1,0 +1,303 @@
+"""The records of an MCAP file, as bytes: https://mcap.dev/spec. Every record is an opcode, a length (uint64), and its content."""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.formats.logs.chunk_runs import Entries
+from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, blocks_by_channel, gathered
+
+MAGIC = b"\x89MCAP0\r\n"
+CHUNK_CRC = 33
+"""Where in a chunk's record its CRC begins (uint32)."""
+RECORD_HEAD = 9
+"""Bytes of opcode and length."""
+MESSAGE_HEAD = 22
+"""Bytes of a message's content before its payload: channel, sequence, log time, publish time."""
+CHUNK_HEAD = 40
+"""Bytes of a chunk's content before its data, without the name of its compression."""
+_INDEX_HEAD = struct.Struct("<BQHI")
+_CHUNK_INDEX_HEAD, _CHUNK_INDEX_MIDDLE, _CHUNK_INDEX_TAIL = (
+    struct.Struct(f"<{form}") for form in ("QQQQI", "QI", "QQ")
+)
+_CHANNEL_OFFSET = struct.Struct("<HQ")
+FOOTER = 20
+"""Bytes of a footer's content."""
+
+_MESSAGE = np.dtype(
+    [
+        ("opcode", "u1"),
+        ("length", "<i8"),
+        ("channel", "<u2"),
+        ("sequence", "<u4"),
+        ("log_time_ns", "<i8"),
+        ("publish_time_ns", "<i8"),
+    ]
+)
+"""A message's record up to its payload; a length that claims the sign bit reads as negative, and is refused."""
+
+OP_FOOTER, OP_SCHEMA, OP_CHANNEL, OP_MESSAGE, OP_CHUNK, OP_MESSAGE_INDEX = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
+OP_CHUNK_INDEX, OP_STATISTICS, OP_DATA_END, OP_LAST = 0x08, 0x0B, 0x0F, 0x0F
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """A message definition."""
+
+    name: str
+    encoding: str
+    definition: str
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelRecord:
+    """A topic, the number of its schema and the encoding of its messages."""
+
+    topic: str
+    schema: int
+    encoding: str
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Where a chunk lies and what it holds; a run of messages outside chunks is one without a head (``crc`` 0, no compression).
+
+    ``index`` gives the byte of each channel's message index (None where the chunk has none), ``index_bytes`` how long they are together.
+    """
+
+    offset: int
+    data_offset: int
+    data_bytes: int
+    compression: str
+    uncompressed_bytes: int
+    start_ns: int
+    end_ns: int
+    index: dict[int, int] | None = None
+    index_bytes: int = 0
+    cut: bool = False
+    headless: bool = False
+
+    @property
+    def size(self) -> int:
+        """Bytes of the chunk's records; of compressed ones, what the chunk claims."""
+        return self.uncompressed_bytes if self.compression else self.data_bytes
+
+    @property
+    def end(self) -> int:
+        """Byte after the chunk's record."""
+        return self.data_offset + self.data_bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Statistics:
+    """Counts of the whole file."""
+
+    messages: int
+    chunks: int
+    start_ns: int
+    end_ns: int
+    messages_by_channel: dict[int, int]
+
+
+class Fields:
+    """Reads the fields of one record in order; raises `DamageError` where they do not fit."""
+
+    def __init__(self, content: bytes | memoryview) -> None:
+        self._content = content
+        self._position = 0
+
+    def take(self, form: str) -> tuple[int, ...]:
+        """Return fixed-size fields, as struct names them."""
+        try:
+            values = struct.unpack_from("<" + form, self._content, self._position)
+        except struct.error:
+            raise DamageError("a record ends before its fields do") from None
+        self._position += struct.calcsize("<" + form)
+        return values
+
+    def blob(self) -> bytes:
+        """Return a length-prefixed run of bytes."""
+        (size,) = self.take("I")
+        if self._position + size > len(self._content):
+            raise DamageError("a text runs past its record")
+        self._position += size
+        return bytes(self._content[self._position - size : self._position])
+
+    def pairs(self, size: int) -> dict[int, int]:
+        """Return a map of ``size`` bytes from channel to number."""
+        whole = size - size % 10
+        if self._position + whole > len(self._content):
+            raise DamageError("a record ends before its fields do")
+        found = self._content[self._position : self._position + whole]
+        self._position += whole
+        return dict(_CHANNEL_OFFSET.iter_unpack(found))
+
+    def text(self) -> str:
+        """Return a text; bytes that are no UTF-8 are kept visible, so that different names stay different."""
+        return self.blob().decode(errors="backslashreplace")
+
+
+def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
+    """Return a schema and its number."""
+    fields = Fields(content)
+    (number,) = fields.take("H")
+    return number, Schema(fields.text(), fields.text(), fields.text())
+
+
+def parse_channel(content: bytes | memoryview) -> tuple[int, ChannelRecord]:
+    """Return a channel and its number."""
+    fields = Fields(content)
+    number, schema = fields.take("HH")
+    return number, ChannelRecord(fields.text(), schema, fields.text())
+
+
+def parse_chunk_head(content: bytes | memoryview, offset: int) -> Chunk:
+    """Return the chunk whose record begins at ``offset``."""
+    fields = Fields(content)
+    start_ns, end_ns, uncompressed, _ = fields.take("QQQI")
+    compression = fields.text()
+    (size,) = fields.take("Q")
+    data_offset = offset + RECORD_HEAD + CHUNK_HEAD + len(compression.encode())
+    return Chunk(offset, data_offset, size, compression, uncompressed, start_ns, end_ns)
+
+
+def parse_chunk_index(content: bytes | memoryview) -> Chunk:
+    """Return a chunk as the summary describes it."""
+    try:
+        start_ns, end_ns, offset, length, map_bytes = _CHUNK_INDEX_HEAD.unpack_from(content)
+        at = _CHUNK_INDEX_HEAD.size + map_bytes
+        index = dict(_CHANNEL_OFFSET.iter_unpack(content[_CHUNK_INDEX_HEAD.size : at]))
+        index_bytes, name_bytes = _CHUNK_INDEX_MIDDLE.unpack_from(content, at)
+        at += _CHUNK_INDEX_MIDDLE.size + name_bytes
+        compression = bytes(content[at - name_bytes : at]).decode(errors="backslashreplace")
+        size, uncompressed = _CHUNK_INDEX_TAIL.unpack_from(content, at)
+    except struct.error:
+        raise DamageError("a record ends before its fields do") from None
+    data_offset = offset + RECORD_HEAD + CHUNK_HEAD + name_bytes
+    if data_offset + size != offset + length:
+        raise DamageError("a chunk index contradicts itself")
+    return Chunk(offset, data_offset, size, compression, uncompressed, start_ns, end_ns, index or None, index_bytes)
+
+
+def parse_statistics(content: bytes | memoryview) -> Statistics:
+    """Return the counts of the file."""
+    fields = Fields(content)
+    messages, _, _, _, _, chunks, start_ns, end_ns, map_bytes = fields.take("QHIIIIQQI")
+    return Statistics(messages, chunks, start_ns, end_ns, fields.pairs(map_bytes))
+
+
+def index_entries(record: bytes | memoryview, channel: int) -> Int64Array:
+    """Return a channel's message index as (log time, offset), shape (N, 2)."""
+    if len(record) < _INDEX_HEAD.size:
+        raise DamageError("a message index is not where it should be")
+    opcode, _, named, size = _INDEX_HEAD.unpack_from(record)
+    if opcode != OP_MESSAGE_INDEX or len(record) < _INDEX_HEAD.size + size:
+        raise DamageError("a message index is not where it should be")
+    if size % 16 or named != channel:
+        raise DamageError("a message index contradicts itself")
+    return np.frombuffer(record, "<i8", size // 8, RECORD_HEAD + 6).reshape(-1, 2)
+
+
+def index_messages(
+    data: bytes, records: Int64Array, ends: Int64Array, channels: Int64Array
+) -> tuple[NDArray[np.bool_], Int64Array, Int64Array, Int64Array]:
+    """Read several message indexes at once.
+
+    Parameters
+    ----------
+    data
+        Bytes that hold them.
+    records, ends, channels
+        Of each index, shape (R,), where it begins, before which byte it must end, and of which channel it should be.
+
+    Returns
+    -------
+    right
+        Which of the indexes are what they should be, shape (R,).
+    record, log_time_ns, offset
+        Of each message of those, shape (N,), the number of its index, its log time and its offset in the chunk.
+    """
+    whole = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
+    right, size = np.zeros(len(records), np.bool_), np.zeros(len(records), np.int64)
+    if len(whole):
+        at = records[whole]
+        size[whole] = gathered(data, at + RECORD_HEAD + 2, "u4")
+        right[whole] = (
+            (np.frombuffer(data, np.uint8)[at] == OP_MESSAGE_INDEX)
+            & (gathered(data, at + 1, "i8") == size[whole] + 6)  # padding is allowed, but so would a broken count look
+            & (gathered(data, at + RECORD_HEAD, "u2") == channels[whole])
+            & (size[whole] % 16 == 0)
+            & (at + RECORD_HEAD + 6 + size[whole] <= ends[whole])
+        )
+    counts = np.where(right, size // 16, 0)
+    record = np.repeat(np.arange(len(records)), counts)
+    within = np.arange(len(record)) - np.repeat(np.cumsum(counts) - counts, counts)
+    places = records[record] + (RECORD_HEAD + 6) + 16 * within
+    if not len(places):
+        return right, record, places, places
+    return right, record, gathered(data, places, "i8"), gathered(data, places + 8, "i8")
+
+
+def message_heads(data: memoryview, offsets: Int64Array) -> NDArray[np.void]:
+    """Return the heads of the messages that begin at ``offsets``; each must lie within the data."""
+    count = max(len(data) - _MESSAGE.itemsize + 1, 0)
+    windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
+    return windows[offsets].view(_MESSAGE)
+
+
+def borne_out(heads: NDArray[np.void], entries: Entries) -> NDArray[np.bool_]:
+    """Return at which index entries there really is a message of that channel and log time that ends before the next, shape (N,)."""
+    lengths = heads["length"]
+    found: NDArray[np.bool_] = (
+        (heads["opcode"] == OP_MESSAGE)
+        & (heads["channel"] == entries.channel)
+        & (heads["log_time_ns"] == entries.log_time_ns)
+        & (lengths >= MESSAGE_HEAD)
+        & (lengths <= entries.end - entries.offset - RECORD_HEAD)
+    )
+    return found
+
+
+def message_blocks(
+    data: memoryview, offsets: Int64Array, heads: NDArray[np.void], ordinals: Int64Array
+) -> list[MessageBlock]:
+    """Return messages as one block a channel; ``offsets``, ``heads`` and ``ordinals`` have shape (N,)."""
+    channels = heads["channel"]
+    if (channels[1:] < channels[:-1]).any():
+        order = np.argsort(channels, kind="stable")
+        offsets, heads, ordinals = offsets[order], heads[order], ordinals[order]
+    return blocks_by_channel(
+        data,
+        heads["channel"],
+        offsets + (RECORD_HEAD + MESSAGE_HEAD),
+        heads["length"] - MESSAGE_HEAD,
+        log_time_ns=heads["log_time_ns"].astype(np.int64),
+        publish_time_ns=heads["publish_time_ns"].astype(np.int64),
+        ordinals=ordinals,
+    )
+
+
+def record_offsets(data: bytes | memoryview, most: int) -> tuple[Int64Array, int]:
+    """Walk the records in ``data`` and return where each begins, and where they end: one that does not fit, or is one too many, ends it."""
+    size, position, found = len(data), 0, array("q")
+    length_at = struct.Struct("<Q").unpack_from
+    while position + RECORD_HEAD <= size and len(found) <= most:
+        end = position + RECORD_HEAD + length_at(data, position + 1)[0]
+        if end > size:
+            break
+        found.append(position)
+        position = end
+    return np.array(found, np.int64), position
+
+
+def message_offsets(data: memoryview, records: Int64Array) -> Int64Array:
+    """Return those of the records that are whole messages."""
+    if not len(records):
+        return records
+    messages: Int64Array = records[np.frombuffer(data, np.uint8)[records] == OP_MESSAGE]
+    return messages[gathered(data, messages + 1, "i8") >= MESSAGE_HEAD] if len(messages) else messages

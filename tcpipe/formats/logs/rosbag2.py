@@ -1,0 +1,267 @@
+"""ROS 2 bags: a directory of .db3 or .mcap files with metadata.yaml, split, and compressed by file or by message."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, Channel, LogPart, MessageBlock, is_bomb, no_room
+from tcpipe.logs.topics import Damage
+
+METADATA = "metadata.yaml"
+STORAGE_SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+MAX_FILES = 4096
+"""A bag of more files is refused: all are open at once. Split every minute, this is three days."""
+MAX_METADATA_BYTES = 1 << 20
+"""A longer metadata.yaml is passed over: its parser takes ten seconds for so much, and a bag is read as well without it."""
+
+_COPY_BYTES = 1 << 22
+_LISTED = 10
+_PART = re.compile(r"(_\d+)?\.(db3|mcap)(\.zstd)?$")
+"""What the names of the files of a bag end with, and differ in."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rosbag2Files:
+    """The storage files of a bag in order, what is wrong with their list, and how many messages metadata.yaml counts, also by topic."""
+
+    paths: tuple[Path, ...]
+    damage: tuple[Damage, ...]
+    message_count: int | None = None
+    topic_counts: Mapping[str, int] = field(default_factory=dict)
+
+
+def rosbag2_files(directory: Path) -> Rosbag2Files:
+    """Return the storage files of a bag directory, by metadata.yaml, or by their names where it is missing.
+
+    Raises
+    ------
+    LogError
+        The directory holds no ROS 2 bag, or cannot be read.
+    """
+    try:
+        present = storage_files(directory)
+    except OSError as error:
+        raise LogError(f"{directory}: it cannot be read ({error.strerror})") from None
+    if len(present) > MAX_FILES:
+        raise LogError(f"{directory}: it holds {len(present)} files; bags of up to {MAX_FILES} are read")
+    information = _bag_information(directory / METADATA)
+    return _by_name(directory, present) if information is None else _by_metadata(directory, present, information)
+
+
+def _by_name(directory: Path, present: tuple[Path, ...]) -> Rosbag2Files:
+    kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in present}
+    what = _trouble(directory / METADATA)
+    if len(kinds) != 1:
+        found = "no .db3 or .mcap file is there" if not kinds else "both .db3 and .mcap files are there"
+        raise LogError(f"{directory}: not a ROS 2 bag: {METADATA} {what}, and {found}")
+    if len({_PART.sub("", path.name) for path in present}) > 1:
+        names = ", ".join(path.name for path in present[:_LISTED]) + (", …" if len(present) > _LISTED else "")
+        raise LogError(
+            f"{directory}: not a ROS 2 bag: {METADATA} {what}, and its files are not named as parts of one ({names}); "
+            "give one of them"
+        )
+    why = f"{METADATA} {what}; files are read in the order of their names"
+    return Rosbag2Files(present, (Damage(directory.name, why, messages_lost=0),))
+
+
+def _by_metadata(directory: Path, present: tuple[Path, ...], information: Mapping[str, Any]) -> Rosbag2Files:
+    named = information.get("relative_file_paths")
+    if isinstance(named, list) and len(named) > MAX_FILES:
+        raise LogError(f"{directory}: {METADATA} names {len(named)} files; bags of up to {MAX_FILES} are read")
+    listed = [Path(name).name for name in named if isinstance(name, str)] if isinstance(named, list) else []
+    paths, damage = [], []
+    for name in dict.fromkeys(listed):
+        path = next((p for p in (directory / name, directory / f"{name}.zstd") if _is_file(p)), None)
+        if path is None:
+            damage.append(Damage(f"{directory.name}/{name}", f"{METADATA} names this file, but it is not there"))
+        else:
+            paths.append(path)
+    taken = set(paths)
+    for path in present:
+        if path not in taken and path.with_name(path.name.removesuffix(".zstd")) not in taken:
+            damage.append(
+                Damage(
+                    f"{directory.name}/{path.name}",
+                    f"{METADATA} does not name this file; it is read all the same",
+                    messages_lost=0,
+                )
+            )
+            paths.append(path)
+    if not paths:
+        names = ", ".join(listed[:_LISTED]) + (", …" if len(listed) > _LISTED else "")
+        raise LogError(f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({names or 'none'})")
+    count = information.get("message_count")
+    return Rosbag2Files(tuple(paths), tuple(damage), count if _is_count(count) else None, _topic_counts(information))
+
+
+def _is_file(path: Path) -> bool:
+    with suppress(OSError):  # a name may be longer than any file's
+        return path.is_file()
+    return False
+
+
+def _is_count(value: object) -> bool:
+    return isinstance(value, int) and 0 <= value < 1 << 63
+
+
+def _topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
+    """Return how many messages metadata.yaml counts of each topic; nothing where it is not as the recorder writes it."""
+    counts: dict[str, int] = {}
+    with suppress(KeyError, TypeError):
+        for entry in information["topics_with_message_count"]:
+            name, count = entry["topic_metadata"]["name"], entry["message_count"]
+            if isinstance(name, str) and _is_count(count):
+                counts[name] = counts.get(name, 0) + count
+    return counts
+
+
+def storage_files(directory: Path) -> tuple[Path, ...]:
+    """Return the .db3 and .mcap files directly in a directory, compressed ones too, by name with numbers in order."""
+    files = [
+        path for path in directory.iterdir() if path.name.endswith(STORAGE_SUFFIXES) and not path.name.startswith(".")
+    ]
+    return tuple(sorted((path for path in files if path.is_file()), key=_natural))
+
+
+def is_one_bag(directory: Path) -> bool:
+    """Return whether a directory is one ROS 2 bag: by metadata.yaml, or by files named after it as the recorder does."""
+    if (directory / METADATA).is_file():
+        return True
+    files = storage_files(directory)
+    kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in files}
+    named = re.compile(re.escape(directory.name) + r"(_\d+)?\.(db3|mcap)(\.zstd)?")
+    return len(kinds) == 1 and all(named.fullmatch(path.name) for path in files)
+
+
+def decompressed_file(path: Path, directory: Path) -> Path:
+    """Decompress a zstd file into ``directory`` and return its copy; of a cut one, as much as can be had."""
+    copy = Path(directory, path.name.removesuffix(".zstd"))
+    size, written = path.stat().st_size, 0
+    try:
+        with copy.open("wb") as target:
+            for block in _decompressed_blocks(path):
+                target.write(block)
+                written += len(block)
+                if is_bomb(size, written):
+                    raise LogError(f"{path}: {size} bytes hold more than {written}; it is taken for a bomb, not a log")
+    except OSError as error:
+        raise LogError(f"{path}: it cannot be decompressed into a copy ({no_room(error) or error.strerror})") from None
+    return copy
+
+
+def _decompressed_blocks(path: Path) -> Iterator[bytes]:
+    """Yield what a zstd file holds; where it is cut or damaged, or the disk fails, it ends: what follows sees that."""
+    with suppress(OSError), pa.input_stream(str(path), compression="zstd") as stream:
+        while block := stream.read(_COPY_BYTES):
+            yield block
+
+
+class MessageDecompressing:
+    """A part whose messages are zstd frames each (``compression_mode: MESSAGE``); others pass as they are."""
+
+    def __init__(self, part: LogPart) -> None:
+        self._part = part
+        self.name, self.damage = part.name, part.damage
+
+    @property
+    def channels(self) -> Mapping[int, Channel]:
+        """Return every channel by its number."""
+        return self._part.channels
+
+    @property
+    def unchecked(self) -> str:
+        """What was read that no checksum covers."""
+        return self._part.unchecked
+
+    def close(self) -> None:
+        """Close the file."""
+        self._part.close()
+
+    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
+        """Yield the messages of the wanted channels, decompressed."""
+        compressed: dict[int, bool] = {}
+        for block in self._part.blocks(wanted, threads=threads):
+            if block.channel not in compressed:
+                compressed[block.channel] = _is_compressed(block)
+            yield self._decompressed(block) if compressed[block.channel] else block
+
+    def _decompressed(self, block: MessageBlock) -> MessageBlock:
+        payloads, kept = [], []
+        for row, (offset, length) in enumerate(zip(block.offsets.tolist(), block.lengths.tolist(), strict=True)):
+            payload = _unframed(block.buffer[offset : offset + length])
+            if payload is not None:
+                payloads.append(payload)
+                kept.append(row)
+        lost = len(block.offsets) - len(kept)
+        if lost:
+            topic = self.channels[block.channel].topic
+            self.damage[Damage(self.name, "messages do not decompress", topic=topic, messages_lost=lost)] = None
+        lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+        rows = np.array(kept, np.int64)
+        return MessageBlock(
+            block.channel,
+            memoryview(b"".join(payloads)),
+            np.cumsum(lengths) - lengths,
+            lengths,
+            block.log_time_ns[rows],
+            block.publish_time_ns[rows],
+            block.ordinal[rows],
+            None,
+        )
+
+
+def _is_compressed(block: MessageBlock) -> bool:
+    """Return whether the first message begins like a zstd frame, as no CDR message can."""
+    return bool(len(block.offsets)) and bytes(block.buffer[block.offsets[0] : block.offsets[0] + 4]) == ZSTD_MAGIC
+
+
+def _unframed(frame: memoryview) -> bytes | None:
+    pieces: list[bytes] = []
+    found = 0
+    try:
+        with pa.CompressedInputStream(pa.BufferReader(pa.py_buffer(frame)), "zstd") as stream:
+            while piece := stream.read(_COPY_BYTES):
+                pieces.append(piece)
+                found += len(piece)
+                if found > MAX_CHUNK_BYTES or is_bomb(len(frame), found, whole=True):
+                    return None
+    except OSError:
+        return None
+    return b"".join(pieces)
+
+
+def _bag_information(path: Path) -> dict[str, Any] | None:
+    """Return what metadata.yaml says of the bag; None where it is missing or broken, as a recorder that is killed leaves it."""
+    try:
+        if path.stat().st_size > MAX_METADATA_BYTES:
+            return None
+        document = YAML(typ="safe").load(path.read_text(errors="replace"))
+        information = document["rosbag2_bagfile_information"]
+    except (YAMLError, KeyError, TypeError, ValueError, OSError, RecursionError):
+        return None
+    return information if isinstance(information, dict) else None
+
+
+def _trouble(path: Path) -> str:
+    """Say why a metadata.yaml tells nothing."""
+    if not path.is_file():
+        return "is missing"
+    size = path.stat().st_size
+    return f"has {size} bytes, more than {MAX_METADATA_BYTES}" if size > MAX_METADATA_BYTES else "is broken"
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(piece), "") if piece.isdigit() else (-1, piece) for piece in re.split(r"(\d+)", path.name)]

@@ -1,0 +1,245 @@
+"""Building a map: rasters that need not share grid, resolution or CRS, put on one common grid, window by window."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tcpipe.errors import MapError
+from tcpipe.formats.atomic import PlaceState, atomic_directory
+from tcpipe.formats.maps.class_table import read_class_scheme
+from tcpipe.formats.maps.layer_building import Layer, RasterLayer, shards_of
+from tcpipe.formats.maps.map_files import SHARD_PX, MapFile, MapWriter, open_map
+from tcpipe.formats.maps.mosaic import Raster, open_raster
+from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
+from tcpipe.formats.seals import write_checksums
+from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, ClassTable, named_scheme
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.placement import Footing, choose_crs, choose_grid, projection_to
+from tcpipe.terrain.projection import parse_crs
+
+Files = Path | Sequence[Path]
+"""One file of a layer, or all; the last lies on top."""
+
+
+@dataclass(frozen=True, slots=True)
+class MapSummary:
+    """What `build_map` made.
+
+    ``covered`` is the share of the grid's pixels with data, by layer; ``class_share`` the share of each class among pixels with one.
+    """
+
+    name: str
+    path: Path
+    grid: MapGrid
+    classes: ClassTable
+    layers: tuple[str, ...]
+    covered: dict[str, float]
+    height_min_m: float
+    height_max_m: float
+    class_share: dict[str, float]
+    warnings: tuple[str, ...]
+
+
+def build_map(
+    out_path: Path,
+    *,
+    name: str,
+    height: Files,
+    ortho: Files = (),
+    terrain: Files = (),
+    classes: Path | None = None,
+    agreed: ClassScheme | None = None,
+    crs: str | None = None,
+    pitch_m: float | None = None,
+    inputs: Mapping[str, Any] | None = None,
+    instead_of: PlaceState | None = None,
+    look: Callable[[MapFile, Path], None] | None = None,
+) -> MapSummary:
+    """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
+
+    Parameters
+    ----------
+    out_path
+        Where the Zarr directory goes; one that is there is replaced once the new one is complete.
+    name
+        The map's name.
+    height, ortho, terrain
+        Rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid (`mosaic`); terrain also as
+        GeoJSON polygons (`terrain_polygons`).
+    classes
+        Class table (CSV or TOML); None takes ``agreed``, else the paper's seven classes, and where the terrain raster names its values,
+        those names say which class each is.
+    agreed
+        The classes of the store's other maps, which this one must share.
+    crs
+        The map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
+    pitch_m
+        Side of a map pixel [m]; None takes the finest raster's.
+    inputs
+        What the caller wants to know the map by later; kept in its facts.
+    instead_of
+        What it may replace; None: whatever is there.
+    look
+        Is given the finished map, and where it lies, before it appears at its place.
+
+    Raises
+    ------
+    MapError
+        A raster cannot be placed or read, or holds nothing here; the class table is not the store's: one line each.
+    StoreError
+        The map cannot be written, or another process has put something else there.
+    """
+    given = {"height": height, "ortho": ortho, "terrain": terrain}
+    paths = {role: [files] if isinstance(files, Path) else list(files) for role, files in given.items() if files}
+    drawn = paths.pop("terrain") if "terrain" in paths and is_drawn(paths["terrain"]) else []
+    with ExitStack() as stack:
+        rasters = _open_all(stack, paths)
+        scheme, origin = _choose_scheme(classes, agreed, rasters.get("terrain"))
+        wanted = parse_crs(crs, where="--crs") if crs else None
+        footings = _place_all(rasters, crs)
+        map_crs = choose_crs(footings["height"], wanted)
+        others = [footings[role] for role in rasters if role != "height"]
+        grid = choose_grid(footings["height"], others, map_crs, pitch_m)
+        layers: dict[str, Layer] = {
+            role: RasterLayer(raster, footings[role], projection_to(footings[role], map_crs), scheme)
+            for role, raster in rasters.items()
+        }
+        if drawn:
+            layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
+        with atomic_directory(out_path, instead_of=instead_of) as half:
+            writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=tuple(layers))
+            _write_layers(writer, layers, grid)
+            _refuse_empty(layers)
+            summary = _summary(out_path, name, grid, scheme.table, layers)
+            writer.finish({**_facts(summary, layers), "classes_from": origin, "inputs": dict(inputs or {})})
+            write_checksums(half)
+            if look is not None:
+                look(open_map(half), half)
+    return summary
+
+
+def _write_layers(writer: MapWriter, layers: Mapping[str, Layer], grid: MapGrid) -> None:
+    for role, layer in layers.items():
+        for row0, col0, rows, cols in shards_of(grid, SHARD_PX):
+            shard = layer.shard(grid, row0, col0, rows, cols)
+            if layer.tally.count(layer, shard):
+                writer.write(role, row0, col0, shard)
+
+
+def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Raster | None) -> tuple[ClassScheme, str]:
+    """Return the classes and where they come from: ``file``, ``names`` of the raster's values, ``store`` or ``default``."""
+    if classes is not None:
+        return _scheme_of_file(classes, agreed), "file"
+    scheme, origin = (PAPER_SCHEME, "default") if agreed is None else (agreed, "store")
+    if terrain is None or not terrain.names:
+        return scheme, origin
+    named = named_scheme(terrain.names, scheme.table)
+    if named is None:
+        theirs = ", ".join(dict.fromkeys(terrain.names.values()))
+        ours = ", ".join(entry.name for entry in scheme.table.classes)
+        raise MapError(
+            f"{terrain.label}: none of its class names ({theirs}) is in the class table ({ours}); "
+            "say with --classes what its values mean"
+        )
+    return named, "names"
+
+
+def _scheme_of_file(classes: Path, agreed: ClassScheme | None) -> ClassScheme:
+    scheme = read_class_scheme(classes)
+    different = () if agreed is None else scheme.table.differences(agreed.table)
+    if different:
+        raise MapError(
+            f"{classes}: the class table is not the one of the store's other maps; take theirs, or keep this map in another store",
+            *(f"{classes}: {clause}" for clause in different),
+        )
+    return scheme
+
+
+def _open_all(stack: ExitStack, paths: Mapping[str, Sequence[Path]]) -> dict[str, Raster]:
+    rasters: dict[str, Raster] = {}
+    problems: list[str] = []
+    for role, files in paths.items():
+        try:
+            rasters[role] = stack.enter_context(open_raster(files, role))
+        except MapError as error:
+            problems += error.problems
+    if problems:
+        raise MapError(*problems)
+    return rasters
+
+
+def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Footing]:
+    footings: dict[str, Footing] = {}
+    problems: list[str] = []
+    for role, raster in rasters.items():
+        text = raster.crs or crs
+        if text is None:
+            problems.append(f"{raster.label}: has no CRS; if you know which one it is in, say so with --crs EPSG:n")
+            continue
+        try:
+            found = parse_crs(text, where=raster.label if raster.crs else "--crs")
+        except MapError as error:
+            problems += error.problems
+            continue
+        footings[role] = Footing(found, raster.affine, raster.rows, raster.cols, raster.label)
+    if problems:
+        raise MapError(*dict.fromkeys(problems))
+    return footings
+
+
+def _refuse_empty(layers: Mapping[str, Layer]) -> None:
+    problems = []
+    for role, layer in layers.items():
+        if layer.tally.pixels:
+            continue
+        if role == "height":
+            problems.append(f"{layer.label}: every pixel is nodata")
+        else:
+            over = layers["height"].name
+            problems.append(layer.nothing() or f"{layer.label}: has no data anywhere on the height raster {over}")
+    if problems:
+        raise MapError(*problems)
+
+
+def _notes(layers: Mapping[str, Layer], covered: Mapping[str, float]) -> tuple[str, ...]:
+    notes: list[str] = []
+    for role, layer in layers.items():
+        notes += layer.notes()
+        if covered[role] < 0.5 * covered["height"]:
+            notes.append(f"{layer.name}: covers {covered[role]:.0%} of the map; samples need every layer")
+    return tuple(notes)
+
+
+def _summary(path: Path, name: str, grid: MapGrid, classes: ClassTable, layers: Mapping[str, Layer]) -> MapSummary:
+    counts = layers["terrain"].tally.by_class if "terrain" in layers else np.zeros(256, np.int64)
+    total = max(int(counts[1:].sum()), 1)
+    covered = {role: layer.tally.pixels / (grid.rows * grid.cols) for role, layer in layers.items()}
+    return MapSummary(
+        name=name,
+        path=path,
+        grid=grid,
+        classes=classes,
+        layers=tuple(layers),
+        covered=covered,
+        height_min_m=layers["height"].tally.low,
+        height_max_m=layers["height"].tally.high,
+        class_share={entry.name: float(counts[entry.id] / total) for entry in classes.classes if counts[entry.id]},
+        warnings=_notes(layers, covered),
+    )
+
+
+def _facts(summary: MapSummary, layers: Mapping[str, Layer]) -> dict[str, Any]:
+    return {
+        "sources": {role: layer.name for role, layer in layers.items()},
+        "covered": summary.covered,
+        "height_min_m": summary.height_min_m,
+        "height_max_m": summary.height_max_m,
+        "class_share": summary.class_share,
+        "warnings": list(summary.warnings),
+    }

@@ -1,0 +1,562 @@
+"""GeoTIFF, JPEG 2000, ERDAS Imagine and VRT, as windows of numbers with their validity: the one home of rasterio.
+
+GDAL opens whatever a file's content says, also what is on another disk or another continent. So a user's file is looked at first: its
+beginning names its one driver, what lies beside it must be plain too, and of a VRT GDAL sees only what `vrt` lets through.
+
+A raster is opened *for a role* (height, ortho, terrain) and refused at once, in one line, if it cannot play it: no place on the
+earth, placed by control points only, wrong bands, wrong numbers. Pixel-is-point tags, south-up and rotated affines, scale and offset
+tags, units, palettes, alpha, mask bands, nodata tags and NaN are dealt with here; what leaves is metres, grey from 0 to 255, or raw
+class values, each with a mask.
+"""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rasterio
+import rasterio.shutil
+from numpy.typing import NDArray
+from pyproj import CRS
+from rasterio.enums import ColorInterp
+from rasterio.errors import NotGeoreferencedWarning, RasterioError
+from rasterio.features import rasterize
+from rasterio.io import MemoryFile
+from rasterio.windows import Window
+
+from tcpipe.errors import MapError
+from tcpipe.formats.atomic import atomic_file
+from tcpipe.formats.maps.value_names import value_names
+from tcpipe.formats.maps.vrt import checked_vrt, is_vrt, root_name
+from tcpipe.terrain.layers import LUMA_RGB
+
+ROLES = ("height", "ortho", "terrain")
+
+_METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
+_METRES |= {"cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "mm": 0.001, "dm": 0.1, "km": 1000.0}
+_METRES |= {"ft": 0.3048, "foot": 0.3048, "feet": 0.3048, "us-ft": 1200.0 / 3937.0, "us survey foot": 1200.0 / 3937.0}
+
+_CONFIG = {
+    "GDAL_CACHEMAX": 256,  # [MB] decoded blocks: a strip of a wide raster is wanted by many windows
+    "GDAL_DISABLE_READDIR_ON_OPEN": "TRUE",  # what lies beside is asked for by name, as `_refuse_beside` does
+    "GDAL_VRT_ENABLE_PYTHON": "NO",
+    "GDAL_PAM_ENABLED": "YES",
+    "CPL_VSIL_CURL_ALLOWED_FILENAME": "none",
+}
+"""How GDAL is set up wherever a raster of the user's is opened."""
+
+_HFA = b"EHFA_HEADER_TAG\0"
+_DRIVERS = {
+    **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), "GTiff"),
+    **dict.fromkeys((b"\0\0\0\x0cjP  \r\n\x87\n", b"\xff\x4f\xff\x51"), "JP2OpenJPEG"),
+    _HFA: "HFA",
+}
+"""Drivers by what a file begins with. All have a zero byte there, which ends the text that GDAL's other drivers look into."""
+
+_OTHERS = {
+    b"\x89PNG": "PNG",
+    b"\xff\xd8\xff": "JPEG",
+    b"\x89HDF": "HDF5 or netCDF 4",
+    b"CDF": "netCDF",
+    b"SQLite format 3": "a GeoPackage or another SQLite database",
+    b"PK": "a zip archive",
+    b"\x1f\x8b": "compressed by gzip",
+    b"ncols": "an ASCII grid",
+    b"NCOLS": "an ASCII grid",
+    b"{": "JSON",
+}
+
+_REDIRECTIONS = ("OVERVIEWS", "ProxyOverviewRequest")
+"""Domains of tags, in a GeoTIFF or in the statistics beside a raster, that tell GDAL to open another file, or an address."""
+
+_MAX_OPEN = 32
+"""Files that are open at one time."""
+
+_MAX_BLOCK_BYTES = 256_000_000
+"""What is decoded at one time: a tile or a strip of a raster."""
+
+_MAX_STATISTICS_BYTES = 16_000_000
+
+_OPAQUE = 1
+"""A pixel is there if its mask or alpha is at least this: 16-bit alpha is often written as 255, which is almost transparent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """How a file is opened: by its one driver, and as the document that stands for it if it is a VRT; the files it is made of."""
+
+    path: Path
+    driver: str
+    document: str | None
+    files: tuple[Path, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Tile:
+    """What one raster file is that can play its role; `TilePool.read` reads it.
+
+    ``affine`` is (a, b, c, d, e, f) of x = a·col + b·row + c, y = d·col + e·row + f at pixel *corners*; ``crs`` is WKT, or empty where
+    the file has none; ``warnings`` are plain sentences.
+    """
+
+    path: Path
+    role: str
+    crs: str
+    affine: tuple[float, float, float, float, float, float]
+    rows: int
+    cols: int
+    kind: str
+    """Type and bands, which the tiles of one layer share."""
+    warnings: tuple[str, ...]
+    names: Mapping[int, str]
+    """Names of values, from the raster attribute table or the category names; empty where there are none."""
+    source: Source = field(repr=False)
+    dtype: str
+    """Type of the values that are read: the file's for terrain, else float64."""
+    bands: tuple[int, ...]
+    scale: tuple[float, float]
+    """Scale and offset to metres."""
+    opaque: NDArray[np.bool_] | None
+    """Which indices of a palette can be seen."""
+
+
+@dataclass(slots=True)
+class TilePool:
+    """Files that are open: a few of them, those that were read last."""
+
+    _open: dict[Path, Any] = field(default_factory=dict)
+
+    def read(self, tile: Tile, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
+        """Return a window inside a tile, and which of its pixels have data.
+
+        Values are float64 metres (height), float64 grey from 0 to 255 (ortho), or raw integers (terrain).
+
+        Raises
+        ------
+        MapError
+            The window's pixels are damaged, or the file is gone.
+        """
+        window = Window(col0, row0, col1 - col0, row1 - row0)
+        dataset = self._dataset(tile)
+        try:
+            raw = dataset.read(tile.bands, window=window)
+            valid = dataset.dataset_mask(window=window) >= _OPAQUE
+        except RasterioError as error:
+            raise MapError(
+                f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: {_reason(error)}"
+            ) from error
+        if tile.role == "terrain":
+            return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
+        values = _grey(dataset, tile.bands, raw) if tile.role == "ortho" else raw[0] * tile.scale[0] + tile.scale[1]
+        return values, valid & np.isfinite(values)
+
+    def _dataset(self, tile: Tile) -> Any:
+        found = self._open.pop(tile.path, None)
+        if found is None:
+            if len(self._open) >= _MAX_OPEN:
+                self._open.pop(next(iter(self._open))).close()
+            found = _open_as(tile.source)
+        self._open[tile.path] = found
+        return found
+
+    def close(self) -> None:
+        """Close every file."""
+        for dataset in self._open.values():
+            dataset.close()
+        self._open.clear()
+
+
+def _grey(dataset: Any, bands: tuple[int, ...], raw: NDArray[Any]) -> NDArray[np.float64]:
+    if dataset.colorinterp[bands[0] - 1] == ColorInterp.palette:
+        return np.asarray(_palette_grey(dataset.colormap(bands[0]))[raw[0]])
+    weights = np.array(LUMA_RGB if len(bands) == 3 else (1.0,)) * (255.0 / np.iinfo(raw.dtype).max)
+    return np.asarray(np.tensordot(weights, raw.astype(np.float64), 1))
+
+
+@contextmanager
+def tile_pool() -> Iterator[TilePool]:
+    """Read tiles, with GDAL set up as `_CONFIG` says."""
+    pool = TilePool()
+    with rasterio.Env(**_CONFIG):
+        try:
+            yield pool
+        finally:
+            pool.close()
+
+
+def read_tile(path: Path, role: str) -> Tile:
+    """Return what a raster file is that is to play a role.
+
+    Raises
+    ------
+    MapError
+        It is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
+    """
+    with rasterio.Env(**_CONFIG):
+        source = _checked(path)
+        with _open_as(source) as dataset:
+            _refuse_unplaced(dataset, path)
+            bands, notes = _choose_bands(dataset, path, role)
+            scale, more = _scaling(dataset, path, role, bands)
+            palette = role == "terrain" and dataset.colorinterp[bands[0] - 1] == ColorInterp.palette
+            colours = ", ".join(dataset.colorinterp[band - 1].name for band in bands)
+            return Tile(
+                path=path,
+                role=role,
+                crs=dataset.crs.to_wkt() if dataset.crs else "",
+                affine=tuple(dataset.transform)[:6],
+                rows=dataset.height,
+                cols=dataset.width,
+                kind=f"{dataset.dtypes[bands[0] - 1]} ({colours})",
+                warnings=(*notes, *more),
+                names=value_names(_described(dataset), bands[0]) if role == "terrain" else {},
+                source=source,
+                dtype=dataset.dtypes[bands[0] - 1] if role == "terrain" else "float64",
+                bands=bands,
+                scale=scale,
+                opaque=np.isfinite(_palette_grey(dataset.colormap(bands[0]))) if palette else None,
+            )
+
+
+def raster_files(path: Path) -> tuple[Path, ...]:
+    """Return every file that a raster is made of: itself, what lies beside it (masks, world files, statistics), what a VRT names.
+
+    Raises
+    ------
+    MapError
+        It is no raster of a kind that is read.
+    """
+    with rasterio.Env(**_CONFIG):
+        return _checked(path).files
+
+
+def _checked(path: Path, nesting: int = 0, met: dict[Path, Source] | None = None) -> Source:
+    """Return how a user's file is opened, once neither it nor what lies beside it nor what it names reaches elsewhere."""
+    met = {} if met is None else met
+    if path in met:
+        return met[path]
+    driver = _driver(path)
+    if driver != "VRT":
+        met[path] = Source(path, driver, None, _plain_files(path, driver))
+        return met[path]
+    named: list[Path] = []
+
+    def source(place: Path, depth: int) -> str | None:
+        found = _checked(place, depth, met)
+        named.extend(found.files)
+        return found.document
+
+    for mask in (path.with_name(f"{path.name}.msk"), path.with_name(f"{path.name}.MSK")):
+        if mask.is_file():
+            raise MapError(f"{mask}: the mask beside a VRT is not followed; write both out: {_rewrite(path)}")
+    document = checked_vrt(path, source, nesting=nesting)
+    met[path] = Source(path, driver, document, tuple(dict.fromkeys((path, *named))))
+    return met[path]
+
+
+def _driver(path: Path) -> str:
+    """Return the driver of a file by what it begins with: that, not its name, is what GDAL goes by."""
+    head = _begins(path)
+    driver = next(
+        (driver for start, driver in _DRIVERS.items() if head.startswith(start)), "VRT" if is_vrt(head) else None
+    )
+    if driver is None:
+        raise MapError(
+            f"{path}: is {_what(head)}, not a raster that is read; wanted GeoTIFF, JPEG 2000, ERDAS Imagine or VRT "
+            f"({_rewrite(path)}){_or_polygons(path)}"
+        )
+    return driver
+
+
+def _begins(path: Path) -> bytes:
+    try:
+        with path.open("rb") as stream:
+            return stream.read(4096)
+    except FileNotFoundError:
+        raise MapError(f"{path}: there is no such file") from None
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def _what(head: bytes) -> str:
+    """Return what a file is, for whoever gave it."""
+    known = next((name for start, name in _OTHERS.items() if head.startswith(start)), None)
+    root = root_name(head)
+    return known or (f"XML ({root[:40]})" if root else "something else" if head else "empty")
+
+
+def _plain_files(path: Path, driver: str) -> tuple[Path, ...]:
+    """Return a raster's files, itself first; refuse one that names others elsewhere, has such beside it, or does not fit into memory."""
+    _refuse_beside(path)
+    with _open_as(Source(path, driver, None, ())) as dataset:
+        if any(dataset.tags(ns=domain) for domain in _REDIRECTIONS):
+            raise MapError(
+                f"{path}: names another file for its overviews, which is not followed; write it anew: {_rewrite(path)}"
+            )
+        block = max(
+            rows * cols * np.dtype(dtype).itemsize
+            for (rows, cols), dtype in zip(dataset.block_shapes, dataset.dtypes, strict=True)
+        )
+        block *= dataset.count if dataset.profile.get("interleave") == "pixel" else 1
+        if block > _MAX_BLOCK_BYTES:
+            raise MapError(
+                f"{path}: kept in blocks of {block / 1e6:.0f} MB, at most {_MAX_BLOCK_BYTES // 10**6}; "
+                f"write it in tiles: gdal_translate -co TILED=YES -co BIGTIFF=IF_SAFER {path.name} out.tif"
+            )
+        files = {Path(name) for name in dataset.files}
+    strangers = sorted(str(file) for file in files if file.parent != _absolute(path).parent)
+    if strangers:
+        raise MapError(f"{path}: reaches for {strangers[0]}, which does not lie beside it; {_rewrite(path)}")
+    return (path, *sorted(path.with_name(file.name) for file in files if file.name != path.name))
+
+
+def _refuse_beside(path: Path) -> None:
+    """Refuse masks, overviews and statistics beside a raster that GDAL would follow elsewhere, or that are too large."""
+    endings = [ending for lower in (".msk", ".ovr", ".aux") for ending in (lower, lower.upper())]
+    names = [*(f"{path.name}{ending}" for ending in endings), *(f"{path.stem}{ending}" for ending in endings[-2:])]
+    for beside in (path.with_name(name) for name in names if name != path.name):
+        if not beside.is_file() or (beside.suffix.lower() == ".aux" and not _begins(beside).startswith(_HFA)):
+            continue
+        driver = _driver(beside)
+        if driver == "VRT":
+            raise MapError(
+                f"{beside}: GDAL takes it for the mask or overview of {path.name}; wanted a GeoTIFF, got a VRT"
+            )
+        _plain_files(beside, driver)
+    statistics = path.with_name(f"{path.name}.aux.xml")
+    if statistics.is_file() and statistics.stat().st_size > _MAX_STATISTICS_BYTES:
+        size = f"{statistics.stat().st_size / 1e6:.0f} MB"
+        raise MapError(
+            f"{statistics}: {size}, at most {_MAX_STATISTICS_BYTES // 10**6}; write its raster anew: {_rewrite(path)}"
+        )
+
+
+def _rewrite(path: Path) -> str:
+    return f"gdal_translate {path.name} out.tif"
+
+
+def _open_as(source: Source) -> Any:
+    logging.getLogger("rasterio").addHandler(logging.NullHandler())  # GDAL's own lines come with our error
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", NotGeoreferencedWarning)
+        try:
+            return rasterio.open(source.document or _absolute(source.path), driver=source.driver)
+        except RasterioError as error:
+            raise MapError(
+                f"{source.path}: not a raster that GDAL can read; the file is damaged: {_reason(error)}"
+            ) from error
+
+
+def _absolute(path: Path) -> Path:
+    """Return a path that begins at the root: no GDAL prefix, no address."""
+    return path.absolute()
+
+
+def _reason(error: BaseException) -> str:
+    return str(error.__cause__ or error).splitlines()[0][:200]
+
+
+def _or_polygons(path: Path) -> str:
+    vector = path.suffix.lower() in {".shp", ".gpkg", ".kml", ".geojson", ".json"}
+    return "; terrain may also be polygons, exported as .geojson" if vector else ""
+
+
+def _refuse_unplaced(dataset: Any, path: Path) -> None:
+    if dataset.count == 0:
+        raise MapError(f"{path}: the file holds no bands itself; name one of its subdatasets as a GeoTIFF")
+    if dataset.crs is None and dataset.gcps[0]:
+        raise MapError(
+            f"{path}: placed by {len(dataset.gcps[0])} ground control points only; rectify it first (gdalwarp -tps in.tif out.tif)"
+        )
+    if dataset.transform.is_identity:
+        raise MapError(
+            f"{path}: has no georeference; give it one (gdal_edit -a_srs EPSG:n -a_ullr xmin ymax xmax ymin)"
+        )
+    if dataset.transform.is_degenerate:
+        raise MapError(f"{path}: its georeference has pixels without area")
+
+
+def _choose_bands(dataset: Any, path: Path, role: str) -> tuple[tuple[int, ...], list[str]]:
+    colours = {colour: band for band, colour in reversed(list(enumerate(dataset.colorinterp, 1)))}
+    plain = [band for band, colour in enumerate(dataset.colorinterp, 1) if colour != ColorInterp.alpha]
+    names = ", ".join(colour.name for colour in dataset.colorinterp)
+    kinds = {np.dtype(dataset.dtypes[band - 1]) for band in plain}
+    if role == "ortho":
+        rgb = [colours.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
+        palette = dataset.colorinterp[0] == ColorInterp.palette
+        if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
+            raise MapError(f"{path}: ortho is {dataset.dtypes[0]}, wanted 8-bit or 16-bit unsigned")
+        if None not in rgb:
+            more = (
+                [f"{path.name}: bands beyond red, green, blue and alpha are ignored ({names})"]
+                if len(plain) > 3
+                else []
+            )
+            return tuple(band for band in rgb if band is not None), more
+        if len(plain) == 1:
+            return (plain[0],), []
+        if len(plain) == 3:
+            return tuple(plain), [f"{path.name}: bands are not named by colour; taken as red, green, blue"]
+        raise MapError(
+            f"{path}: ortho has {dataset.count} bands ({names}), wanted grey or red, green, blue, and alpha at most"
+        )
+    if len(plain) != 1:
+        raise MapError(f"{path}: {role} has {dataset.count} bands ({names}), wanted one")
+    kind = kinds.pop()
+    if role == "height" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
+        raise MapError(f"{path}: height is a palette of colours, wanted metres")
+    if role == "height" and kind.kind not in "fiu":
+        raise MapError(f"{path}: height is {kind}, wanted floating point or integer metres")
+    if role == "terrain" and kind.kind not in "iu":
+        raise MapError(f"{path}: terrain is {kind}, wanted integer class values")
+    return (plain[0],), []
+
+
+def _scaling(dataset: Any, path: Path, role: str, bands: tuple[int, ...]) -> tuple[tuple[float, float], list[str]]:
+    """Return scale and offset to metres; for other roles, a note that such tags were not applied."""
+    scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
+    if role != "height":
+        tagged = (scale, offset) != (1.0, 0.0)
+        return (1.0, 0.0), [
+            f"{path.name}: scale {scale:g} and offset {offset:g} are not applied to {role}"
+        ] if tagged else []
+    unit = (dataset.units[bands[0] - 1] or "").strip()
+    if unit.lower() not in _METRES:
+        raise MapError(f"{path}: height is in {unit!r}, wanted metres (or cm, mm, ft)")
+    metres = _METRES[unit.lower()] if unit else _vertical_unit_m(dataset)
+    return (scale * metres, offset * metres), []
+
+
+def _vertical_unit_m(dataset: Any) -> float:
+    """Return the unit of a compound CRS's heights [m]; a metre where the CRS says nothing of heights."""
+    crs = CRS.from_wkt(dataset.crs.to_wkt()) if dataset.crs else None
+    vertical = [part for part in crs.sub_crs_list if part.is_vertical] if crs else []
+    return float(vertical[0].axis_info[0].unit_conversion_factor) if vertical else 1.0
+
+
+def _described(dataset: Any) -> str:
+    """Return the dataset as a VRT document: GDAL's own reading of attribute tables and names, wherever a format keeps them."""
+    with MemoryFile(ext=".vrt") as memory:
+        rasterio.shutil.copy(dataset, memory.name, driver="VRT")
+        return str(memory.read().decode("utf-8", "replace"))
+
+
+def burn_polygons(
+    polygons: NDArray[np.object_],
+    ids: NDArray[np.uint8],
+    *,
+    affine: tuple[float, float, float, float, float, float],
+    rows: int,
+    cols: int,
+) -> NDArray[np.uint8]:
+    """Return the id of the last polygon that each pixel's centre lies in, shape (rows, cols); 0 where there is none."""
+    if not len(polygons):
+        return np.zeros((rows, cols), np.uint8)
+    shapes = zip(polygons.tolist(), ids.tolist(), strict=True)
+    return np.asarray(rasterize(shapes, (rows, cols), transform=rasterio.Affine(*affine), dtype=np.uint8))
+
+
+def _palette_grey(colormap: dict[int, tuple[int, int, int, int]]) -> NDArray[np.float64]:
+    """Return grey by palette index; NaN where the palette is transparent or has no entry."""
+    grey = np.full(65536, np.nan)
+    for index, (red, green, blue, alpha) in colormap.items():
+        if alpha >= _OPAQUE:
+            grey[index] = np.dot(LUMA_RGB, (red, green, blue))
+    return grey
+
+
+_STRIP_ROWS = 512
+
+
+def write_geotiff(
+    path: Path,
+    strip: Callable[[int, int], NDArray[Any]],
+    *,
+    rows: int,
+    cols: int,
+    affine: tuple[float, float, float, float, float, float],
+    crs: str,
+    dtype: str,
+    bands: int = 1,
+    nodata: float | None = None,
+    palette: Mapping[int, tuple[int, int, int]] | None = None,
+) -> None:
+    """Write a tiled, deflated GeoTIFF strip by strip, whole or not at all.
+
+    ``strip(first_row, last_row)`` returns (bands, rows, cols); ``affine`` is of pixel corners, as in `Raster`; four bands are RGB
+    and alpha.
+    """
+    profile = {
+        "driver": "GTiff",
+        "height": rows,
+        "width": cols,
+        "count": bands,
+        "dtype": dtype,
+        "crs": crs,
+        "nodata": nodata,
+    }
+    profile |= {
+        "transform": rasterio.Affine(*affine),
+        "tiled": True,
+        "blockxsize": 256,
+        "blockysize": 256,
+        "BIGTIFF": "IF_SAFER",
+    }
+    profile |= {"compress": "deflate", "zlevel": 1, "predictor": 3 if dtype == "float32" else 2}
+    if bands == 4:
+        profile |= {"photometric": "RGB", "alpha": "YES"}
+    with atomic_file(path) as temporary, rasterio.open(temporary, "w", **profile) as dataset:
+        if palette is not None:  # before the first pixel: GDAL cannot change what is on disk already
+            dataset.write_colormap(1, {value: (*colour, 255) for value, colour in palette.items()})
+        for first in range(0, rows, _STRIP_ROWS):
+            last = min(first + _STRIP_ROWS, rows)
+            dataset.write(strip(first, last), window=Window(0, first, cols, last - first))
+
+
+def write_cog(
+    path: Path,
+    strip: Callable[[int, int], NDArray[Any]],
+    *,
+    rows: int,
+    cols: int,
+    affine: tuple[float, float, float, float, float, float],
+    crs: str,
+    dtype: str,
+    nodata: float | None,
+    bands: Sequence[tuple[str, str]],
+) -> None:
+    """Write a Cloud-Optimised GeoTIFF strip by strip, whole or not at all; overviews hold every second pixel, nothing is averaged.
+
+    ``strip`` and ``affine`` as in `write_geotiff`; ``bands`` are names and units.
+    """
+    with atomic_file(path) as temporary:
+        plain = temporary.with_name("plain.tif")
+        write_geotiff(
+            plain, strip, rows=rows, cols=cols, affine=affine, crs=crs, dtype=dtype, bands=len(bands), nodata=nodata
+        )
+        with rasterio.open(plain, "r+") as dataset:
+            dataset.descriptions = [name for name, _ in bands]
+            dataset.units = [unit for _, unit in bands]
+        options = {"compress": "deflate", "predictor": "yes", "blocksize": 256, "overview_resampling": "nearest"}
+        rasterio.shutil.copy(plain, temporary, driver="COG", bigtiff="IF_SAFER", **options)
+
+
+def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
+    """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols).
+
+    Raises
+    ------
+    MapError
+        It cannot be read.
+    """
+    try:
+        with rasterio.Env(**_CONFIG), _open_as(_checked(path)) as dataset:
+            return np.asarray(dataset.read(list(bands)))
+    except RasterioError as error:
+        raise MapError(f"{path}: cannot be read; the file is damaged ({_reason(error)})") from error

@@ -1,0 +1,314 @@
+"""Maps on disk: ``maps/<name>.zarr``, a Zarr v3 group with one array a layer on one common grid.
+
+===========  =======  ==========================================================================
+array        type     meaning
+===========  =======  ==========================================================================
+height       float32  metres above the attribute ``add_offset``; NaN: no data
+ortho        uint8    grey from 1 to 255 (black is stored as 1); 0: no data
+terrain      uint8    class ids of the class table; 0: no data
+x, y         float64  pixel centres in the map's CRS [m]
+spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
+===========  =======  ==========================================================================
+
+The groups ``overviews/2``, ``overviews/4`` … hold the same arrays at coarser levels (`tcpipe.terrain.overviews`). Attributes follow
+CF (``grid_mapping``, ``flag_values``) and GeoZarr (``proj:``, ``spatial:``), so that xarray opens map and overviews as they are, and
+so does GDAL from 3.13 on, the first that reads shards.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from tcpipe.errors import MapError, StoreError
+from tcpipe.formats.maps.class_table import table_from_json, table_to_json
+from tcpipe.formats.seals import CHECKSUMS, prove_files, read_sealed
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
+from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
+from tcpipe.terrain.classes import ClassScheme, ClassTable
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.overviews import coarser_levels, overview_factors, overview_grid
+
+TILE_PX = 512
+"""Side of a tile: the unit that is decoded."""
+
+SHARD_PX = 2048
+"""Side of a shard: the unit that is a file, and that is written at once."""
+
+MAP_VERSION = "1.1"
+
+
+@dataclass(frozen=True, slots=True)
+class MapFile:
+    """An open map; satisfies `tcpipe.terrain.tiles.MapReader`."""
+
+    name: str
+    grid: MapGrid
+    classes: ClassTable
+    layers: tuple[str, ...]
+    tile_px: int
+    height_reference_m: float
+    facts: Mapping[str, Any]
+    """What `build_map` recorded: sources, coverage, warnings."""
+    id_by_value: Mapping[int, int]
+    """Which values of its terrain raster stood for which class ids."""
+    factors: tuple[int, ...]
+    _levels: Mapping[int, Mapping[str, ShardedArray]]
+    """The arrays of each factor."""
+    _factor: int = 1
+
+    def at(self, factor: int) -> MapFile:
+        """Return the map at one of its ``factors``, which are the full map's."""
+        return replace(self, grid=overview_grid(self.grid, factor), factors=(1,), _factor=factor)
+
+    def summary(self) -> dict[str, Any]:
+        """Return what the map is, as JSON values."""
+        grid = self.grid
+        return {
+            "name": self.name,
+            "crs": grid.crs,
+            "rows": grid.rows,
+            "cols": grid.cols,
+            "pitch_m": grid.pitch_m,
+            "bounds_m": list(grid.bounds_m),
+            "layers": list(self.layers),
+            "overviews": list(self.factors[1:]),
+            "class_table": table_to_json(self.classes),
+            **self.facts,
+        }
+
+    def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
+        """Return a window of a layer as stored: NaN (height) or 0 (ortho, terrain) where there is no data.
+
+        Raises
+        ------
+        MapError
+            A tile of the window is damaged.
+        """
+        with self._told(layer, row0, row1, col0, col1):
+            return self._levels[self._factor][layer].window(row0, row1, col0, col1)
+
+    def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
+        """Decode the tile in row i and column j into ``out``, contiguous, `tile_px` each way; `MapError` as `read`."""
+        grid, side = self.grid, self.tile_px
+        with self._told(layer, i * side, (i + 1) * side, j * side, (j + 1) * side):
+            array = self._levels[self._factor][layer]
+            array.chunk((i, j), out=out)
+        out[max(grid.rows - i * side, 0) :] = array.fill  # what a file holds beyond its array is nobody's promise
+        out[:, max(grid.cols - j * side, 0) :] = array.fill
+
+    @contextmanager
+    def _told(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> Iterator[None]:
+        """Say which part of the map it was that could not be read."""
+        try:
+            yield
+        except StoreError as error:
+            raise MapError(
+                f"map {self.name}: {layer}, rows {row0} to {row1}, columns {col0} to {col1} cannot be read ({error}); add the map again"
+            ) from error
+
+
+def open_map(path: Path, *, proved: bool = True) -> MapFile:
+    """Open a map for reading.
+
+    Raises
+    ------
+    MapError
+        There is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were written
+        or a file is gone: lost tiles would read as ground without data.
+    """
+    try:
+        group = open_group(path)
+    except StoreError as error:
+        raise MapError(f"{path}: not a map ({error}); add one with: tcpipe add-map") from error
+    found = group.attrs.asdict().get("tcpipe_map")
+    if not isinstance(found, dict) or found.get("version") != MAP_VERSION:
+        version = found.get("version") if isinstance(found, dict) else None
+        raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
+    factors = tuple(found["factors"])
+    wanted = [f"{_level_path(factor)}{layer}" for factor in factors for layer in found["layers"]]
+    missing = [array for array in wanted if not (path / array / "zarr.json").is_file()]
+    if missing:
+        raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
+    if proved:
+        _prove(path)
+    return MapFile(
+        name=found["name"],
+        grid=MapGrid(**found["grid"]),
+        classes=table_from_json(found["class_table"]),
+        layers=tuple(found["layers"]),
+        tile_px=found["tile_px"],
+        height_reference_m=found["height_reference_m"],
+        facts=found["facts"],
+        id_by_value={int(value): class_id for value, class_id in found["id_by_value"].items()},
+        factors=factors,
+        _levels={
+            f: {layer: open_sharded(path / f"{_level_path(f)}{layer}", sparse=True) for layer in found["layers"]}
+            for f in factors
+        },
+    )
+
+
+def _prove(path: Path) -> None:
+    """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
+    try:
+        listed = read_sealed(path / CHECKSUMS, {"checksums": dict})["checksums"]
+        prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
+    except StoreError as error:
+        raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
+    lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry["size_bytes"])]
+    if lost:
+        more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
+        raise MapError(f"{lost[0]}{more}: gone or cut short; add the map again")
+
+
+def _has_size(path: Path, size_bytes: int) -> bool:
+    try:
+        return path.stat().st_size == size_bytes
+    except OSError:
+        return False
+
+
+def _level_path(factor: int) -> str:
+    return "" if factor == 1 else f"overviews/{factor}/"
+
+
+class MapWriter:
+    """Writes a map and its overviews shard by shard into a directory; `finish` makes it complete."""
+
+    __slots__ = ("_factors", "_grid", "_group", "_layers", "_levels", "_name", "_scheme", "height_reference_m")
+
+    def __init__(
+        self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: tuple[str, ...]
+    ) -> None:
+        self._name, self._grid, self._scheme, self._layers = name, grid, scheme, layers
+        self._factors = overview_factors(grid)
+        self._group = create_group(directory)
+        self._levels = {factor: self._add_level(factor) for factor in self._factors}
+        self.height_reference_m: float | None = None
+        """What stored heights are above [m]: the floor of the smallest of the first shard that has any."""
+
+    def _add_level(self, factor: int) -> dict[str, Any]:
+        group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
+        grid = overview_grid(self._grid, factor)
+        shard_px = max(SHARD_PX // factor, TILE_PX)
+        return {layer: _add_layer(group, layer, grid, self._scheme.table, shard_px) for layer in self._layers}
+
+    def write(self, layer: str, row0: int, col0: int, values: NDArray[Any]) -> None:
+        """Write a shard whose corner is at a multiple of `SHARD_PX`; heights in metres with NaN, the others bytes with 0, as no data."""
+        if layer == "height":
+            if self.height_reference_m is None and np.isfinite(values).any():
+                self.height_reference_m = float(np.floor(np.nanmin(values)))
+            values = values - (self.height_reference_m or 0.0)
+        _put(self._levels[1][layer], row0, col0, values)
+        for factor, level in coarser_levels(layer, values, self._factors):
+            _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
+
+    def finish(self, facts: Mapping[str, Any]) -> None:
+        """Write coordinates and attributes."""
+        reference_m = self.height_reference_m or 0.0
+        for factor, arrays in self._levels.items():
+            arrays["height"].attrs.update({"add_offset": reference_m})
+            group = self._group if factor == 1 else self._group[_level_path(factor).rstrip("/")]
+            _place(
+                group,
+                overview_grid(self._grid, factor),
+                f"{self._name}, {factor} x coarser" if factor > 1 else self._name,
+            )
+        self._group.attrs.update(
+            {
+                "tcpipe_map": {
+                    "version": MAP_VERSION,
+                    "name": self._name,
+                    "grid": {field: getattr(self._grid, field) for field in MapGrid.__slots__},
+                    "class_table": table_to_json(self._scheme.table),
+                    "id_by_value": {str(value): class_id for value, class_id in self._scheme.id_by_value.items()},
+                    "layers": list(self._layers),
+                    "factors": list(self._factors),
+                    "tile_px": TILE_PX,
+                    "height_reference_m": reference_m,
+                    "facts": dict(facts),
+                },
+            }
+        )
+        consolidate(self._group)
+
+
+def _put(array: Any, row0: int, col0: int, values: NDArray[Any]) -> None:
+    if values.size:
+        array[row0 : row0 + values.shape[0], col0 : col0 + values.shape[1]] = values.astype(array.dtype)
+
+
+def _place(group: Any, grid: MapGrid, title: str) -> None:
+    """Say where a group's pixels lie: coordinates, the grid mapping, and the same as attributes."""
+    crs = CRS(grid.crs)
+    _add_axis(group, "x", grid.x_min_m + (np.arange(grid.cols) + 0.5) * grid.pitch_m)
+    _add_axis(group, "y", grid.y_max_m - (np.arange(grid.rows) + 0.5) * grid.pitch_m)
+    mapping = add_array(
+        group,
+        "spatial_ref",
+        shape=(),
+        dtype=np.int64,
+        chunks=(),
+        dimensions=(),
+        attributes={**crs.to_cf(), "GeoTransform": " ".join(repr(value) for value in grid.geotransform)},
+    )
+    mapping[...] = 0
+    authority = crs.to_authority(min_confidence=100)
+    group.attrs.update(
+        {
+            "Conventions": "CF-1.11",
+            "title": title,
+            **({"proj:code": ":".join(authority)} if authority else {}),
+            "proj:wkt2": crs.to_wkt(),
+            "spatial:dimensions": ["y", "x"],
+            "spatial:transform": [grid.pitch_m, 0.0, grid.x_min_m, 0.0, -grid.pitch_m, grid.y_max_m],
+            "spatial:bbox": list(grid.bounds_m),
+            "spatial:shape": [grid.rows, grid.cols],
+        }
+    )
+
+
+def _add_layer(group: Any, layer: str, grid: MapGrid, classes: ClassTable, shard_px: int) -> Any:
+    attributes: dict[str, dict[str, Any]] = {
+        "height": {"long_name": "height of the ground", "units": "m", "scale_factor": 1.0},
+        "ortho": {"long_name": "grey of the orthophoto", "units": "1", "scale_factor": 1.0 / 255.0, "_FillValue": 0},
+        "terrain": {
+            "long_name": "terrain class",
+            "flag_values": [entry.id for entry in classes.classes],
+            "flag_meanings": " ".join(entry.name.replace(" ", "_") for entry in classes.classes),
+            "_FillValue": 0,
+        },
+    }
+    return add_array(
+        group,
+        layer,
+        shape=(grid.rows, grid.cols),
+        dtype=np.float32 if layer == "height" else np.uint8,
+        chunks=(TILE_PX, TILE_PX),
+        shards=(shard_px, shard_px),
+        dimensions=("y", "x"),
+        fill_value=float("nan") if layer == "height" else 0,
+        attributes={**attributes[layer], "grid_mapping": "spatial_ref"},
+    )
+
+
+def _add_axis(group: Any, name: str, centres_m: NDArray[np.floating[Any]]) -> None:
+    attributes = {"units": "m", "standard_name": f"projection_{name}_coordinate"}
+    axis = add_array(
+        group,
+        name,
+        shape=centres_m.shape,
+        dtype=np.float64,
+        chunks=centres_m.shape,
+        dimensions=(name,),
+        attributes=attributes,
+    )
+    axis[:] = centres_m

@@ -1,0 +1,235 @@
+"""Terrain drawn by hand: GeoJSON polygons with a property ``class``, as QGIS saves an annotated orthophoto.
+
+The property is a class name of the class table (case, '_' and '-' do not matter), or a number: a value of the table, as in a raster,
+else an id. Where polygons overlap, the later feature lies on top, as it was drawn. A map pixel has the class of the polygon that its
+centre lies in; ground outside all polygons has no data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from tcpipe.errors import MapError, RegionError
+from tcpipe.formats.geojson import PolygonFeature, brief, read_polygons, shortened
+from tcpipe.formats.maps.geotiff import burn_polygons
+from tcpipe.formats.maps.layer_building import Tally
+from tcpipe.terrain.classes import ClassScheme, name_key
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.projection import Projection, area_of
+
+PROPERTY = "class"
+"""The property that tells a polygon's class, in any case."""
+
+SUFFIXES = (".geojson", ".json")
+"""A terrain file that ends so is polygons."""
+
+_EDGE_STEP_DEG = 0.001
+"""Edges are straight in lon/lat; at this step (100 m) the projected edge is straight to 1 mm below 70° latitude."""
+
+_SEEN_OVERLAP_M2 = 1.0
+"""Polygons of different classes that overlap by more than this are said."""
+
+
+_LOOKED_AT = 5_000_000
+"""Vertices of pairs of polygons that are held against each other to tell how they overlap."""
+
+_TOGETHER = 32
+"""Polygons that are held against all others at one time."""
+
+_DETAILED = 10_000
+"""A polygon of more vertices is cut to the part of the map that it is burnt into: each row of pixels looks at every edge."""
+
+
+@dataclass(frozen=True, slots=True)
+class PolygonLayer:
+    """Polygons as the terrain layer: in the map's CRS, in the order they are drawn, with their class ids."""
+
+    label: str
+    name: str
+    polygons: NDArray[np.object_]
+    ids: NDArray[np.uint8]
+    warnings: tuple[str, ...]
+    _tree: shapely.STRtree = field(repr=False)
+    tally: Tally = field(default_factory=Tally)
+
+    @property
+    def role(self) -> str:
+        """Always ``terrain``."""
+        return "terrain"
+
+    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
+        """Return class ids of a part of the map, shape (rows, cols); 0 where no polygon is."""
+        left, top = grid.x_min_m + col0 * grid.pitch_m, grid.y_max_m - row0 * grid.pitch_m
+        box = shapely.box(left, top - rows * grid.pitch_m, left + cols * grid.pitch_m, top)
+        drawn = np.sort(self._tree.query(box))
+        affine = (grid.pitch_m, 0.0, left, 0.0, -grid.pitch_m, top)
+        polygons = self.polygons[drawn].copy()
+        detailed = shapely.get_num_coordinates(polygons) > _DETAILED
+        polygons[detailed] = shapely.intersection(
+            polygons[detailed], shapely.buffer(box, grid.pitch_m, join_style="mitre")
+        )
+        kept = ~shapely.is_empty(polygons)
+        return burn_polygons(polygons[kept], self.ids[drawn][kept], affine=affine, rows=rows, cols=cols)
+
+    def nothing(self) -> str | None:
+        """No reason of its own: `place_polygons` has seen that they reach the map."""
+        return None
+
+    def notes(self) -> list[str]:
+        """Return what was noticed when they were placed."""
+        return list(self.warnings)
+
+
+def is_drawn(paths: Sequence[Path]) -> bool:
+    """Return whether terrain files are polygons; `MapError` if some are and some are not."""
+    drawn = [path for path in paths if path.suffix.lower() in SUFFIXES]
+    if drawn and len(drawn) != len(paths):
+        other = next(path for path in paths if path not in drawn)
+        raise MapError(f"terrain: {drawn[0]} holds polygons, {other} does not; wanted one kind")
+    return bool(drawn)
+
+
+def place_polygons(
+    paths: Sequence[Path], scheme: ClassScheme, crs: CRS, bounds_m: tuple[float, float, float, float]
+) -> PolygonLayer:
+    """Read terrain polygons and carry them into a map's CRS.
+
+    Parameters
+    ----------
+    paths
+        The GeoJSON files; the features of a later one lie on top.
+    scheme
+        The class table, and the values that stand for its ids.
+    crs, bounds_m
+        The map's CRS, and x min, y min, x max, y max in it.
+
+    Raises
+    ------
+    MapError
+        Not GeoJSON, another CRS, unsound geometry, a class that the table does not have, or nothing on the map: all problems at once.
+    """
+    features, problems = _read_all(paths)
+    label = f"{paths[0]}" if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
+    name = label.removeprefix(f"{paths[0].parent}/")
+    ids = [_class_id(feature, scheme, problems) for feature in features]
+    if not features:
+        problems.append(f"{label}: no polygon in it; draw the terrain as polygons")
+    if problems:
+        raise MapError(*shortened(problems))
+    flat = [polygon for feature in features for polygon in feature.polygons]
+    id_of_each = np.repeat(np.array(ids, np.uint8), [len(feature.polygons) for feature in features])
+    projection = Projection(CRS.from_epsg(4326), crs, area_of(crs, bounds_m))
+    polygons = _carried(label, np.array(flat, dtype=object), projection, bounds_m)
+    on_map = ~shapely.is_empty(polygons)
+    polygons, id_of_each = polygons[on_map], id_of_each[on_map]
+    doubt = projection.doubt()
+    warnings = [f"{name}: {doubt}; its polygons may be off by that"] if doubt else []
+    warnings += _overlaps(name, polygons, id_of_each, scheme)
+    return PolygonLayer(label, name, polygons, id_of_each, tuple(warnings), shapely.STRtree(polygons))
+
+
+def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:
+    features: list[PolygonFeature] = []
+    problems: list[str] = []
+    for path in paths:
+        try:
+            found, unsound = read_polygons(path)
+        except RegionError as error:
+            raise MapError(*error.problems) from None
+        features += found
+        problems += unsound
+    return features, problems
+
+
+def _class_id(feature: PolygonFeature, scheme: ClassScheme, problems: list[str]) -> int:
+    """Return a feature's class id; 0, and a line in ``problems``, where it has none."""
+    given = _property(feature.properties)
+    if given is None:
+        there = brief(", ".join(sorted(feature.properties)) or "none")[1:-1]
+        problems.append(
+            f"{feature.where}: has no property {PROPERTY!r} that names its terrain (its properties: {there})"
+        )
+        return 0
+    by_name = {name_key(entry.name): entry.id for entry in scheme.table.classes}
+    found = by_name.get(name_key(str(given)))
+    number = _integer(given)
+    if found is None and number is not None:
+        known = {entry.id: entry.id for entry in scheme.table.classes} | dict(scheme.id_by_value)
+        found = known.get(number)
+    if found is None:
+        names = ", ".join(entry.name for entry in scheme.table.classes)
+        problems.append(f"{feature.where}: {PROPERTY} {brief(given)} is not in the class table ({names})")
+    return found or 0
+
+
+def _property(properties: Mapping[str, Any]) -> Any:
+    return next((value for name, value in properties.items() if name.casefold() == PROPERTY), None)
+
+
+def _integer(given: Any) -> int | None:
+    try:
+        number = float(given)
+    except (TypeError, ValueError):
+        return None
+    return int(number) if number.is_integer() and not isinstance(given, bool) else None
+
+
+def _carried(
+    label: str, polygons: NDArray[np.object_], projection: Projection, bounds_m: tuple[float, float, float, float]
+) -> NDArray[np.object_]:
+    """Return the polygons in the map's CRS, empty where they are not on the map; `MapError` if none is."""
+    west, south, east, north = projection.area_deg
+    margin_deg = max(east - west, north - south, _EDGE_STEP_DEG)
+    near = shapely.box(west - margin_deg, south - margin_deg, east + margin_deg, north + margin_deg)
+    cut = shapely.segmentize(shapely.intersection(polygons, near), _EDGE_STEP_DEG)
+    placed = shapely.transform(cut, projection.forward)
+    on_map = shapely.intersects(placed, shapely.box(*bounds_m))
+    if on_map.any():
+        return np.asarray(np.where(on_map, placed, shapely.Polygon()))
+    lon, lat = shapely.get_coordinates(polygons).mean(axis=0)
+    swapped = shapely.transform(polygons, lambda lonlat: lonlat[:, ::-1])
+    if shapely.intersects(swapped, shapely.box(west, south, east, north)).any():
+        raise MapError(
+            f"{label}: none of its polygons is on the map, but would be with the axes swapped: GeoJSON is lon before lat (RFC 7946)"
+        )
+    raise MapError(
+        f"{label}: none of its polygons is on the map: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
+        f"the map covers {west:.5f} to {east:.5f}, {south:.5f} to {north:.5f}"
+    )
+
+
+def _overlaps(name: str, polygons: NDArray[np.object_], ids: NDArray[np.uint8], scheme: ClassScheme) -> Iterator[str]:
+    """Say how much ground polygons of different classes share; of very many, and of very detailed ones, not all are looked at."""
+    tree, shared_m2, worst, left = shapely.STRtree(polygons), 0.0, (0.0, ""), _LOOKED_AT
+    vertices = shapely.get_num_coordinates(polygons)
+    for first in range(0, len(polygons), _TOGETHER):
+        above, below = tree.query(polygons[first : first + _TOGETHER], predicate="intersects")
+        above += first
+        pairs = (below < above) & (ids[below] != ids[above])
+        above, below = above[pairs], below[pairs]
+        looked_at = np.cumsum(vertices[above] + vertices[below]) <= left
+        above, below = above[looked_at], below[looked_at]
+        left -= int((vertices[above] + vertices[below]).sum())
+        areas_m2 = shapely.area(shapely.intersection(polygons[below], polygons[above]))
+        shared_m2 += float(areas_m2.sum())
+        if areas_m2.size and areas_m2.max() > worst[0]:
+            at = int(np.argmax(areas_m2))
+            names = [scheme.table.name(int(ids[part[at]])) for part in (above, below)]
+            worst = float(areas_m2[at]), f"{names[0]} over {names[1]}"
+        if not looked_at.all():
+            left = 0
+            break
+    if shared_m2 > _SEEN_OVERLAP_M2:
+        more = "" if left else "at least "
+        yield (
+            f"{name}: polygons of different classes overlap by {more}{shared_m2:.0f} m² (most of it {worst[1]}); "
+            "the later in the file lies on top"
+        )

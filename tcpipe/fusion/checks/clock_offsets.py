@@ -1,0 +1,293 @@
+"""The clock doctor: offsets between the stamps of a run's sensors, and their drift, from what they say of the same motion.
+
+Speed of the wheels against that of the fixes, yaw rate against the gyroscope, power against what speed and acceleration cost. Each pair
+that can be compared gives a lag with its standard deviation (`lags`), over the whole run and in windows of ten minutes, through which a
+line tells the drift; the pairs together give each sensor's offset from the clock that most of them share. Nothing is corrected here: a
+person decides. The course of the fixes is not held against the gyroscope: an antenna that sits ahead of the turning point by l leads the
+body's course by l / v, 0.1 s for 10 cm.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.checks.gridded_motion import FIXES_S, fix_velocity, on_grid, twist_on_grid
+from tcpipe.fusion.checks.lags import GRID_S, Floats, averaged, lag_of, lag_products
+from tcpipe.fusion.checks.windows import span_ns, windows_ns
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements, part
+from tcpipe.fusion.signals import median_period_ns
+
+POWER = "power"
+ROLES = (IMU, WHEELS, VISUAL, GNSS, POWER)
+"""In the order in which a clock is taken for the right one where as many agree with either: a gyroscope has the least to compute."""
+
+_NOTED_S = {POWER: 0.08}
+_NOTED_MOTION_S = 0.05
+_SURE = 4.0  # standard deviations
+_MAX_STD_S = {POWER: 0.04}
+_MAX_MOTION_STD_S = 0.02
+_MIN_EXPLAINED = 0.25
+_ODOMETRY_S = 0.1
+_POWER_S = 0.2
+_SLOW_S = 4.0
+_STOPPED_MPS = 0.1
+_NEAR_STOP_S = 3.0
+_WINDOW_NS = 600_000_000_000
+_MARGIN_NS = 5_000_000_000
+_FEWEST_WINDOWS = 3
+_LEAST_STD_S = 1e-3
+
+Signals = tuple[str, str, str, Floats, Floats]
+
+
+@dataclass(frozen=True, slots=True)
+class Pair:
+    """Two sensors compared: by what, how late the first's stamps are against the second's [s], and how much one explains the other.
+
+    ``offset_s`` is that of the middle of the run where the drift [s/h] is sure; ``windows`` are (seconds into the run, offset [s], its
+    standard deviation) of parts that tell enough; a drift needs three of them and is NaN otherwise.
+    """
+
+    late: str
+    against: str
+    by: str
+    offset_s: float
+    std_s: float
+    explained: float
+    drift_s_per_h: float = math.nan
+    drift_std_s_per_h: float = math.nan
+    windows: tuple[tuple[float, float, float], ...] = ()
+
+    @property
+    def determined(self) -> bool:
+        """Whether the offset is known well enough to be spoken of: to a small error, or as surely not zero."""
+        return _determined(self.late, self.offset_s, self.std_s, self.explained)
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """How late a sensor's stamps are against the reference's [s], their drift [s/h, NaN where unknown], with standard deviations.
+
+    ``noted`` and ``drifts``: whether a person should act on either.
+    """
+
+    offset_s: float
+    std_s: float
+    noted: bool
+    drift_s_per_h: float = math.nan
+    drift_std_s_per_h: float = math.nan
+    drifts: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PowerSignal:
+    """The robot's power: stamps [ns] and values [W], shape (N,); ``averaged`` over the period that ends at each stamp."""
+
+    stamp_ns: NDArray[np.int64]
+    power_watt: Floats
+    averaged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffsets:
+    """Every pair compared, the sensor whose clock the others are held against, and the offsets of those connected to it.
+
+    ``span_s`` is how long the run is.
+    """
+
+    pairs: tuple[Pair, ...]
+    reference: str
+    offsets: Mapping[str, Offset]
+    span_s: float = 0.0
+
+
+def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) -> ClockOffsets:
+    """Return the offsets between the stamps of a clock epoch's sensors, and how they drift.
+
+    Parameters
+    ----------
+    measurements : of one clock epoch; mountings need not be right, since a yaw rate is compared with all three axes of a gyroscope.
+    power : sum over the drive rails; None without.
+    """
+    span = span_ns(measurements)
+    if span is None:
+        return ClockOffsets((), "", {})
+    told: dict[tuple[str, str, str], list[tuple[float, Floats]]] = {}
+    for at_ns in windows_ns(measurements, _WINDOW_NS):
+        first_ns, last_ns = int(at_ns[0]) - _MARGIN_NS, int(at_ns[-1]) + _MARGIN_NS
+        middle_s = ((int(at_ns[0]) + int(at_ns[-1])) / 2 - span[0]) * 1e-9
+        for late, against, by, target, regressors in _signals(
+            part(measurements, first_ns, last_ns), _within(power, first_ns, last_ns), at_ns
+        ):
+            products = lag_products(target, regressors)
+            if products is not None:
+                told.setdefault((late, against, by), []).append((middle_s, products))
+    span_s = (span[1] - span[0]) * 1e-9
+    pairs = (_pair(names, windows, span_s) for names, windows in told.items())
+    return _settled(tuple(pair for pair in pairs if pair is not None), span_s)
+
+
+def _signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterable[Signals]:
+    """Yield what can be compared in a window: whose stamps against whose, by what, target and regressors on the grid."""
+    odometries = [(role, source) for role, source in ((WHEELS, m.wheels), (VISUAL, m.visual)) if source is not None]
+    twists = {role: twist_on_grid(source, at_ns) for role, source in odometries}
+    gyro = (
+        None if m.imu is None else averaged(on_grid(m.imu.stamp_ns, m.imu.angular_velocity_radps, at_ns), _ODOMETRY_S)
+    )
+    if gyro is not None:
+        for role, _ in odometries:
+            yield role, IMU, "yaw rate", averaged(twists[role], _ODOMETRY_S)[:, 1], gyro
+    if len(odometries) == 2:
+        speeds = {role: _quick(averaged(np.abs(twists[role][:, :1]), _ODOMETRY_S)) for role, _ in odometries}
+        yield VISUAL, WHEELS, "speed", speeds[VISUAL][:, 0], speeds[WHEELS]
+    if m.gnss is not None and odometries:
+        role = odometries[0][0]
+        seen = averaged(averaged(_antenna_speed(twists[role], m.gnss.lever_arm_m), FIXES_S), FIXES_S)
+        fixes = np.abs(fix_velocity(m.gnss, at_ns))
+        yield GNSS, role, "speed", _quick(fixes[:, None])[:, 0], _quick(seen)
+    if power is not None and odometries:
+        role = odometries[0][0]
+        yield POWER, role, "power of speed, acceleration and turning", *_power(power, twists[role], at_ns)
+
+
+def _within(power: PowerSignal | None, first_ns: int, last_ns: int) -> PowerSignal | None:
+    """Return the part of a power signal between two stamps; None where there is too little."""
+    if power is None:
+        return None
+    rows = slice(*np.searchsorted(power.stamp_ns, (first_ns, last_ns + 1)))
+    if rows.stop - rows.start < 2:
+        return None
+    return PowerSignal(power.stamp_ns[rows], power.power_watt[rows], power.averaged)
+
+
+def _pair(names: tuple[str, str, str], windows: list[tuple[float, Floats]], span_s: float) -> Pair | None:
+    """Return a pair of the whole run; where it drifts for sure, as it is in the middle of the run."""
+    lags = [(at_s, lag_of([products])) for at_s, products in windows] if len(windows) > 1 else []
+    known = [(at_s, lag) for at_s, lag in lags if lag and _determined(names[0], lag.offset_s, lag.std_s, lag.explained)]
+    told = tuple((at_s, lag.offset_s, lag.std_s) for at_s, lag in known)
+    whole = lag_of([products for _, products in windows])
+    if len(told) >= _FEWEST_WINDOWS:
+        (middle_s, rate), (middle_std_s, rate_std) = _line(np.array(told), span_s)
+        drift = (3600.0 * rate, 3600.0 * rate_std)
+        if whole is None or abs(rate) > _SURE * rate_std:
+            explained = float(np.median([lag.explained for _, lag in known]))
+            return Pair(*names, middle_s, middle_std_s, explained, *drift, told)
+        return Pair(*names, whole.offset_s, whole.std_s, whole.explained, *drift, told)
+    return None if whole is None else Pair(*names, whole.offset_s, whole.std_s, whole.explained, windows=told)
+
+
+def _line(told: Floats, span_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return offset in the middle of the run [s] and its rate [s/s] by weighted least squares, and their standard deviations.
+
+    Windows that scatter by more than they claim widen the deviations (Birge's ratio).
+    """
+    at_s, offset_s, std_s = told.T
+    weight = 1.0 / np.maximum(std_s, _LEAST_STD_S)
+    design = np.column_stack((np.ones_like(at_s), at_s - span_s / 2)) * weight[:, None]
+    covariance = np.linalg.inv(design.T @ design)
+    solved = covariance @ design.T @ (offset_s * weight)
+    left = offset_s * weight - design @ solved
+    birge = max(1.0, float(left @ left) / (at_s.size - 2))
+    middle_std_s, rate_std = np.sqrt(birge * np.diagonal(covariance)).tolist()
+    return (float(solved[0]), float(solved[1])), (middle_std_s, rate_std)
+
+
+def _determined(role: str, offset_s: float, std_s: float, explained: float) -> bool:
+    limit_s = _MAX_STD_S.get(role, _MAX_MOTION_STD_S)
+    known = std_s <= limit_s or (std_s <= 3 * limit_s and abs(offset_s) > _SURE * std_s)
+    return known and explained >= _MIN_EXPLAINED
+
+
+def _quick(values: Floats) -> Floats:
+    """Return (M, k) values without their slow parts, which slip and terrain change, and starts, stops and turns do not need."""
+    return values - averaged(values, _SLOW_S)
+
+
+def _antenna_speed(twist: Floats, lever_arm_m: tuple[float, float, float]) -> Floats:
+    forward, yaw_rate = twist.T
+    speed: Floats = np.hypot(forward - yaw_rate * lever_arm_m[1], yaw_rate * lever_arm_m[0])
+    return speed[:, None]
+
+
+def _power(power: PowerSignal, twist: Floats, at_ns: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Return power, and what it may depend on, without their slow parts."""
+    stamp_ns = power.stamp_ns
+    if power.averaged:
+        stamp_ns = stamp_ns - median_period_ns(stamp_ns) // 2
+    drawn = on_grid(stamp_ns, power.power_watt[:, None], at_ns)
+    speed, turning = np.abs(twist).T
+    causes = averaged(np.column_stack((drawn, speed, turning, turning * speed, speed**2)), _POWER_S)
+    # Speed times acceleration, as half the slope of the squared speed: smoothed like the power itself.
+    causes[:, -1] = np.gradient(causes[:, -1], GRID_S) / 2
+    fast = _quick(causes)
+    near_stop = averaged((speed < _STOPPED_MPS).astype(np.float64)[:, None], _NEAR_STOP_S)[:, 0] > 0
+    return np.where(near_stop, fast[:, 0], np.nan), fast[:, 1:]
+
+
+def _settled(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
+    """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined."""
+    known = [pair for pair in pairs if pair.determined]
+    linked = [role for role in ROLES if any(role in {pair.late, pair.against} for pair in known)]
+    best: dict[str, Offset] = {}
+    reference = ""
+    for role in linked:
+        offsets = _against(role, linked, known, span_s)
+        if not best or _agreeing(offsets) > _agreeing(best):
+            best, reference = offsets, role
+    return ClockOffsets(pairs, reference, {role: offset for role, offset in best.items() if role != reference}, span_s)
+
+
+def _agreeing(offsets: Mapping[str, Offset]) -> int:
+    """Count the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
+    return sum(
+        abs(offset.offset_s) <= _NOTED_S.get(role, _NOTED_MOTION_S) and not offset.drifts
+        for role, offset in offsets.items()
+    )
+
+
+def _against(reference: str, roles: list[str], pairs: list[Pair], span_s: float) -> dict[str, Offset]:
+    """Return the offsets of the sensors that pairs connect to the reference, its own (zero) included."""
+    offsets = _solved(reference, roles, [(p.late, p.against, p.offset_s, max(p.std_s, _LEAST_STD_S)) for p in pairs])
+    least = 3600.0 * _LEAST_STD_S / max(span_s, 1.0)
+    told = [p for p in pairs if math.isfinite(p.drift_s_per_h)]
+    drifts = _solved(
+        reference, roles, [(p.late, p.against, p.drift_s_per_h, max(p.drift_std_s_per_h, least)) for p in told]
+    )
+    found = {}
+    for role, (offset_s, std_s) in offsets.items():
+        limit_s = _NOTED_S.get(role, _NOTED_MOTION_S)
+        rate, rate_std = drifts.get(role, (math.nan, math.nan))
+        wanders = abs(rate) > max(_SURE * rate_std, limit_s * 3600.0 / max(span_s, 1.0))
+        noted = abs(offset_s) > max(limit_s, _SURE * std_s)
+        found[role] = Offset(offset_s, std_s, noted, rate, rate_std, drifts=bool(wanders))
+    return found
+
+
+def _solved(
+    reference: str, roles: list[str], differences: list[tuple[str, str, float, float]]
+) -> dict[str, tuple[float, float]]:
+    """Return each connected role's value against the reference's zero, with its standard deviation.
+
+    ``differences`` are (role, other, value of the role less that of the other, standard deviation).
+    """
+    connected = {reference}
+    for _ in roles:
+        connected |= {r for a, b, *_ in differences if connected & {a, b} for r in (a, b)}
+    free = [role for role in roles if role in connected and role != reference]
+    if not free:
+        return {reference: (0.0, 0.0)}
+    used = [each for each in differences if each[0] in connected]
+    design = np.array([[(r == a) - float(r == b) for r in free] for a, b, *_ in used])
+    values, std = np.array([each[2:] for each in used]).T
+    weighted = design / std[:, None]
+    covariance = np.linalg.inv(weighted.T @ weighted)
+    solved = covariance @ weighted.T @ (values / std)
+    deviations = np.sqrt(np.diagonal(covariance))
+    return {reference: (0.0, 0.0)} | dict(
+        zip(free, zip(solved.tolist(), deviations.tolist(), strict=True), strict=True)
+    )

@@ -1,0 +1,179 @@
+"""How far each sensor says that the robot went: one that counts in other units, or stands still, tells another distance than the rest.
+
+Distances are chords over ten seconds, so that the noise of fixes does not count as driving: of fixes their difference, of an odometry
+what its own velocity and yaw rate add up to. A command is a voice where two sensors differ, though a robot may be slower than it is told.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.checks.gridded_motion import fix_places
+from tcpipe.fusion.checks.lags import GRID_S, Floats
+from tcpipe.fusion.measurements import GNSS, WHEELS, Positions
+
+COMMAND = "command"
+"""The command's name among the distances; it is never refused."""
+
+_WINDOW = round(10.0 / GRID_S)
+_STEP = round(5.0 / GRID_S)
+_FAR_M = 3.0
+_SURE = 6.0  # standard deviations
+_FEWEST_WINDOWS = 3
+_FACTOR = 2.0
+_STILL = 0.05
+_BEND_M = 0.3
+_UNLIKE_M = 1.0
+_UNLIKE_SHARE = 0.3
+_UNLIKE_WINDOWS = 0.3
+_CLEARLY = 3.0
+_KMH = (3.2, 4.0)
+_RADIANS = (1 / 75, 1 / 30)
+
+
+@dataclass(frozen=True, slots=True)
+class Distances:
+    """How far the robot went in each window by each source [m], shape (W,), NaN where it does not tell; ``least_m`` may be noise."""
+
+    chord_m: Mapping[str, Floats]
+    least_m: float
+
+    def without(self, names: Collection[str]) -> Distances:
+        """Return the distances without those of some sources."""
+        return Distances({name: chord for name, chord in self.chord_m.items() if name not in names}, self.least_m)
+
+    def ratio(self, name: str, other: str) -> float | None:
+        """Return how many times as far as the other a source goes, where either goes far; None where that is hardly ever."""
+        mine, its = self.chord_m[name], self.chord_m[other]
+        far = np.isfinite(mine + its) & (np.fmax(mine, its) > self.least_m)
+        if far.sum() < _FEWEST_WINDOWS:
+            return None
+        return float(np.median(mine[far])) / max(float(np.median(its[far])), 1e-3)
+
+    def differ(self, name: str, other: str) -> bool:
+        """Return whether one goes more than twice as far as the other."""
+        ratio = self.ratio(name, other)
+        return ratio is not None and not 1 / _FACTOR <= ratio <= _FACTOR
+
+    def agree(self, name: str, other: str) -> bool:
+        """Return whether both go about as far."""
+        ratio = self.ratio(name, other)
+        return ratio is not None and 1 / _FACTOR <= ratio <= _FACTOR
+
+
+def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> Distances:
+    """Return the distances by every source that tells any.
+
+    Parameters
+    ----------
+    gnss : None without.
+    twists : by name, forward velocity [m/s] and yaw rate [rad/s] on the grid, shape (M, 2).
+    at_ns : the grid's stamps, shape (M,).
+    """
+    chords = {name: _chords_m(_dead_reckoned(twist)) for name, twist in twists.items()}
+    least_m = _FAR_M
+    if gnss is not None:
+        chords[GNSS] = _chords_m(fix_places(gnss, at_ns))
+        least_m += _SURE * float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
+    return Distances(chords, least_m)
+
+
+def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, str]:
+    """Return why by sensor: of two that differ the one that fewer others agree with, or both.
+
+    Parameters
+    ----------
+    turning : sensors whose yaw rate the gyroscope confirms: the robot does drive when they say so.
+    """
+    sensors = [name for name in found.chord_m if name != COMMAND]
+    heard = {name: [other for other in found.chord_m if other != name and found.agree(name, other)] for name in sensors}
+    why: dict[str, str] = {}
+    for slow, fast, ratio in _differing(found, sensors):
+        still = ratio > 1 / _STILL
+        # A command tells how fast a robot that moves is to go, not that it moves; a gyroscope that turns with it does.
+        for_fast = len(set(heard[fast]) - {COMMAND}) + (fast in turning) if still else len(heard[fast])
+        for_slow = len(heard[slow])
+        if still and fast == WHEELS and not for_fast:
+            continue  # the wheels turn, the robot stands: stuck
+        doubt = ", and nothing tells which of the two is right" if for_fast == for_slow else ""
+        if for_slow <= for_fast:
+            why.setdefault(slow, _text(fast, 1 / ratio) + doubt + _radians(slow, 1 / ratio))
+        if for_fast <= for_slow:
+            why.setdefault(fast, _text(slow, ratio) + doubt + _kilometres(ratio))
+    return why
+
+
+def path_of_fixes(
+    gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]
+) -> Literal["alike", "mirrored", "unlike"] | None:
+    """Return how the path of the fixes lies to what an odometry adds up to; None where there is too little to tell.
+
+    In every window the fixes are laid on the odometry's path by rotation and scale, and again on its mirror image. Unlike is what fits
+    neither way, by more than the fixes' noise, what slip bends, and a metre.
+    """
+    fixes, path = fix_places(gnss, at_ns), _dead_reckoned(twist)
+    left, bound = [], []
+    noise_m2 = _SURE**2 * float(np.median(gnss.variance_m2[:, :2]))
+    for first in range(0, at_ns.size - 2 * _WINDOW, _WINDOW):
+        rows = slice(first, first + 2 * _WINDOW)
+        if np.isfinite(fixes[rows] + path[rows]).all():
+            a, b = fixes[rows] - fixes[rows].mean(), path[rows] - path[rows].mean()
+            left.append((_unlike_m2(a, b), _unlike_m2(a, np.conj(b))))
+            bound.append(_UNLIKE_M**2 + noise_m2 + _UNLIKE_SHARE**2 * float(np.mean(np.abs(b) ** 2)))
+    if len(left) < _FEWEST_WINDOWS:
+        return None
+    as_it_is, as_mirrored = np.array(left).T
+    if np.mean(as_it_is > bound) > _UNLIKE_WINDOWS and np.mean(as_mirrored > bound) > _UNLIKE_WINDOWS:
+        return "unlike"
+    most, least = max(as_it_is.sum(), as_mirrored.sum()), min(as_it_is.sum(), as_mirrored.sum())
+    if most / len(left) < _BEND_M**2 + noise_m2 or most < _CLEARLY * least:
+        return None
+    return "alike" if as_it_is.sum() < as_mirrored.sum() else "mirrored"
+
+
+def _unlike_m2(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> float:
+    """Return the mean square that is left when b, turned and scaled, is laid on a; both about their mean."""
+    energy, own = float(np.mean(np.abs(a) ** 2)), float(np.mean(np.abs(b) ** 2))
+    return energy - float(np.abs(np.mean(a * np.conj(b))) ** 2) / own if own > 0 else energy
+
+
+def _differing(found: Distances, sensors: list[str]) -> Iterable[tuple[str, str, float]]:
+    """Return the pairs that differ: the slower, the faster, and how many times as far it goes."""
+    for a, b in combinations(sensors, 2):
+        ratio = found.ratio(a, b)
+        if ratio is not None and found.differ(a, b):
+            yield (b, a, ratio) if ratio > 1 else (a, b, 1 / ratio)
+
+
+def _text(other: str, ratio: float) -> str:
+    return f"it goes {ratio:.2g} times as far as {other}"
+
+
+def _kilometres(ratio: float) -> str:
+    return " (km/h?)" if _KMH[0] < ratio < _KMH[1] else ""
+
+
+def _radians(name: str, ratio: float) -> str:
+    return " (latitude and longitude in radians?)" if name == GNSS and _RADIANS[0] < ratio < _RADIANS[1] else ""
+
+
+def _dead_reckoned(twist: Floats) -> NDArray[np.complex128]:
+    """Return the places that a twist (M, 2) adds up to, east and i times north [m]; NaN where it is unknown."""
+    known = np.isfinite(twist.sum(1))
+    forward, yaw_rate = np.where(known[:, None], twist, 0.0).T
+    place = np.cumsum(forward * np.exp(1j * np.cumsum(yaw_rate) * GRID_S)) * GRID_S
+    return np.where(known, place, np.nan)
+
+
+def _chords_m(place_m: NDArray[np.complex128]) -> Floats:
+    """Return the distance over every window [m]; NaN where a place in it is unknown."""
+    lost = np.concatenate(([0], np.cumsum(np.isnan(place_m))))
+    first = np.arange(0, place_m.size - _WINDOW, _STEP)
+    whole = lost[first + _WINDOW + 1] == lost[first]
+    return np.where(whole, np.abs(place_m[first + _WINDOW] - place_m[first]), np.nan)

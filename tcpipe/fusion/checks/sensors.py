@@ -1,0 +1,321 @@
+"""Sensors that contradict physics or each other, and what would set each right; such a sensor is not to be fused.
+
+An IMU in degrees or in g, one that does not stand upright, one that looks elsewhere; an odometry that drives or turns the other way;
+fixes on a mirrored path; a sensor that is frozen, or goes another distance than the rest. Where two disagree a third decides: the command,
+the camera, the course of the fixes. Mountings that somebody stated weigh more than assumed ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.checks.distances import COMMAND, Distances, contradictions, find_distances, path_of_fixes
+from tcpipe.fusion.checks.frozen import frozen_sensors
+from tcpipe.fusion.checks.gridded_motion import course_rate, fix_velocity, on_grid, twist_on_grid
+from tcpipe.fusion.checks.lags import Floats, averaged
+from tcpipe.fusion.checks.plausibility import (
+    YawAxis,
+    agreement,
+    forward_yaw_rad,
+    levelling,
+    nearest_mounting,
+    up_axis,
+    yaw_axis,
+)
+from tcpipe.fusion.checks.windows import liveliest_ns
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.signals import hold_last
+
+_SMOOTH_S = 0.1
+_IN_G = (0.8, 1.25)
+_IN_MPS2 = (8.0, 12.0)
+_IN_DEGREES = 1.0 / 15.0  # rad/s by the wheels over the gyroscope's rate; in radians 0.5 to 2
+_NO_ROBOT_TURNS_RADPS = 15.0
+_TILTED_RAD = np.radians(30.0)  # slopes average out; the steepest that is driven is 22.5 degrees
+_LOOKS_ELSEWHERE_RAD = np.radians(60.0)
+_BACKWARDS_RAD = np.radians(120.0)
+_OTHER_WAY = -0.5
+
+FORWARD = np.diag([-1.0, -1.0, 1.0])
+"""Turns a body's x axis round and leaves its yaw rate."""
+YAW = np.diag([1.0, -1.0, -1.0])
+"""Turns a body's yaw rate round and leaves its x axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Refusal:
+    """A sensor that is not to be fused: why, and what would set it right.
+
+    ``units`` is the value of the recipe's ``imu_units``; ``turned_by`` (3, 3) turns what the mounting in use makes of the sensor into
+    base_link. Neither: nothing in the recipe does.
+    """
+
+    role: str
+    why: str
+    units: str | None = None
+    turned_by: Floats | None = None
+
+
+@dataclass(slots=True)
+class Checks:
+    """What was found: refusals in order, and the figures they rest on."""
+
+    refusals: list[Refusal] = field(default_factory=list)
+    facts: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """Commanded forward velocity: stamps [ns] and values [m/s], in order."""
+
+    stamp_ns: NDArray[np.int64]
+    forward_velocity_mps: Floats
+
+
+def check_sensors(
+    measurements: Measurements, *, command: Command | None, stated: Mapping[str, bool], felt: float
+) -> Checks:
+    """Return which sensors of a clock epoch are not to be fused.
+
+    Parameters
+    ----------
+    measurements : in base_link axes, by the mountings in use.
+    command : None without.
+    stated : by role, whether somebody stated the mounting (recipe, transforms, message in base_link); otherwise it is assumed.
+    felt : median size of the specific force as the IMU told it, before its lever arm was taken out; NaN without an IMU.
+    """
+    checks = Checks()
+    at_ns = liveliest_ns(measurements)
+    if at_ns is None:
+        return checks
+    twists = {
+        role: twist_on_grid(source, at_ns)
+        for role, source in ((WHEELS, measurements.wheels), (VISUAL, measurements.visual))
+        if source is not None
+    }
+    found = find_distances(measurements.gnss, _with_command(twists, command, at_ns), at_ns)
+    frozen = frozen_sensors(measurements, found)
+    checks.refusals += [Refusal(role, why) for role, why in frozen.items()]
+    twists = {role: twist for role, twist in twists.items() if role not in frozen}
+    gnss = None if GNSS in frozen else measurements.gnss
+    turning = {role: averaged(twist, _SMOOTH_S)[:, 1] for role, twist in twists.items()}
+    if gnss is not None:
+        turning[GNSS] = course_rate(fix_velocity(gnss, at_ns))
+    looks: dict[str, float] = {}
+    if measurements.imu is not None and IMU not in frozen:
+        looks = _check_imu(checks, measurements.imu, at_ns, felt, twists=twists, turning=turning, stated=stated)
+    _check_directions(checks, twists, at_ns, command=command, looks=looks, stated=stated)
+    _check_distances(checks, found.without(frozen))
+    if gnss is not None:
+        _check_path(checks, gnss, _turning_as_felt(checks, twists, measurements.imu, at_ns), at_ns)
+    return checks
+
+
+def _with_command(twists: Mapping[str, Floats], command: Command | None, at_ns: NDArray[np.int64]) -> dict[str, Floats]:
+    """Return the twists and, under `COMMAND`, the commanded speed with the yaw rate that an odometry tells."""
+    if command is None or not twists:
+        return dict(twists)
+    wanted = hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
+    return {**twists, COMMAND: np.column_stack((wanted, next(iter(twists.values()))[:, 1]))}
+
+
+def _check_distances(checks: Checks, found: Distances) -> None:
+    """Check that all sensors go about as far."""
+    axes = checks.facts.get("yaw_axis", {})
+    turning = frozenset(role for role, axis in axes.items() if role != GNSS)
+    checks.facts["distance_m"] = {
+        role: float(np.nanmedian(chord)) for role, chord in found.chord_m.items() if np.isfinite(chord).any()
+    }
+    refused = {refusal.role for refusal in checks.refusals}
+    why = contradictions(found, turning=turning)
+    checks.refusals += [Refusal(role, text) for role, text in why.items() if role not in refused]
+
+
+def _turning_as_felt(
+    checks: Checks, twists: Mapping[str, Floats], imu: InertialMeasurements | None, at_ns: NDArray[np.int64]
+) -> dict[str, Floats]:
+    """Return the twists with the yaw rate of the gyroscope where it confirms theirs: wheels that skid turn by too much."""
+    confirmed = {role for role, axis in checks.facts.get("yaw_axis", {}).items() if axis["axis"][2] > -_OTHER_WAY}
+    if imu is None or any(refusal.role == IMU for refusal in checks.refusals):
+        return dict(twists)
+    felt = on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns)[:, 2]
+    return {
+        role: np.column_stack((twist[:, 0], np.where(np.isfinite(felt), felt, twist[:, 1])))
+        if role in confirmed
+        else twist
+        for role, twist in twists.items()
+    }
+
+
+def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], at_ns: NDArray[np.int64]) -> None:
+    """Check that the fixes go the way the odometries do; one odometry that no gyroscope confirms is as doubtful as they are."""
+    refused = {refusal.role for refusal in checks.refusals}
+    told = {role: path_of_fixes(gnss, twist, at_ns) for role, twist in twists.items() if role not in refused}
+    against = [role for role, how in told.items() if how in {"mirrored", "unlike"}]
+    if GNSS in refused or not against or "alike" in told.values():
+        return
+    confirmed = len(against) > 1 or against[0] in checks.facts.get("yaw_axis", {})
+    doubt = "" if confirmed else ", and nothing tells which of the two is right"
+    by = " and ".join(against)
+    if "unlike" in told.values():
+        if confirmed:
+            checks.refusals.append(Refusal(GNSS, f"its path is not that by {by} (another clock, drive or receiver?)"))
+        return
+    exchanged = f"its path is the mirror image of that by {by} (latitude and longitude exchanged?)"
+    checks.refusals.append(Refusal(GNSS, exchanged + doubt))
+    if doubt:
+        checks.refusals.append(
+            Refusal(against[0], f"its yaw rate has the opposite sign of {GNSS}{doubt}", turned_by=YAW)
+        )
+
+
+def _check_imu(
+    checks: Checks,
+    imu: InertialMeasurements,
+    at_ns: NDArray[np.int64],
+    felt: float,
+    *,
+    twists: Mapping[str, Floats],
+    turning: Mapping[str, Floats],
+    stated: Mapping[str, bool],
+) -> dict[str, float]:
+    """Check units, gravity and yaw; return the yaw of the unit by each odometry [rad] where it is upright."""
+    rate = averaged(on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _SMOOTH_S)
+    axes = {role: found for role, yaw in turning.items() if (found := yaw_axis(yaw, rate)) is not None}
+    up = up_axis(imu.specific_force_mps2)
+    checks.facts |= {"specific_force_median": felt, "up": up.tolist()}
+    checks.facts["yaw_axis"] = {role: {"axis": a.axis.tolist(), "scale": a.scale} for role, a in axes.items()}
+    units = _units(rate, axes, felt)
+    if units is not None:
+        checks.refusals.append(Refusal(IMU, _units_text(units, axes, rate, felt), units=units))
+        return {}
+    if not _IN_MPS2[0] <= felt <= _IN_MPS2[1]:
+        return {}
+    level = levelling(up)
+    force = on_grid(imu.stamp_ns, imu.specific_force_mps2 @ level.T, at_ns)
+    looks = {}
+    for role, twist in twists.items():
+        late_s = axes[role].late_s if role in axes else 0.0
+        if (ahead := forward_yaw_rad(twist, force, late_s)) is not None:
+            looks[role] = ahead[0]
+            checks.facts.setdefault("looks_rad", {})[role] = list(ahead)
+    if up[2] < np.cos(_TILTED_RAD):
+        tilt_deg = float(np.degrees(np.arccos(up[2])))
+        why = f"gravity lies {tilt_deg:.0f}° off the robot's z axis"
+        checks.refusals.append(Refusal(IMU, why, turned_by=_upright(level, looks)))
+        return {}
+    return _check_yaw_sign(checks, axes, looks, stated)
+
+
+def _units(rate: Floats, axes: Mapping[str, YawAxis], felt: float) -> str | None:
+    """Return the recipe's word for the units an IMU seems to be in, or None where they are SI."""
+    if axes:
+        degrees = float(np.median([axis.scale for axis in axes.values()])) < _IN_DEGREES
+    else:
+        known = np.linalg.norm(rate[np.isfinite(rate.sum(1))], axis=1)
+        degrees = known.size > 0 and float(np.percentile(known, 99.5)) > _NO_ROBOT_TURNS_RADPS
+    words = (["deg"] if degrees else []) + (["g"] if _IN_G[0] <= felt <= _IN_G[1] else [])
+    return "_".join(words) or None
+
+
+def _units_text(units: str, axes: Mapping[str, YawAxis], rate: Floats, felt: float) -> str:
+    parts = []
+    if "deg" in units and axes:
+        role, axis = next(iter(axes.items()))
+        parts.append(f"its gyroscope turns {1 / axis.scale:.0f} times as fast as {role} (degrees: 57)")
+    elif "deg" in units:
+        parts.append(f"its gyroscope tells up to {np.nanmax(np.abs(rate)):.0f}, which no robot turns in rad/s")
+    if "g" in units.split("_"):
+        parts.append(f"its specific force at rest is {felt:.2f} (in g 1, in m/s² 9.81)")
+    return " and ".join(parts)
+
+
+def _upright(level: Floats, looks: Mapping[str, float]) -> Floats:
+    """Return the rotation that stands an IMU upright and, where acceleration shows it, looking ahead."""
+    yaw = next(iter(looks.values()), 0.0)
+    return nearest_mounting(_about_z(yaw) @ level)
+
+
+def _about_z(yaw_rad: float) -> Floats:
+    c, s = np.cos(yaw_rad), np.sin(yaw_rad)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _check_yaw_sign(
+    checks: Checks, axes: Mapping[str, YawAxis], looks: dict[str, float], stated: Mapping[str, bool]
+) -> dict[str, float]:
+    """Check that gyroscope, odometries and fixes turn the same way, the IMU being upright by gravity."""
+    against = [role for role, axis in axes.items() if axis.axis[2] < _OTHER_WAY]
+    others = [role for role, axis in axes.items() if axis.axis[2] > -_OTHER_WAY]
+    blamed = [role for role in against if role != GNSS]
+    if not blamed:
+        return looks
+    if others or (len(against) == 1 and stated.get(IMU, False)):
+        for role in blamed:
+            with_whom = " and ".join((IMU, *others))
+            checks.refusals.append(Refusal(role, f"its yaw rate has the opposite sign of {with_whom}", turned_by=YAW))
+        return looks
+    why = f"it is upright by gravity, but its gyroscope turns the other way round than {' and '.join(against)}"
+    checks.refusals.append(Refusal(IMU, f"{why}: gyroscope or accelerometer has the wrong sign"))
+    return {}
+
+
+def _check_directions(
+    checks: Checks,
+    twists: Mapping[str, Floats],
+    at_ns: NDArray[np.int64],
+    *,
+    command: Command | None,
+    looks: Mapping[str, float],
+    stated: Mapping[str, bool],
+) -> None:
+    """Check that the odometries go forward when the command or, without one, the accelerations say so."""
+    forward = {role: twist[:, 0] for role, twist in twists.items()}
+    against = _against_command(forward, command, at_ns)
+    if against:
+        for role in (role for role, backwards in against.items() if backwards):
+            _add_turned(checks, role, "it drives the other way than the command says")
+        return
+    backwards = [role for role, yaw in looks.items() if abs(yaw) > _BACKWARDS_RAD]
+    if backwards and len(backwards) == len(forward) and (len(forward) > 1 or not stated.get(IMU, False)):
+        why = f"by the accelerations of {' and '.join(backwards)} it looks backwards"
+        checks.refusals.append(Refusal(IMU, why, turned_by=FORWARD))
+        return
+    for role in backwards:
+        _add_turned(checks, role, f"it drives the other way than the accelerations of {IMU} say")
+    same = agreement(forward[WHEELS], forward[VISUAL]) if len(forward) > 1 and not looks else None
+    if same is not None and same < _OTHER_WAY:
+        _add_turned(
+            checks, VISUAL, f"it drives the other way than {WHEELS}, and nothing tells which of the two is right"
+        )
+    aside = {role: yaw for role, yaw in looks.items() if _LOOKS_ELSEWHERE_RAD < abs(yaw) <= _BACKWARDS_RAD}
+    if aside and len(aside) == len(looks):
+        yaw = next(iter(aside.values()))
+        why = f"by the accelerations of {' and '.join(aside)} it looks {np.degrees(yaw):.0f}° aside"
+        checks.refusals.append(Refusal(IMU, why, turned_by=nearest_mounting(_about_z(yaw))))
+
+
+def _against_command(
+    forward: Mapping[str, Floats], command: Command | None, at_ns: NDArray[np.int64]
+) -> dict[str, bool]:
+    """Return for each odometry that moves while a command stands whether it goes the other way."""
+    if command is None:
+        return {}
+    wanted = hold_last(command.stamp_ns, command.forward_velocity_mps, at_ns)
+    same = {role: agreement(velocity, wanted) for role, velocity in forward.items()}
+    return {role: value < _OTHER_WAY for role, value in same.items() if value is not None}
+
+
+def _add_turned(checks: Checks, role: str, why: str) -> None:
+    """Refuse an odometry that drives backwards, in one with a yaw rate that turns the other way."""
+    before = next((refusal for refusal in checks.refusals if refusal.role == role), None)
+    if before is None or before.turned_by is None:
+        checks.refusals.append(Refusal(role, why, turned_by=FORWARD))
+        return
+    checks.refusals.remove(before)
+    checks.refusals.append(Refusal(role, f"{before.why}, and {why}", turned_by=FORWARD @ before.turned_by))

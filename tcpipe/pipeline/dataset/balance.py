@@ -1,0 +1,285 @@
+"""What a dataset covers and where it is thin: cells of class, slope and speed, the repeatability floor, and where to drive next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS
+from shapely.geometry.base import BaseGeometry
+from shapely.geometry.polygon import orient
+
+from tcpipe.balance.cells import (
+    ENOUGH,
+    SLOPE_EDGES_DEG,
+    SLOPE_NAMES,
+    Cell,
+    count_cells,
+    slope_ranges,
+    speed_edges,
+)
+from tcpipe.balance.correlation import correlations, residuals
+from tcpipe.balance.repeats import Floor, repeatability, repeated_pairs
+from tcpipe.balance.thin_ground import CELL_M, CLOSED, Ground, Patch, cell_classes, cell_gradients, offered, thin_ground
+from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.splits.assignment import SPLITS
+from tcpipe.splits.regions import Regions
+from tcpipe.tables.columns import floats, integers
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+
+BALANCE_COLUMNS = (
+    *("run_id", "split", "start_ns", "course_rad", "terrain_class", "slope_rad"),
+    *("power_watt", "velocity_mps", "fused_velocity_mps", "duration_s", "energy_joule"),
+)
+"""Columns of samples.parquet that the balance is made from."""
+
+_EDGE_STEP_DEG = 1e-4
+_DECIMALS = 8
+"""Of a degree: a millimetre."""
+
+DRIVE_NEXT = "drive-next.geojson"
+
+_USED = tuple(name for name in SPLITS if name != "buffer")
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class _Samples:
+    """What is asked of every sample, (N,) each; ``xy_m`` is its footprint's centre in the first map's plane, (N, 2)."""
+
+    split: NDArray[np.str_]
+    run: Ints
+    start_ns: Ints
+    course_rad: Floats
+    terrain: Ints
+    slope: Floats
+    labels: Mapping[str, Floats]
+    xy_m: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """The balance as JSON values for the card, and the GeoJSON document of `DRIVE_NEXT`."""
+
+    facts: Mapping[str, Any]
+    drive_next: Mapping[str, Any]
+
+
+def measure_balance(
+    table: pa.Table,
+    xy_m: Floats,
+    sources: Sequence[MapFile],
+    *,
+    velocity_column: str,
+    chord_m: float,
+    regions: Regions | None,
+    buffer_m: float,
+) -> Balance:
+    """Measure what the samples cover.
+
+    Parameters
+    ----------
+    table
+        `BALANCE_COLUMNS` of the samples, in the dataset's order, which is random.
+    xy_m
+        Centres of their footprints in the first map's plane [m], shape (N, 2).
+    sources
+        The maps, the first ruling where they overlap.
+    velocity_column
+        The velocity that is the label.
+    chord_m
+        Segment length [m].
+    regions, buffer_m
+        Of the split, in WGS84 lon/lat [deg] and [m]: what they exclude, and what lies in the buffer, is not worth driving.
+
+    """
+    samples = _samples(table, xy_m, velocity_column)
+    left = {name: residuals(values, samples.terrain, samples.slope) for name, values in samples.labels.items()}
+    alike = correlations(
+        {name: left[name] for name in ("power_watt", velocity_column)},
+        xy_m,
+        samples.run,
+        samples.start_ns,
+        chord_m=chord_m,
+    )
+    known = [found for found in alike.values() if found is not None]
+    slopes, edges = slope_ranges(samples.slope), speed_edges(samples.labels[velocity_column])
+    speeds = np.searchsorted(edges, samples.labels[velocity_column], side="right").astype(np.int64)
+    pairs = count_cells((samples.terrain, slopes), samples.split, xy_m, known, splits=_USED)
+    cells = count_cells((samples.terrain, slopes, speeds), samples.split, xy_m, known, splits=_USED)
+    rooms = [_Room(source, sources[:number], sources[0], regions, buffer_m) for number, source in enumerate(sources)]
+    names = dict(enumerate(sources[0].classes.names().tolist()))
+    rows, features = _by_ground(pairs, rooms, samples, slopes, names)
+    facts = {
+        "slope_edges_deg": list(SLOPE_EDGES_DEG),
+        "speed_edges_mps": list(edges),
+        "enough_effective": ENOUGH,
+        "correlation": {name: None if found is None else asdict(found) for name, found in alike.items()},
+        "by_class_and_slope": rows,
+        "cells": [_cell_json(cell, names, edges) for cell in cells],
+        "repeatability": {name: _floor_json(found) for name, found in _floors(samples, left, chord_m)},
+    }
+    return Balance(facts, {"type": "FeatureCollection", "features": features})
+
+
+def _samples(table: pa.Table, xy_m: Floats, velocity_column: str) -> _Samples:
+    labels = ("power_watt", velocity_column, "duration_s", "energy_joule")
+    splits, runs = (table.column(name).combine_chunks().dictionary_encode() for name in ("split", "run_id"))
+    return _Samples(
+        split=np.array(splits.dictionary.to_pylist(), np.str_)[splits.indices.to_numpy()],
+        run=runs.indices.to_numpy().astype(np.int64),
+        start_ns=integers(table, "start_ns"),
+        course_rad=floats(table, "course_rad"),
+        terrain=table.column("terrain_class").fill_null(0).to_numpy().astype(np.int64),
+        slope=floats(table, "slope_rad"),
+        labels={name: floats(table, name) for name in labels},
+        xy_m=xy_m,
+    )
+
+
+def _floors(samples: _Samples, left: Mapping[str, Floats], chord_m: float) -> Iterator[tuple[str, Floor | None]]:
+    pairs = repeated_pairs(samples.xy_m, samples.course_rad, samples.terrain, chord_m=chord_m)
+    for name, values in samples.labels.items():
+        yield name, repeatability(values, left[name], pairs, samples.xy_m, chord_m=chord_m)
+
+
+def _floor_json(found: Floor | None) -> dict[str, Any] | None:
+    return None if found is None else asdict(found)
+
+
+def _cell_json(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> dict[str, Any]:
+    found: dict[str, Any] = {
+        "class": names[cell.terrain_class] or None,
+        "class_id": cell.terrain_class,
+        "slope": SLOPE_NAMES[cell.slope],
+        "samples": dict(cell.samples),
+        "effective": cell.effective,
+        "effective_train": cell.effective_train,
+        "rare": cell.rare,
+    }
+    if cell.speed is not None:
+        ends = ("0", *(f"{edge:g}" for edge in edges))
+        last = cell.speed == len(edges)
+        found["speed_mps"] = f"above {ends[-1]}" if last else f"{ends[cell.speed]} to {ends[cell.speed + 1]}"
+    return found
+
+
+class _Room:
+    """The ground of one map that is worth driving: not what an earlier map covers, a region excludes, or the buffer takes."""
+
+    def __init__(
+        self, source: MapFile, earlier: Sequence[MapFile], first: MapFile, regions: Regions | None, buffer_m: float
+    ) -> None:
+        plane, own = parse_crs(first.grid.crs, where="map"), parse_crs(source.grid.crs, where="map")
+        area_deg = area_of(own, source.grid.bounds_m)
+        self._from_plane = Projection(plane, own, area_deg)
+        self._to_lonlat = Projection(own, CRS.from_epsg(4326), area_deg)
+        self.ground = _ground(source)
+        taken = [shapely.box(*_bounds_in(other, own)) for other in earlier]
+        for area, reach_m in () if regions is None else ((regions.exclude, 0.0), (regions.borders(), buffer_m)):
+            near = shapely.segmentize(shapely.intersection(area, shapely.box(*area_deg)), _EDGE_STEP_DEG)
+            taken.append(shapely.buffer(shapely.transform(near, self._to_lonlat.inverse), reach_m))
+        _close(self.ground, taken)
+
+    def area_m2(self, terrain_class: int, slope: int) -> float:
+        """Return how much ground offers a class and a range of slope."""
+        return float(offered(self.ground, terrain_class, slope).sum()) * self.ground.cell_m**2
+
+    def patches(self, terrain_class: int, slope: int, driven_xy_m: Floats) -> Iterator[tuple[Patch, BaseGeometry]]:
+        """Yield the patches of `thin_ground` and their polygons in WGS84 lon/lat; ``driven_xy_m`` is in the first map's plane."""
+        for patch in thin_ground(self.ground, terrain_class, slope, self._from_plane.forward(driven_xy_m)):
+            lonlat = shapely.transform(patch.polygon, self._to_lonlat.forward)
+            yield patch, orient(shapely.transform(lonlat, lambda deg: np.round(deg, _DECIMALS)))
+
+
+def _bounds_in(source: MapFile, crs: CRS) -> tuple[float, float, float, float]:
+    from_crs = parse_crs(source.grid.crs, where="map")
+    corners = shapely.segmentize(shapely.box(*source.grid.bounds_m), 50.0)
+    projection = Projection(from_crs, crs, area_of(from_crs, source.grid.bounds_m))
+    found: tuple[float, float, float, float] = tuple(shapely.bounds(shapely.transform(corners, projection.forward)))
+    return found
+
+
+def _close(ground: Ground, taken: Sequence[BaseGeometry]) -> None:
+    """Close the cells that any of the areas reaches into."""
+    rows, cols = np.nonzero(ground.terrain_class != CLOSED)
+    x_m, y_m = ground.x_min_m + (cols + 0.5) * ground.cell_m, ground.y_max_m - (rows + 0.5) * ground.cell_m
+    for area in taken:
+        reached = shapely.buffer(area, ground.cell_m / np.sqrt(2.0))
+        shapely.prepare(reached)
+        inside = shapely.contains_xy(reached, x_m, y_m)
+        ground.terrain_class[rows[inside], cols[inside]] = CLOSED
+
+
+def _ground(source: MapFile) -> Ground:
+    """Read the cells of a map from its coarsest level, strip by strip."""
+    level = source.at(source.factors[-1]) if len(source.factors) > 1 else source
+    grid = level.grid
+    pixels = max(2, round(CELL_M / grid.pitch_m))
+    classes, gradients = [], []
+    strip = max(pixels, level.tile_px // pixels * pixels)
+    for row in range(0, grid.rows - pixels + 1, strip):
+        last = min(row + strip, grid.rows)
+        heights = level.read("height", row, last, 0, grid.cols)
+        gradient = cell_gradients(heights.astype(np.float64), pixels, grid.pitch_m)
+        known = np.isfinite(gradient).all(axis=-1)
+        kinds = np.zeros(known.shape, np.int16)
+        if "terrain" in level.layers:
+            terrain = level.read("terrain", row, last, 0, grid.cols)
+            kinds = cell_classes(terrain, pixels, level.classes.traversable())
+        classes.append(np.where(known, kinds, np.int16(CLOSED)))
+        gradients.append(gradient)
+    shape = (0, grid.cols // pixels)
+    return Ground(
+        np.concatenate([np.empty(shape, np.int16), *classes]),
+        np.concatenate([np.empty((*shape, 2)), *gradients]),
+        grid.x_min_m,
+        grid.y_max_m,
+        pixels * grid.pitch_m,
+    )
+
+
+def _by_ground(
+    pairs: Sequence[Cell], rooms: Sequence[_Room], samples: _Samples, slopes: Ints, names: Mapping[int, str]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return a row for each class and slope that was driven or that the maps offer, and the features of where to drive next."""
+    driven = {(cell.terrain_class, cell.slope): cell for cell in pairs}
+    kinds = {int(kind) for room in rooms for kind in np.unique(room.ground.terrain_class)} - {CLOSED}
+    rows, thin = [], []
+    for kind in sorted(kinds | {kind for kind, _ in driven}):
+        for slope in range(len(SLOPE_NAMES)):
+            cell = driven.get((kind, slope)) or Cell(kind, slope, None, dict.fromkeys(_USED, 0), 0.0, 0.0)
+            area_m2 = sum(room.area_m2(kind, slope) for room in rooms)
+            if area_m2 == 0.0 and (kind, slope) not in driven:
+                continue
+            rows.append({**_cell_json(cell, names, ()), "offered_m2": area_m2})
+            if cell.rare and area_m2 > 0.0:
+                here = samples.xy_m[(samples.terrain == kind) & (slopes == slope) & (samples.split != "buffer")]
+                thin += [(cell, patch, lonlat) for room in rooms for patch, lonlat in room.patches(kind, slope, here)]
+    thin.sort(key=lambda found: (found[0].effective or 0.0, found[0].terrain_class, found[0].slope, -found[1].area_m2))
+    features = [_feature(rank, cell, patch, lonlat, names) for rank, (cell, patch, lonlat) in enumerate(thin, start=1)]
+    return rows, features
+
+
+def _feature(rank: int, cell: Cell, patch: Patch, lonlat: BaseGeometry, names: Mapping[int, str]) -> dict[str, Any]:
+    """Return a feature of RFC 7946: rings to the right-hand rule, lon before lat."""
+    return {
+        "type": "Feature",
+        "properties": {
+            "rank": rank,
+            "class": names[cell.terrain_class] or None,
+            "slope": SLOPE_NAMES[cell.slope],
+            "drive_towards": patch.towards,
+            "samples": sum(cell.samples.values()),
+            "effective_samples": None if cell.effective is None else round(cell.effective, 1),
+            "area_m2": round(patch.area_m2, 1),
+        },
+        "geometry": shapely.geometry.mapping(lonlat),
+    }

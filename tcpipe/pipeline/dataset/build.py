@@ -1,0 +1,338 @@
+"""From labelled segments and a map to a dataset: sample, split, audit, write; whole or not at all."""
+
+from __future__ import annotations
+
+import logging
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from tcpipe.cost.budget import in_words
+from tcpipe.errors import DatasetError, UsageError, plain_lines
+from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
+from tcpipe.formats.croissant import croissant
+from tcpipe.formats.dataset_files import (
+    CARD,
+    CROISSANT,
+    OVERVIEW,
+    REPORT,
+    SAMPLES,
+    SHARDS,
+    FileFormat,
+    Pixels,
+    read_card,
+    read_current_card,
+    read_samples,
+    write_patches_parquet,
+    write_patches_zarr,
+)
+from tcpipe.formats.geojson import read_regions
+from tcpipe.formats.json_files import plain, write_json
+from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
+from tcpipe.formats.places import local_output
+from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+from tcpipe.formats.seals import file_checksum, file_checksums, sealed_page, write_sealed
+from tcpipe.formats.zarr_arrays import Compression
+from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, DRIVE_NEXT, measure_balance
+from tcpipe.pipeline.dataset.card import (
+    CARD_COLUMNS,
+    VELOCITY_COLUMN,
+    CardFacts,
+    dataset_card,
+    is_whole,
+    map_to_json,
+)
+from tcpipe.pipeline.dataset.content import Content, gather_content
+from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
+from tcpipe.pipeline.dataset.runs import gone_runs
+from tcpipe.pipeline.dataset.segments import KEPT
+from tcpipe.pipeline.dataset.splitting import empty_splits, regions_to_json
+from tcpipe.recipe import Recipe
+from tcpipe.report.dataset_report import dataset_report
+from tcpipe.report.overview import maps_overview, write_overview
+from tcpipe.splits.assignment import SPLITS
+from tcpipe.splits.audit import HeldOut, audit_lines
+from tcpipe.splits.holdouts import Holdout
+from tcpipe.splits.regions import Regions
+from tcpipe.store import open_store
+from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
+
+logger = logging.getLogger("tcpipe")
+
+
+@dataclass(frozen=True, slots=True)
+class BuildResult:
+    """What became of a dataset; ``str`` of it is what the command prints."""
+
+    path: Path
+    status: str
+    """``done`` or ``unchanged``."""
+    samples: int
+    splits: Mapping[str, int]
+    ledger_m: Mapping[str, float]
+    audit: tuple[HeldOut, ...]
+    warnings: tuple[str, ...]
+    problems: tuple[str, ...] = ()
+    """Runs that belong in and are left out, and splits that were asked for and are empty: the dataset is not what it should be."""
+    energy_budget: Mapping[str, Any] | None = None
+
+    @property
+    def exit_code(self) -> int:
+        """Return 3 if the dataset is not what it should be, else 0."""
+        return 3 if self.problems else 0
+
+    def __str__(self) -> str:
+        """Return counts, the audit, where the metres went and how wrong a label may be, as plain lines."""
+        counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
+        head = f"{self.path}: {self.samples} samples ({counts})"
+        if self.status == "unchanged":
+            head += "; nothing to do: it is made from the same runs, map, region and recipe"
+        lost = [(name, metres) for name, metres in self.ledger_m.items() if metres >= 0.5 and name != KEPT]
+        lost.sort(key=lambda entry: (-entry[1], entry[0]))
+        ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
+        ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
+        floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
+        said = (f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s"))
+        return plain_lines((head, *audit_lines(self.audit), ledger, *floor, *said))
+
+
+def build_dataset(
+    out: str | Path = "dataset",
+    *,
+    store: str | Path = "tcpipe-store",
+    split: str | Path | None = None,
+    map_name: str | Sequence[str] | None = None,
+    robot: str | None = None,
+    tags: Mapping[str, str] | None = None,
+    recipe: Recipe | str | Path | None = None,
+    jobs: int = 1,
+    file_format: FileFormat = "zarr",
+    holdout: Holdout | None = None,
+    seed: int | None = None,
+    keep_split: str | Path | None = None,
+    min_runs: int | None = None,
+) -> BuildResult:
+    """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
+
+    Runs that are not as they were written are left out; those, runs that have to be ingested again, runs of the dataset that is replaced
+    that are gone, and empty splits are the result's ``problems``.
+
+    Parameters
+    ----------
+    out
+        Directory of the dataset: new, empty, or a dataset, which is replaced unless it is made from the same inputs.
+    store
+        Where runs and maps are kept.
+    split
+        GeoJSON region (WGS84): inside is train and test, outside is unseen. None: everything is train and test.
+    map_name
+        Map to sample, or several, the first ruling where they overlap; None takes the only one in the store.
+    robot
+        Only runs of this robot; needed where the store holds several.
+    tags
+        Only runs that carry all of these tags.
+    recipe
+        A `Recipe`, a path to one, or None for the one that rules here.
+    jobs
+        Processes that sample side by side; the bytes do not depend on it.
+    file_format
+        ``zarr`` or ``parquet``.
+    holdout, seed
+        Instead of the recipe's.
+    keep_split
+        An earlier dataset, which may be ``out`` itself: its samples keep their split and fold, only new ones are drawn.
+    min_runs
+        Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
+
+    Raises
+    ------
+    DatasetError, RegionError, MapError, StoreError, RecipeError
+        Nothing is written then.
+
+    """
+    ruling = _ruling(recipe, holdout=holdout, seed=seed)
+    place, house = local_output(out), open_store(store)
+    clear_beside(place)
+    known, proved = _card_in_place(place)
+    regions = None if split is None else read_regions(Path(split))
+    region = None if split is None else Path(split).read_bytes()
+    robot = robot or ruling.robot
+    earlier = None if keep_split is None else earlier_splits(Path(keep_split))
+    inputs = choose_inputs(
+        house,
+        ruling,
+        map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
+        robot=robot,
+        tags=tags,
+        region=region,
+        file_format=file_format,
+        earlier=earlier,
+    )
+    problems, warnings = _left_out(inputs, known, robot=robot, tags=tags or {}, min_runs=min_runs)
+    inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
+    if proved and known is not None and known["inputs"] == inputs.digest and is_whole(place, known):
+        return _result(place, "unchanged", known, problems)
+    with atomic_directory(place.absolute()) as directory:
+        card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
+    return _result(place, "done", card, problems)
+
+
+def _left_out(
+    inputs: Inputs, known: Mapping[str, Any] | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return what is wrong with the choice of runs, and what is worth a warning; `DatasetError` where there are too few."""
+    chosen = inputs.chosen
+    fewer = (*chosen.missing, *(() if known is None else gone_runs(known, chosen, robot=robot, tags=tags)))
+    if min_runs is None:
+        return (*chosen.damaged, *fewer), ()
+    if len(inputs.runs) < min_runs:
+        count = f"{len(inputs.runs)} runs, wanted {min_runs} or more (--min-runs); nothing is written"
+        raise DatasetError(count, *chosen.damaged, *fewer)
+    return chosen.damaged, fewer
+
+
+def _result(place: Path, status: str, card: Mapping[str, Any], problems: Sequence[str]) -> BuildResult:
+    return BuildResult(
+        path=place,
+        status=status,
+        samples=card["samples"],
+        splits={name: card["splits"][name] for name in SPLITS},
+        ledger_m=card["ledger_m"],
+        audit=tuple(HeldOut(**part) for part in card["split"]["audit"]),
+        warnings=tuple(card["warnings"]),
+        problems=(*problems, *empty_splits(card)),
+        energy_budget=card.get("energy_budget"),
+    )
+
+
+def _ruling(recipe: Recipe | str | Path | None, *, holdout: Holdout | None, seed: int | None) -> Recipe:
+    """Return the recipe with the command's own choices in it."""
+    if not isinstance(recipe, Recipe):
+        recipe = load_recipe(find_recipe(None if recipe is None else Path(recipe), Path.cwd()))
+    rules = replace(
+        recipe.split,
+        holdout=recipe.split.holdout if holdout is None else holdout,
+        seed=recipe.split.seed if seed is None else seed,
+    )
+    return replace(recipe, split=rules)
+
+
+def _card_in_place(place: Path) -> tuple[Mapping[str, Any] | None, bool]:
+    """Return the card of the dataset that is there, if one is, and whether it is as it was written; `DatasetError` for anything else."""
+    if not place.exists() or (place.is_dir() and not any(place.iterdir())):
+        return None, False
+    if not place.is_dir():
+        raise UsageError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
+    if not (place / CARD).is_file():
+        raise UsageError(f"{place}: exists and is no dataset (it has no {CARD}); it is left alone; give another OUT")
+    card, proved = read_card(place, proved=False), True
+    try:
+        read_current_card(place)
+    except DatasetError as error:
+        proved = False
+        logger.warning("%s; it is built again", error.problems[0])
+    ours = {*card.get("checksums", {}), CARD, CROISSANT, REPORT}
+    others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
+    if others:
+        more = f" and {len(others) - 1} more" if len(others) > 1 else ""
+        raise UsageError(f"{place}: holds {others[0]}{more} beside the dataset; move it away or give another OUT")
+    return card, proved
+
+
+def _build(
+    directory: Path,
+    inputs: Inputs,
+    recipe: Recipe,
+    regions: Regions | None,
+    earlier: pa.Table | None,
+    *,
+    file_format: FileFormat,
+    jobs: int,
+) -> dict[str, Any]:
+    """Write the dataset into ``directory`` and return its card."""
+    spool = directory / "spool"
+    spool.mkdir()
+    content = gather_content(spool, inputs, recipe, regions, earlier, jobs=jobs)
+    logger.info("writing %d samples", len(content.samples))
+    with parquet_rows(directory / SAMPLES, SAMPLES_SCHEMA.arrow()) as write:
+        for piece in content.samples.pieces(ROWS_PER_GROUP):
+            write(piece)
+    shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
+    shutil.rmtree(spool)
+    write_overview(directory / OVERVIEW, maps_overview(content.sources))
+    balance = measure_balance(
+        read_samples(directory, BALANCE_COLUMNS),
+        content.samples.centres_xy_m(),
+        content.sources,
+        velocity_column=VELOCITY_COLUMN[recipe.label.velocity],
+        chord_m=recipe.segment.chord_m,
+        regions=regions,
+        buffer_m=content.drawn.buffer_m,
+    )
+    write_json(directory / DRIVE_NEXT, balance.drive_next)
+    files = file_checksums(directory)
+    patches = {layer.name: content.spool.patch_px**2 for layer in content.layers} if file_format == "parquet" else None
+    write_json(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches))
+    facts = CardFacts(
+        inputs=inputs.digest,
+        file_format=file_format,
+        layers=content.layers,
+        classes=content.sources[0].classes,
+        region=None if regions is None else regions_to_json(regions),
+        buffer_m=content.drawn.buffer_m,
+        audit=content.drawn.audit,
+        kept=content.drawn.kept,
+        runs=inputs.sources,
+        maps=[
+            {**map_to_json(source), "sha256": sha256, "registration": registration}
+            for source, sha256, registration in zip(
+                content.sources, inputs.map_sha256, content.registrations, strict=True
+            )
+        ],
+        ledger_m=content.ledger_m,
+        removal=content.removal.to_json(),
+        balance=balance.facts,
+        problems=inputs.problems,
+        warnings=content.warnings,
+        shards=shards,
+        checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},
+    )
+    card = plain(dataset_card(read_samples(directory, CARD_COLUMNS), recipe, facts))
+    write_sealed(directory / CARD, card)
+    write_text(directory / REPORT, sealed_page(dataset_report(directory)))
+    return dict(card)
+
+
+def _write_patches(
+    directory: Path, content: Content, file_format: FileFormat, *, compression: Compression, threads: int
+) -> list[dict[str, Any]]:
+    """Write the layers; return the shards, where the format has any."""
+    samples, spool = content.samples, content.spool
+    pixels = Pixels(content.layers, spool.patch_px, samples.slots(), spool.read)
+    if file_format == "parquet":
+        return write_patches_parquet(directory, pixels, samples.take, samples.splits())
+    write_patches_zarr(directory, pixels, samples.ids, compression=compression, threads=threads)
+    return []
+
+
+def _croissant(
+    files: Mapping[str, tuple[int, str]], recipe: Recipe, inputs: str, patches: Mapping[str, int] | None
+) -> dict[str, Any]:
+    about = recipe.dataset
+    return croissant(
+        name=about.name,
+        description=about.description,
+        licence=about.licence,
+        creator=about.creator,
+        files=files,
+        samples_file=SAMPLES,
+        samples=SAMPLES_SCHEMA.arrow(),
+        version=f"{DATA_MODEL_VERSION}.0+{inputs[:12]}",
+        shards=None if patches is None else f"{SHARDS}/*.parquet",
+        layers=patches,
+    )

@@ -1,0 +1,155 @@
+"""What a dataset is made from: which runs and which map of a store, and one hash over all of it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe import __version__
+from tcpipe.errors import DatasetError, MapError, StoreError
+from tcpipe.formats.dataset_files import (
+    FileFormat,
+    read_card,
+    read_samples,
+    sample_columns,
+)
+from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_sealed
+from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
+from tcpipe.pipeline.recordings import each_drive_once
+from tcpipe.recipe import Recipe
+from tcpipe.store import RunDirectory, Store
+from tcpipe.tables.levels import DATA_MODEL_VERSION
+
+
+@dataclass(frozen=True, slots=True)
+class Inputs:
+    """Runs by id and what the card says of each, the maps, the hash over all inputs, and what was noticed on the way."""
+
+    runs: tuple[RunDirectory, ...]
+    sources: tuple[dict[str, Any], ...]
+    map_names: tuple[str, ...]
+    """In order of priority where maps overlap."""
+    map_paths: tuple[Path, ...]
+    map_sha256: tuple[str, ...]
+    """Over the checksums of each map's files."""
+    again: Mapping[str, NDArray[np.bool_]]
+    """By run: which of its segments another run has too."""
+    digest: str
+    chosen: Chosen
+    warnings: tuple[str, ...]
+    problems: tuple[str, ...] = ()
+    """What is wrong with the choice of runs."""
+
+
+def choose_inputs(
+    store: Store,
+    recipe: Recipe,
+    *,
+    map_names: Sequence[str],
+    robot: str | None,
+    region: bytes | None,
+    file_format: FileFormat,
+    tags: Mapping[str, str] | None = None,
+    earlier: pa.Table | None = None,
+) -> Inputs:
+    """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
+    names = choose_maps(store, map_names)
+    chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
+    once = each_drive_once(chosen.runs, {run_id: log["sha256"] for run_id, log in chosen.logs.items()})
+    runs = once.runs
+    paths = tuple(store.map_path(name) for name in names)
+    map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths, strict=True))
+    sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
+    fingerprint = digest(
+        {
+            "versions": [__version__, DATA_MODEL_VERSION],
+            "recipe": plain(asdict(recipe)),
+            "runs": sources,
+            "maps": list(zip(names, map_sha256, strict=True)),
+            "region": None if region is None else region.decode("utf-8", "replace"),
+            "format": file_format,
+            **({} if earlier is None else {"kept_split": _table_digest(earlier)}),
+        }
+    )
+    warnings = (*chosen.warnings, *once.warnings)
+    return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings)
+
+
+def _map_digest(name: str, path: Path) -> str:
+    """Return one hash over a map's files; `MapError` if they are not as they were written: a lost one would read as no data."""
+    found, wrong = file_checksums(path), list[str]()
+    try:
+        recorded = {
+            name: (entry["size_bytes"], entry["sha256"])
+            for name, entry in read_sealed(path / CHECKSUMS, {"checksums": dict})["checksums"].items()
+        }
+        names = {*found, *recorded} - {CHECKSUMS}
+        wrong = [str(path / name) for name in sorted(names) if found.get(name) != recorded.get(name)]
+    except StoreError as error:
+        wrong = list(error.problems)
+    if wrong:
+        what = f"{wrong[0]}{f' and {len(wrong) - 1} more' if len(wrong) > 1 else ''}"
+        raise MapError(
+            f"map {name}: not as it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
+        )
+    return digest(found)
+
+
+def earlier_splits(directory: Path) -> pa.Table:
+    """Return ``sample_id``, ``split`` and, where there is one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
+    read_card(directory)
+    there = sample_columns(directory)
+    missing = [name for name in ("sample_id", "split") if name not in there]
+    if missing:
+        raise DatasetError(f"{directory}: its samples have no column {missing[0]}; its split cannot be kept")
+    return read_samples(directory, [name for name in ("sample_id", "split", "fold") if name in there])
+
+
+def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
+    """Return the maps to sample: those named, in their order, or the only one."""
+    maps = store.maps()
+    if not maps:
+        raise DatasetError(f"{store.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
+    unknown = [name for name in names if name not in maps]
+    if unknown:
+        raise DatasetError(f"{store.root}: no map {unknown[0]!r} in the store; there are {', '.join(maps)}")
+    if not names and len(maps) > 1:
+        raise DatasetError(
+            f"{store.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map, or several, the first to rule "
+            "where they overlap"
+        )
+    return tuple(dict.fromkeys(names)) or (maps[0],)
+
+
+def run_source(run: RunDirectory, log: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, warnings and error budget."""
+    return {
+        "run_id": run.run_id,
+        "recipe_id": run.recipe_id,
+        "robot": run.robot,
+        "tags": dict(run.manifest["tags"]),
+        "logs": [Path(path).name for path in log["paths"]],
+        "sha256": log["sha256"],
+        "segments_sha256": run.manifest["checksums"]["segments.parquet"]["sha256"],
+        "driven_m": math.fsum(run.manifest["ledger_m"].values()),
+        "warnings": list(run.manifest["warnings"]),
+        "energy_budget": run.manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget"),
+    }
+
+
+def _table_digest(table: pa.Table) -> str:
+    """Return the sha256 (hex) of a table's values, hashed piece by piece."""
+    found = hashlib.sha256()
+    for batch in table.to_batches(max_chunksize=65_536):
+        found.update(json.dumps(batch.to_pydict(), sort_keys=True).encode())
+    return found.hexdigest()

@@ -1,0 +1,168 @@
+"""What of each class and slope is in the dataset and what is not, over every metre driven; and whether that depends on the ground."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.motion.ledger import interval_length_m, interval_reason
+from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.motion.removal import Group, main_reason, named_groups, tally_m, uneven
+from tcpipe.recipe import Recipe
+from tcpipe.store import RunDirectory
+from tcpipe.tables.bits import DropReason, name_of
+from tcpipe.tables.columns import floats, integers
+from tcpipe.terrain.point_classes import OFF_THE_MAP, classes_at
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+
+_COLUMNS = (
+    *("stamp_ns", "epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
+    *("lon_deg", "lat_deg", "pitch_rad", "forward_velocity_mps", "dropped_by"),
+)
+_SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
+_SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
+_REASONS = (
+    "in_samples",
+    *(name_of(bit) for bit in DropReason),
+    "curved_or_leftover",
+    "not_sampled",
+)
+"""Reason of each metre of a track; what is lost at sampling or to the split's buffer is one entry."""
+_LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
+
+
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """Metres by class and by slope: driven, in samples, and removed by reason; warnings where the removal is not even."""
+
+    by_class: tuple[Group, ...]
+    by_slope: tuple[Group, ...]
+    warnings: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return both tables for the card."""
+        return {
+            name: [{**asdict(group), "used_share": group.used_share} for group in groups]
+            for name, groups in (("by_class", self.by_class), ("by_slope", self.by_slope))
+        }
+
+
+def removed_by_ground(
+    runs: Sequence[RunDirectory],
+    segments: pa.Table,
+    used: NDArray[np.int64],
+    sources: Sequence[MapFile],
+    recipe: Recipe,
+) -> Removal:
+    """Return where the metres of all runs went, by the class under them and the slope along them.
+
+    Parameters
+    ----------
+    runs
+        The runs of the dataset, with their tracks.
+    segments
+        All segments that could become samples.
+    used
+        Rows of those that are train, test or unseen.
+    sources
+        The maps, the first ruling where they overlap; without a terrain layer there are no classes.
+    recipe
+        ``read.gnss_crs`` rules.
+
+    """
+    grounds = [_Ground(source, _projection(source, recipe)) for source in sources if "terrain" in source.layers]
+    table = sources[0].classes
+    names = ["off the map", "no data", *table.names().tolist()[1:]]
+    spans = _Spans(segments, used)
+    by_class, by_slope = np.zeros((len(names), len(_REASONS))), np.zeros((len(_SLOPE_NAMES), len(_REASONS)))
+    for run in runs:
+        length_m, reason, slope, ground = _metres(run, spans.of(run.run_id), grounds)
+        by_slope += tally_m(slope, reason, length_m, shape=by_slope.shape)
+        by_class += tally_m(ground - OFF_THE_MAP, reason, length_m, shape=by_class.shape)
+    slopes = named_groups(by_slope, _SLOPE_NAMES, _REASONS)
+    classes = named_groups(by_class, names, _REASONS) if grounds else ()
+    traversable = set(table.names()[table.traversable()].tolist())
+    lines = _warnings([group for group in classes if group.name in traversable], "class")
+    return Removal(classes, slopes, (*lines, *_warnings(slopes, "slope")))
+
+
+class _Spans:
+    """Start and end of every segment of a run, in order, and whether it is in use."""
+
+    def __init__(self, segments: pa.Table, used: NDArray[np.int64]) -> None:
+        is_used = np.zeros(segments.num_rows, np.bool_)
+        is_used[used] = True
+        runs = segments.column("run_id").combine_chunks().dictionary_encode()
+        self._code = {run_id: code for code, run_id in enumerate(runs.dictionary.to_pylist())}
+        code = runs.indices.to_numpy(zero_copy_only=False)
+        start, end = (integers(segments, f"{name}_ns") for name in ("start", "end"))
+        order = np.lexsort((start, code))
+        self._run, self._start, self._end, self._used = code[order], start[order], end[order], is_used[order]
+
+    def of(self, run_id: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]]:
+        code = self._code.get(run_id, -1)
+        rows = slice(*np.searchsorted(self._run, [code, code + 1]))
+        return self._start[rows], self._end[rows], self._used[rows]
+
+
+def _metres(
+    run: RunDirectory,
+    spans: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]],
+    grounds: Sequence[_Ground],
+) -> tuple[NDArray[Any], ...]:
+    """Return length [m], reason, slope and class (ids as `classes_at`) of every interval of a run's track."""
+    track = run.table("track", _COLUMNS)
+    stamp_ns, epoch = integers(track, "stamp_ns"), integers(track, "epoch")
+    piece = piece_of_rows(stamp_ns, epoch, period_ns=1e9 / run.manifest["info"]["rate_hz"])
+    position = np.column_stack([floats(track, f"{axis}_m") for axis in "xyz"])
+    velocity = np.column_stack([floats(track, f"{name}_velocity_mps") for name in ("east", "north", "up")])
+    length_m = interval_length_m(stamp_ns, position, velocity, piece)
+    dropped = interval_reason(track["dropped_by"].to_numpy(), piece)
+    reason = np.where(dropped > 0, np.log2(np.maximum(dropped, 1)).astype(np.int64) + 1, _LEFT_OVER)
+    start, end, used = spans
+    middle = stamp_ns[:-1] + np.diff(stamp_ns) // 2
+    row = np.searchsorted(start, middle, side="right") - 1
+    inside = (row >= 0) & (dropped == 0)
+    inside[inside] = middle[inside] < end[row[inside]]
+    reason[inside] = np.where(used[row[inside]], 0, _NOT_SAMPLED)
+    uphill = -np.degrees(floats(track, "pitch_rad")) * np.sign(floats(track, "forward_velocity_mps"))
+    slope = np.searchsorted(_SLOPES_DEG, 0.5 * (uphill[1:] + uphill[:-1]))
+    lonlat = np.stack([floats(track, "lon_deg"), floats(track, "lat_deg")], axis=1)
+    return length_m, reason, slope, _classes(grounds, 0.5 * (lonlat[1:] + lonlat[:-1]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Ground:
+    source: MapFile
+    projection: Projection
+
+
+def _projection(source: MapFile, recipe: Recipe) -> Projection:
+    crs = parse_crs(source.grid.crs, where=f"map {source.name}")
+    return Projection(parse_crs(recipe.read.gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
+
+
+def _classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the class id under each point on the first map that has one there, else as `classes_at`; 0 without maps."""
+    found = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
+    for ground in grounds:
+        open_yet = found <= 0
+        here = classes_at(ground.source, ground.projection.forward(lonlat_deg[open_yet]))
+        found[open_yet] = np.maximum(here, found[open_yet])
+    return found
+
+
+def _warnings(groups: Sequence[Group], what: str) -> list[str]:
+    driven_m, used_m = sum(group.driven_m for group in groups), sum(group.used_m for group in groups)
+    return [
+        f"what is removed depends on the {what}: {group.used_share:.0%} of {group.driven_m:.0f} m of {group.name} are in samples "
+        f"(most of the rest is {main_reason(group).replace('_', ' ') or 'nothing'}), {used_m / driven_m:.0%} over all; what is left may "
+        "not be typical of it"
+        for group in uneven(groups)
+    ]

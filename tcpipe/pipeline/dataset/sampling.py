@@ -1,0 +1,326 @@
+"""Segments of all runs to patches in one file a layer: batch by batch, each batch a patch of ground, side by side."""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from tcpipe.errors import DatasetError, MapError, TcpipeError
+from tcpipe.execution import run_all
+from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.recipe import SampleConfig
+from tcpipe.stages.sample import Sampled
+from tcpipe.stages.sample_maps import check_alike, sample_on_maps
+from tcpipe.tables.bits import Loss, name_of
+from tcpipe.tables.columns import floats
+from tcpipe.tables.levels import PLACED_SEGMENTS
+from tcpipe.terrain.layers import LAYERS
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.sampling_kernel import morton
+from tcpipe.terrain.tiles import TilePool, level_for
+
+_BATCH_ROWS = 8_192
+"""Segments sampled together: 50 MB of patches."""
+
+_DRAWER_ROWS = 16_384
+"""Segments in a drawer of the spool: 0.1 GB of patches, read together."""
+
+_CELL_DEG = 1e-4
+"""Batches follow a space-filling curve over cells of this size, so that a map tile is decoded for few of them."""
+
+_XY, _LONLAT, _MAP = "footprint_xy_m", "footprint_lonlat_deg", "map_index"
+
+_HELD_MAPS = 2
+"""Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
+
+_LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
+
+
+@dataclass(frozen=True, slots=True)
+class Spool:
+    """Pixels on disk while they wait for their place in the dataset: one file a layer, one slot a segment.
+
+    Slots are drawers of segments whose ranks are near, in the order of the ranks; what is sampled together lies side by side in a drawer.
+    So pixels are written in stretches as they come, and read in the dataset's order one drawer after another: shuffled on disk, never
+    held in memory.
+    """
+
+    directory: Path
+    layers: tuple[str, ...]
+    slots: int
+    patch_px: int
+
+    def create(self) -> None:
+        """Make the files; a slot that is never written takes no room."""
+        for layer in self.layers:
+            with self._path(layer).open("wb") as file:
+                file.truncate(self.slots * self._slot_bytes(layer))
+
+    def write(self, layer: str, slots: NDArray[np.int64], pixels: NDArray[Any]) -> None:
+        """Write patches, shape (n, px, px), to their slots, (n,)."""
+        order = np.argsort(slots)
+        stretches = np.split(order, np.flatnonzero(np.diff(slots[order]) != 1) + 1)
+        with self._path(layer).open("r+b", buffering=0) as file:
+            for stretch in stretches:
+                if len(stretch):
+                    file.seek(int(slots[stretch[0]]) * self._slot_bytes(layer))
+                    file.write(np.ascontiguousarray(pixels[stretch]).data)
+
+    def read(self, layer: str, slots: NDArray[np.int64]) -> NDArray[Any]:
+        """Return the patches in ``slots``, shape (n, px, px); the file is mapped only while they are copied."""
+        shape = (self.slots, self.patch_px, self.patch_px)
+        return np.asarray(np.memmap(self._path(layer), _dtype(layer), "r", shape=shape)[slots])
+
+    def _path(self, layer: str) -> Path:
+        return self.directory / layer
+
+    def _slot_bytes(self, layer: str) -> int:
+        return self.patch_px**2 * np.dtype(_dtype(layer)).itemsize
+
+
+def _dtype(layer: str) -> type[np.unsignedinteger[Any]]:
+    return np.uint16 if layer == "height" else np.uint8
+
+
+@dataclass(frozen=True, slots=True)
+class PatchTable:
+    """Patches of N of M segments: what each says of its patch, (N,), footprints, (N, 4, 2), and where its pixels wait.
+
+    ``segment`` are the rows of the segments table, rising; ``slot`` those of the spool; ``map_index`` says which map each lies on.
+    ``footprint_xy_m`` is in the CRS of the first map [m].
+    """
+
+    segment: NDArray[np.int64]
+    slot: NDArray[np.int64]
+    map_index: NDArray[np.uint8]
+    columns: Mapping[str, NDArray[Any]]
+    footprint_xy_m: NDArray[np.float64]
+    footprint_lonlat_deg: NDArray[np.float64]
+    spool: Spool
+    lost_m: Mapping[Loss, float]
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    rows: NDArray[np.int64]
+    slots: NDArray[np.int64]
+    segments: pa.Table
+    map_paths: tuple[Path, ...]
+    config: SampleConfig
+    gnss_crs: str
+    spool: Spool
+
+
+@dataclass(frozen=True, slots=True)
+class _HeldMap:
+    source: MapFile
+    tiles: TilePool
+
+
+_held: OrderedDict[Path, _HeldMap] = OrderedDict()
+"""Of this process, while it samples."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Batches(Sequence[_Batch]):
+    """The batches, each made when it is asked for, so that one copy of its segments exists at a time."""
+
+    rows: Sequence[NDArray[np.int64]]
+    slot_of: NDArray[np.int64]
+    segments: pa.Table
+    map_paths: tuple[Path, ...]
+    config: SampleConfig
+    gnss_crs: str
+    spool: Spool
+
+    def __len__(self) -> int:
+        """Return the number of batches."""
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, index: int) -> _Batch: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[_Batch]: ...
+    def __getitem__(self, index: int | slice) -> _Batch | Sequence[_Batch]:
+        """Return one batch, or some."""
+        if isinstance(index, slice):
+            return replace(self, rows=self.rows[index])
+        rows = self.rows[index]
+        segments = self.segments.take(pa.array(rows))
+        return _Batch(rows, self.slot_of[rows], segments, self.map_paths, self.config, self.gnss_crs, self.spool)
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """A batch's result without its pixels, which are in the spool."""
+
+    segment: NDArray[np.int64]
+    columns: Mapping[str, NDArray[Any]]
+    ledger_m: Mapping[str, float]
+    warnings: tuple[str, ...]
+
+
+def sample_all_segments(
+    segments: pa.Table,
+    ranks: NDArray[np.uint64],
+    map_paths: tuple[Path, ...],
+    config: SampleConfig,
+    *,
+    gnss_crs: str,
+    directory: Path,
+    jobs: int,
+) -> PatchTable:
+    """Sample every segment from the first map that has data for it; pixels go to files in ``directory``.
+
+    Parameters
+    ----------
+    segments
+        M segments, of any runs.
+    ranks
+        Their ranks in the dataset's order, uniform over 64 bits, shape (M,).
+    map_paths, config, gnss_crs
+        What is sampled, in order of priority, how, and the CRS of the segments' positions.
+    directory
+        Where the pixels wait.
+    jobs
+        Processes side by side.
+
+    Raises
+    ------
+    TcpipeError
+        The map or the segments cannot be used.
+
+    """
+    sources = [open_map(path) for path in map_paths]
+    check_alike(sources)
+    layers = tuple(layer for layer in LAYERS if layer in sources[0].layers)
+    spool = Spool(directory, layers, segments.num_rows, config.patch_px)
+    spool.create()
+    rows = list(_batch_rows(segments))
+    placed = segments.select(PLACED_SEGMENTS.names())
+    batches = _Batches(rows, _slots(rows, ranks), placed, map_paths, config, gnss_crs, spool)
+    kept = np.zeros(segments.num_rows, np.bool_)
+    columns: dict[str, NDArray[Any]] = {}
+    parts: dict[int, _Part] = {}
+    try:
+        with closing(run_all(_sample_batch, batches, jobs=jobs)) as outcomes:
+            for outcome in outcomes:
+                part = _sound(outcome.result)
+                kept[part.segment] = True
+                for name, values in part.columns.items():
+                    whole = columns.setdefault(name, np.zeros((len(kept), *values.shape[1:]), values.dtype))
+                    whole[part.segment] = values
+                parts[outcome.index] = replace(part, columns={})
+    finally:
+        _held.clear()
+    ended = [parts[index] for index in sorted(parts)]
+    segment = np.flatnonzero(kept)
+    for name in columns:
+        columns[name] = columns[name][segment]
+    return PatchTable(
+        segment=segment,
+        slot=batches.slot_of[segment],
+        map_index=columns.pop(_MAP, np.empty(0, np.uint8)),
+        footprint_xy_m=columns.pop(_XY, np.empty((0, 4, 2))),
+        footprint_lonlat_deg=columns.pop(_LONLAT, np.empty((0, 4, 2))),
+        columns=columns,
+        spool=spool,
+        lost_m={loss: math.fsum(part.ledger_m.get(name_of(loss), 0.0) for part in ended) for loss in _LOSSES},
+        warnings=tuple(dict.fromkeys(warning for part in ended for warning in part.warnings)),
+    )
+
+
+def _sound(part: _Part | TcpipeError | None) -> _Part:
+    """Return what a batch gave; raise what was wrong with it."""
+    if part is None:
+        raise DatasetError("a worker process died while sampling (killed, or out of memory); try fewer --jobs")
+    if isinstance(part, TcpipeError):
+        raise part
+    return part
+
+
+def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
+    """Yield the rows of each batch, rising."""
+    places = [np.floor((floats(segments, f"start_{axis}_deg") + 360.0) / _CELL_DEG) for axis in ("lon", "lat")]
+    order = np.argsort(morton(*(place.astype(np.int64) for place in places)), kind="stable")
+    for first in range(0, len(order), _BATCH_ROWS):
+        yield np.sort(order[first : first + _BATCH_ROWS])
+
+
+def _slots(batches: Sequence[NDArray[np.int64]], ranks: NDArray[np.uint64]) -> NDArray[np.int64]:
+    """Return the slot of every segment, (M,): by drawer of near ranks, then by batch."""
+    sequence = np.concatenate(batches)
+    drawers = np.uint64(-(-len(ranks) // _DRAWER_ROWS))
+    drawer = (ranks[sequence] >> np.uint64(32)) * drawers >> np.uint64(32)
+    slots = np.empty(len(ranks), np.int64)
+    slots[sequence[np.argsort(drawer, kind="stable")]] = np.arange(len(ranks))
+    return slots
+
+
+def _sample_batch(batch: _Batch) -> _Part | TcpipeError:
+    """Sample one batch; its pixels go to its slots of the spool."""
+    try:
+        held = [_held_map(path, batch.config) for path in batch.map_paths]
+        sources, pools = [each.source for each in held], [each.tiles for each in held]
+        sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
+        parts = [
+            {
+                **_columns(part),
+                _XY: _in_first_plane(part, source, sources[0]),
+                _MAP: np.full(len(rows), number, np.uint8),
+            }
+            for number, (rows, part, source) in enumerate(zip(sampled.rows, sampled.sampled, sources, strict=True))
+        ]
+    except TcpipeError as error:
+        return error
+    for rows, part in zip(sampled.rows, sampled.sampled, strict=True):
+        for layer in batch.spool.layers:
+            batch.spool.write(layer, batch.slots[rows], getattr(part.patches, layer))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    return _Part(batch.rows[np.concatenate(sampled.rows)], columns, sampled.ledger_m, sampled.warnings)
+
+
+def _held_map(path: Path, config: SampleConfig) -> _HeldMap:
+    """Return a map as this process's last batch left it: the next one lies beside it and wants the same tiles."""
+    held = _held.pop(path, None)
+    if held is None:
+        source = open_map(path)
+        held = _HeldMap(source, TilePool(level_for(source, config.patch_m / config.patch_px)))
+    _held[path] = held
+    if len(_held) > _HELD_MAPS:
+        _held.popitem(last=False)
+    return held
+
+
+def _in_first_plane(sampled: Sampled, source: MapFile, first: MapFile) -> NDArray[np.float64]:
+    """Return footprints in the CRS of the first map [m], in which splits are drawn and distances measured."""
+    if source.grid.crs == first.grid.crs:
+        return sampled.footprint_xy_m
+    crs = parse_crs(first.grid.crs, where=f"map {first.name}")
+    placed = Projection(CRS.from_epsg(4326), crs, area_of(crs, first.grid.bounds_m)).forward(
+        sampled.footprint_lonlat_deg
+    )
+    if not np.isfinite(placed).all():
+        raise MapError(f"map {source.name}: lies too far from map {first.name} for one dataset; build one from each")
+    return placed
+
+
+def _columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
+    """Return what the patches say of themselves, one array a column of samples.parquet, and their footprints."""
+    patches = sampled.patches
+    found = {entry.name: getattr(patches, entry.name) for entry in fields(patches)}
+    columns = {name: values for name, values in found.items() if name not in (*LAYERS, "index")}
+    if patches.terrain is None:
+        columns = {name: values for name, values in columns.items() if not name.startswith("terrain")}
+    return {**columns, _LONLAT: sampled.footprint_lonlat_deg}

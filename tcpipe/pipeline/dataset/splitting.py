@@ -1,0 +1,201 @@
+"""The split of sampled patches: regions carried into the map's plane, the holdout drawn, leakage measured."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS
+
+from tcpipe.errors import DatasetError
+from tcpipe.pipeline.dataset.sampling import PatchTable
+from tcpipe.recipe import Recipe
+from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
+from tcpipe.splits.audit import HeldOut, audit_leakage
+from tcpipe.splits.ranking import hash_ranks
+from tcpipe.splits.regions import Regions, project_regions
+from tcpipe.tables.columns import integers
+from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+
+_MARGIN_DEG = 0.05
+"""Regions are followed this far around the samples (3 km or more below 60° latitude)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """Split and fold of every patch, the buffer that was kept [m], the audit, and what an earlier dataset decided."""
+
+    assigned: Assignment
+    buffer_m: float
+    audit: tuple[HeldOut, ...]
+    kept: Mapping[str, int] | None
+    """Samples whose split is an earlier dataset's, and those of it that are gone; None where none was to be kept."""
+
+
+def draw_splits(
+    segments: pa.Table,
+    patches: PatchTable,
+    grid: MapGrid,
+    regions: Regions | None,
+    recipe: Recipe,
+    *,
+    earlier: pa.Table | None = None,
+) -> Drawn:
+    """Assign every patch to a split by its whole footprint, and audit the result.
+
+    Parameters
+    ----------
+    segments
+        All segments that were sampled.
+    patches
+        Their patches.
+    grid
+        The map's grid, for its CRS.
+    regions
+        In WGS84 lon/lat; None: everything is train and test.
+    recipe
+        Its sections ``split`` and ``segment`` rule.
+    earlier
+        ``sample_id``, ``split`` and ``fold`` of a dataset whose samples keep their split.
+
+    Raises
+    ------
+    DatasetError
+        No footprint lies inside the region.
+
+    """
+    rules, chord_m = recipe.split, recipe.segment.chord_m
+    buffer_m = math.sqrt(2.0) * chord_m if rules.buffer_m is None else rules.buffer_m
+    starts_ns = integers(segments, "start_ns")
+    run, run_names = _runs(segments, starts_ns)
+    run, starts_ns = run[patches.segment], starts_ns[patches.segment]
+    ids = segments.column("segment_id").take(pa.array(patches.segment))
+    kept = None if earlier is None else _kept(ids, earlier)
+    assigned = assign_splits(
+        np.concatenate([hash_ranks(part.to_pylist(), seed=rules.seed, purpose="test") for part in ids.chunks]),
+        run,
+        run_names,
+        patches.footprint_xy_m,
+        None if regions is None else _in_plane(regions, grid, patches.footprint_lonlat_deg),
+        holdout=rules.holdout,
+        test_fraction=rules.test_fraction,
+        block_m=rules.block_m,
+        buffer_m=buffer_m,
+        folds=rules.folds,
+        seed=rules.seed,
+        kept=kept,
+    )
+    split = assigned.split
+    if regions is not None and not np.isin(split, ("train", "test")).any():
+        raise DatasetError(_nothing_inside(regions, patches.footprint_lonlat_deg, split))
+    audit = audit_leakage(split, run, starts_ns, patches.footprint_xy_m, chord_m=chord_m)
+    counts = None
+    if kept is not None and earlier is not None:
+        found = int((kept.split != "").sum())
+        counts = {"samples": found, "gone": earlier.num_rows - found}
+    return Drawn(assigned, buffer_m, audit, counts)
+
+
+def _runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], list[str]]:
+    """Return the number of each segment's run in the order of recording, (M,), and the runs' ids by number."""
+    coded = segments.column("run_id").dictionary_encode().unify_dictionaries()
+    names = coded.chunk(0).dictionary.to_pylist()
+    codes = np.concatenate([chunk.indices.to_numpy() for chunk in coded.chunks]).astype(np.int64)
+    first_ns = np.full(len(names), np.iinfo(np.int64).max)
+    np.minimum.at(first_ns, codes, starts_ns)
+    order = sorted(range(len(names)), key=lambda code: (first_ns[code], names[code]))
+    number = np.empty(len(names), np.int64)
+    number[order] = np.arange(len(names))
+    return number[codes], [names[code] for code in order]
+
+
+def _kept(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignment:
+    """Return what an earlier dataset says of each sample."""
+    at = pc.index_in(ids, value_set=earlier.column("sample_id").combine_chunks())
+    row = at.to_numpy(zero_copy_only=False)  # NaN where it is not there
+    known = np.isfinite(row)
+    split, fold = np.full(len(row), "", dtype="<U8"), np.full(len(row), NO_FOLD)
+    rows = row[known].astype(np.int64)
+    split[known] = earlier.column("split").to_numpy().astype(np.str_)[rows]
+    if "fold" in earlier.column_names:
+        fold[known] = earlier.column("fold").fill_null(NO_FOLD).to_numpy()[rows]
+    return Assignment(split, fold)
+
+
+def regions_to_json(regions: Regions) -> dict[str, Any]:
+    """Return the regions as GeoJSON geometries by kind, as the card keeps them."""
+    kinds: Mapping[str, Any] = {
+        "train_test": regions.train_test,
+        "unseen": regions.unseen,
+        "exclude": regions.exclude,
+    }
+    return {kind: shapely.geometry.mapping(area) for kind, area in kinds.items() if not shapely.is_empty(area)}
+
+
+def _in_plane(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
+    crs = parse_crs(grid.crs, where="map")
+    projection = Projection(CRS.from_epsg(4326), crs, area_of(crs, grid.bounds_m))
+    return project_regions(regions, projection.forward, window_deg=_window_deg(footprint_lonlat_deg))
+
+
+def _window_deg(lonlat_deg: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    west, south = lonlat_deg.min(axis=(0, 1)) - _MARGIN_DEG
+    east, north = lonlat_deg.max(axis=(0, 1)) + _MARGIN_DEG
+    return float(west), float(south), float(east), float(north)
+
+
+def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: NDArray[np.str_]) -> str:
+    """Say why no sample is inside, and what may be wrong with the region."""
+    points = shapely.multipoints(lonlat_deg.mean(axis=1))
+    lon, lat = lonlat_deg.mean(axis=(0, 1))
+    near, excluded = int((split == "buffer").sum()), int((split == EXCLUDED).sum())
+    if excluded:
+        return (
+            f"the region (--split) leaves nothing to train on: {excluded} of {len(split)} samples lie in its exclude polygons, "
+            f"{near} on a border or nearer to one than the buffer; redraw them"
+        )
+    if near:
+        return (
+            f"the region (--split) holds no whole footprint: {near} of {len(split)} samples lie on its border or nearer "
+            "to it than the buffer; draw it larger, or lower split.buffer_m"
+        )
+    swapped = shapely.transform(regions.train_test, lambda lonlat: lonlat[:, ::-1])
+    if shapely.intersects(swapped, points):
+        return (
+            f"the region (--split) covers none of the {len(split)} samples, but would with its axes swapped: "
+            "GeoJSON is lon before lat (RFC 7946)"
+        )
+    km_per_deg = 111.3 * np.array([math.cos(math.radians(lat)), 1.0])
+    apart_km = shapely.distance(
+        *(shapely.transform(each, lambda p: p * km_per_deg) for each in (regions.train_test, points))
+    )
+    return (
+        f"the region (--split) covers none of the {len(split)} samples: they lie around {lon:.5f}, {lat:.5f} (lon, lat), "
+        f"about {apart_km:.2g} km from it; draw it over the runs"
+    )
+
+
+def empty_splits(card: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a line for each split of a dataset that was asked for and holds no sample, by its card."""
+    counts, rules, found = card["splits"], card["split"], list[str]()
+    if not counts["train"]:
+        found.append("no sample trains: too few lie inside the region; draw it larger")
+    if not counts["test"] and rules["test_fraction"] > 0:
+        one = {"run": "one run", "block": "one block"}.get(rules["holdout"], "too few samples")
+        found.append(
+            f"no sample tests: all inside samples are {one}; try --holdout sample, or a smaller split.block_m, "
+            "or want none with split.test_fraction = 0"
+        )
+    if not counts["unseen"] and rules["region"] is not None:
+        found.append(
+            "no sample is unseen: all lie inside the region (--split), or near it; draw it smaller, or give none"
+        )
+    return tuple(found)

@@ -1,0 +1,450 @@
+"""Generated logs, broken in known places: what is intact before and after comes back, the rest is counted."""
+
+import itertools
+import sqlite3
+import struct
+from contextlib import closing
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, IndexType
+from random_messages import (
+    ROS1,
+    assert_same,
+    expected_columns,
+    random_messages,
+    write_bag,
+    write_mcap,
+    write_rosbag2,
+)
+from rosbags.rosbag1 import Writer as BagWriter
+
+from tcpipe.formats.logs.bag_file import BagPart, _borne_out
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
+
+TYPES = ("sensor_msgs/msg/Imu", "std_msgs/msg/ColorRGBA")
+NO_MESSAGES = "rows that are no messages: a number, a time or the data is missing or of another kind"
+COMPRESSIONS = (CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE)
+
+
+def chunks_of(path):
+    """Byte range of every chunk of an intact .mcap."""
+    data = path.read_bytes()
+    offsets = record_offsets(data[8:], len(data))[0] + 8
+    lengths = [struct.unpack_from("<Q", data, offset + 1)[0] for offset in offsets.tolist()]
+    return [
+        (offset, offset + RECORD_HEAD + length)
+        for offset, length in zip(offsets.tolist(), lengths, strict=True)
+        if data[offset] == OP_CHUNK
+    ]
+
+
+def flip(path, offset, bits=0x10):
+    data = bytearray(path.read_bytes())
+    data[offset] ^= bits
+    path.write_bytes(data)
+
+
+def read(path):
+    with open_log(path) as log:
+        tables = log.tables(log.topics)
+        return tables, log.damage
+
+
+def stamps(tables, topic):
+    return tables[topic]["log_time_ns"].to_pylist()
+
+
+def without(messages, lost):
+    return [message for message in messages if message.log_time_ns not in lost]
+
+
+@pytest.fixture
+def messages():
+    return random_messages(1, count=200, types=TYPES)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_a_flipped_bit_costs_its_chunk_and_no_more(tmp_path, messages, compression):
+    path = write_mcap(tmp_path / "run.mcap", messages, compression=compression)
+    clean, _ = read(path)
+    start, end = chunks_of(path)[2]
+    flip(path, (start + end) // 2 + 30)
+    tables, damage = read(path)
+    assert len(damage) == 1
+    finding = damage[0]
+    kept = [m for m in messages if not finding.start_ns <= m.log_time_ns <= finding.end_ns]
+    assert finding.messages_lost == len(messages) - len(kept) > 0
+    assert finding.where == f"run.mcap, byte {start}"
+    for topic in clean:
+        assert_same(tables[topic], expected_columns(kept, topic))
+
+
+def test_a_flip_in_a_message_index_costs_nothing(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    clean, _ = read(path)
+    flip(path, chunks_of(path)[1][1] + RECORD_HEAD + 6 + 8)  # the first offset of the first index behind the chunk
+    tables, damage = read(path)
+    assert [(finding.what[:31], finding.is_loss) for finding in damage] == [("the index of a chunk names othe", False)]
+    assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
+
+
+def test_a_flip_in_the_summary_costs_nothing_and_is_said(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    clean, _ = read(path)
+    flip(path, path.stat().st_size - 200)
+    tables, damage = read(path)
+    assert ["summary's CRC" in finding.what for finding in damage] == [True]
+    assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+@pytest.mark.parametrize("what", ["opcode", "length"])
+def test_a_destroyed_chunk_head_without_summary_costs_its_chunk(tmp_path, messages, compression, what):
+    path = write_mcap(tmp_path / "run.mcap", messages, compression=compression)
+    chunks = chunks_of(path)
+    start, _ = chunks[2]
+    path.write_bytes(path.read_bytes()[: chunks[-1][1]])  # no summary
+    clean, _ = read(path)
+    flip(path, start + (0 if what == "opcode" else 3), 0x40)
+    tables, damage = read(path)
+    lost = set(stamps(clean, "/Imu")) - set(stamps(tables, "/Imu"))
+    chunk_messages = len(stamps(clean, "/Imu")) // len(chunks)
+    assert 0 < len(lost) < 2.5 * chunk_messages
+    assert max(stamps(tables, "/Imu")) == max(stamps(clean, "/Imu"))
+    assert any(finding.bytes_lost for finding in damage)
+    assert_same(tables["/Imu"], expected_columns(without(messages, lost), "/Imu"))
+
+
+@pytest.mark.parametrize("options", [{}, {"index_types": IndexType.CHUNK}, {"use_chunking": False}])
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+def test_a_cut_mcap_gives_everything_before_the_cut(tmp_path, messages, options, share):
+    path = write_mcap(tmp_path / "run.mcap", messages, compression=CompressionType.NONE, **options)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+    tables, damage = read(path)
+    found = sorted(stamp for topic in tables for stamp in stamps(tables, topic))
+    assert found == [message.log_time_ns for message in messages[: len(found)]]
+    assert len(found) >= int(len(messages) * share * 0.9) - 12
+    assert damage
+    for topic in tables:
+        assert_same(tables[topic], expected_columns(messages[: len(found)], topic))
+
+
+@pytest.mark.parametrize("compression", [None, BagWriter.CompressionFormat.BZ2, BagWriter.CompressionFormat.LZ4])
+def test_a_cut_bag_gives_every_whole_chunk(tmp_path, compression):
+    messages = random_messages(2, count=4000, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, compression)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * 0.8)])
+    tables, damage = read(path)
+    found = {topic: stamps(tables, topic) for topic in tables}
+    for topic, log_times in found.items():
+        assert log_times == [m.log_time_ns for m in messages if m.topic == topic][: len(log_times)]
+        assert len(log_times) > 1000
+    assert any("the file is cut" in finding.what for finding in damage)
+
+
+def test_a_bag_with_a_destroyed_chunk_head_goes_on_behind_it(tmp_path):
+    messages = random_messages(3, count=6000, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, BagWriter.CompressionFormat.LZ4)
+    clean, _ = read(path)
+    data = bytearray(path.read_bytes())
+    first = data.find(b"op=\x05")
+    second = data.find(b"op=\x05", first + 4)
+    index_at = data.find(b"index_pos=") + 10
+    data[index_at : index_at + 8] = bytes(8)  # as a recorder that died leaves it
+    data[second] = 0
+    path.write_bytes(data)
+    tables, damage = read(path)
+    assert 0 < len(stamps(tables, "/Imu")) < len(stamps(clean, "/Imu"))
+    assert stamps(tables, "/Imu")[-1] == stamps(clean, "/Imu")[-1]
+    assert any(finding.bytes_lost for finding in damage)
+
+
+def test_a_cut_db3_gives_the_rows_before_the_cut(tmp_path):
+    messages = random_messages(4, count=400, types=("sensor_msgs/msg/Imu", "sensor_msgs/msg/PointCloud2"))
+    bag = write_rosbag2(tmp_path / "run", messages)
+    path = next(bag.glob("*.db3"))
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * 0.6)])
+    tables, damage = read(bag)
+    found = sum(table.num_rows for table in tables.values())
+    assert 0.5 * len(messages) < found < 0.7 * len(messages)
+    assert len(messages) - found in [finding.messages_lost for finding in damage]
+    for topic in tables:
+        assert_same(tables[topic], expected_columns(messages[:found], topic))
+
+
+def test_a_db3_with_a_zeroed_page_gives_the_rows_on_both_sides(tmp_path):
+    messages = random_messages(5, count=600, types=("sensor_msgs/msg/Imu",))
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    data = bytearray(path.read_bytes())
+    leaves = [at for at in range(0, len(data), 4096) if data[at] == 0x0D]
+    middle = leaves[len(leaves) // 2]
+    data[middle : middle + 4096] = bytes(4096)
+    path.write_bytes(data)
+    tables, damage = read(path)
+    found = stamps(tables, "/Imu")
+    assert len(messages) - 20 < len(found) < len(messages)
+    assert found[0] == messages[0].log_time_ns
+    assert found[-1] == messages[-1].log_time_ns
+    assert any("cannot be read" in finding.what for finding in damage)
+
+
+def test_a_chunk_that_claims_to_be_huge_is_refused(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    chunks = chunks_of(path)
+    data = bytearray(path.read_bytes()[: chunks[-1][1]])
+    struct.pack_into("<Q", data, chunks[1][0] + RECORD_HEAD + 16, 1 << 60)
+    path.write_bytes(data)
+    tables, damage = read(path)
+    assert tables["/Imu"].num_rows > 0
+    assert any(f"{1 << 60} bytes" in finding.what for finding in damage)
+
+
+def test_lengths_past_the_end_and_endless_sequences_are_counted(tmp_path):
+    messages = random_messages(6, count=12, types=("sensor_msgs/msg/JointState",))
+    evil = []
+    for index, message in enumerate(messages):
+        payload = bytearray(message.payload)
+        if index % 3 == 0:
+            struct.pack_into("<I", payload, 12, 0xFFFFFFFF)  # length of header.frame_id
+        evil.append(type(message)(message.topic, message.type_name, message.log_time_ns, bytes(payload), message.value))
+    tables, damage = read(write_mcap(tmp_path / "run.mcap", evil))
+    kept = [message for index, message in enumerate(messages) if index % 3]
+    assert_same(tables["/JointState"], expected_columns(kept, "/JointState"))
+    assert sum(finding.messages_lost for finding in damage) == 4
+
+
+def test_broken_first_bytes_cost_nothing(tmp_path, messages):
+    path = write_mcap(tmp_path / "run.mcap", messages)
+    flip(path, 3)
+    tables, damage = read(path)
+    assert_same(tables["/Imu"], expected_columns(messages, "/Imu"))
+    assert ["first bytes" in finding.what for finding in damage] == [True]
+
+
+def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
+    messages = random_messages(7, count=10, types=("std_msgs/msg/String",))
+    payload = b"\x00\x01\x00\x00\x03\x00\x00\x00a\xff\x00"
+    odd = [type(m)(m.topic, m.type_name, m.log_time_ns, payload, m.value) for m in messages]
+    tables, damage = read(write_mcap(tmp_path / "run.mcap", odd))
+    assert tables["/String"]["data"].to_pylist() == ["a\ufffd"] * 10
+    assert [(finding.topic, finding.messages_lost) for finding in damage] == [("/String", 0)]
+
+
+def test_the_index_of_an_intact_bag_is_used(tmp_path):
+    messages = random_messages(8, count=50, types=TYPES, store=ROS1)
+    part = BagPart(write_bag(tmp_path / "run.bag", messages), "run.bag")
+    (run,) = part._runs(frozenset({0, 1}))
+    data, entries = part._load(part._chunks[0]), run.plan.entries
+    assert len(entries.offset) == len(messages)
+    assert _borne_out(data, entries.offset, entries).all()
+    for wrong in (
+        replace(entries, log_time_ns=entries.log_time_ns + 1),
+        replace(entries, channel=1 - entries.channel),
+        replace(entries, end=entries.offset + 20),
+    ):
+        assert not _borne_out(data, entries.offset, wrong).any()
+    assert not _borne_out(data, entries.offset + 1, entries).any()
+    one_wrong = replace(entries, log_time_ns=entries.log_time_ns + (np.arange(len(messages)) == 20))
+    assert np.flatnonzero(~_borne_out(data, entries.offset, one_wrong)).tolist() == [20]
+    part.close()
+
+
+def test_a_cut_chunk_of_an_unknown_compression_is_lost_by_name(tmp_path):
+    messages = random_messages(8, count=50, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "run.bag", messages, BagWriter.CompressionFormat.LZ4)
+    data = path.read_bytes().replace(b"compression=lz4", b"compression=lz8")
+    path.write_bytes(data[: data.index(b"compression=lz8") + 500])
+    tables, damage = read(path)
+    assert tables == {}
+    assert any("'lz8' is unknown" in finding.what for finding in damage)
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe\0garbage: [", b"rosbag2_bagfile_information:\n", b"a: &a [*a]\n"])
+def test_a_broken_metadata_file_costs_nothing(tmp_path, content):
+    messages = random_messages(4, count=20, types=TYPES)
+    bag = write_rosbag2(tmp_path / "run", messages)
+    (bag / "metadata.yaml").write_bytes(content)
+    tables, damage = read(bag)
+    assert [(finding.what.split(";")[0], finding.is_loss) for finding in damage] == [("metadata.yaml is broken", False)]
+    for topic in tables:
+        assert_same(tables[topic], expected_columns(messages, topic))
+
+
+def test_rows_that_are_no_messages_cost_only_themselves(tmp_path):
+    messages = random_messages(5, count=20, types=("std_msgs/msg/ColorRGBA",))
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("UPDATE messages SET timestamp = 'abc' WHERE id = 3")
+        database.execute("UPDATE messages SET data = 'text' WHERE id = 5")
+        database.execute("UPDATE messages SET topic_id = 99 WHERE id IN (7, 8)")
+    database.close()
+    with open_log(path) as log:
+        assert log.topics["/ColorRGBA"].message_count == 16
+        assert log.table("/ColorRGBA").num_rows == 16
+        said = {finding.what: finding.messages_lost for finding in log.damage}
+    assert said == {"messages of topic 99, which nothing declares": 2, NO_MESSAGES: 2}
+
+
+WRONG_VALUES = ("NULL", "'text'", "x'00'", "2.5", "NULL, topic_id = 'x'", "NULL, data = NULL")
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    sorted({*itertools.product(("topic_id", "timestamp", "data"), WRONG_VALUES)} - {("data", "x'00'")}),
+)
+@pytest.mark.parametrize("journal", [False, True])
+def test_every_row_of_a_db3_is_a_message_or_counted_as_lost(tmp_path, column, value, journal):
+    """However a row is wrong, and whether pages are read here or by SQLite: what is read and what is lost is what was there."""
+    path = tmp_path / "a.db3"
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name, type, serialization_format)")
+        database.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)")
+        database.execute("INSERT INTO topics VALUES (1, '/ColorRGBA', 'std_msgs/msg/ColorRGBA', 'cdr')")
+        for number, message in enumerate(random_messages(5, count=20, types=TYPES[1:])):
+            row = (number, message.log_time_ns, message.payload)
+            database.execute("INSERT INTO messages VALUES (?, 1, ?, ?)", row)
+        database.execute(f"UPDATE messages SET {column} = {value} WHERE id IN (7, 12, 19)")  # noqa: S608
+    if journal:
+        path.with_name("a.db3-wal").write_bytes(b"not a journal")
+    for wanted in (["/ColorRGBA"], []):
+        with open_log(path) as log:
+            assert [table.num_rows for table in log.tables(wanted).values()] == [17] * len(wanted)
+            assert {finding.what: finding.messages_lost for finding in log.damage} == {NO_MESSAGES: 3}
+
+
+@pytest.mark.parametrize(
+    "kinds", [b"\0\1\6\x81\x80\x80\x80\x80\x80\x80\x80\0", b"\0\1\6\x0b", b"\0\1\5\x2c", b"\0\1\6\xff"]
+)
+def test_a_row_whose_head_contradicts_itself_is_counted(tmp_path, kinds):
+    messages = random_messages(5, count=20, types=TYPES[1:])
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    data = path.read_bytes()
+    at = (
+        data.index(bytes([0, 9, 6, 12 + 2 * 20]))
+        if bytes([0, 9, 6, 12 + 2 * 20]) in data
+        else data.index(bytes([0, 1, 6, 52]))
+    )
+    path.write_bytes(data[:at] + kinds + data[at + len(kinds) :])
+    with open_log(path) as log:
+        rows = log.table("/ColorRGBA").num_rows
+        lost = sum(finding.messages_lost or 0 for finding in log.damage)
+    assert (rows, lost) == (19, 1)
+
+
+def test_a_row_that_is_missing_from_its_pages_list_is_damage(tmp_path):
+    messages = random_messages(5, count=20, types=TYPES[1:])
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    with closing(sqlite3.connect(path)) as database:
+        root = database.execute("SELECT rootpage FROM sqlite_schema WHERE name = 'messages'").fetchone()[0]
+    data = bytearray(path.read_bytes())
+    data[(root - 1) * 4096 + 4] -= 1
+    path.write_bytes(data)
+    with open_log(path) as log:
+        assert log.table("/ColorRGBA").num_rows == 19
+        assert [finding.what[:34] for finding in log.damage if finding.is_loss] == [
+            "its pages contradict one another ("
+        ]
+
+
+def test_a_row_that_claims_to_be_endless_costs_itself(tmp_path):
+    """Where SQLite itself has to read, it says that there is no memory for such a row, and no more than that."""
+    messages = random_messages(5, count=40, types=TYPES[1:])
+    path = next(write_rosbag2(tmp_path / "run", messages).glob("*.db3"))
+    data = bytearray(path.read_bytes())
+    at = (
+        data.index(struct.pack(">q", messages[20].log_time_ns)) - 4
+    )  # the row's head: its size, and a serial type for each column
+    data[at - 1 : at + 3] = b"\xff\xff\xff\x7f"
+    path.write_bytes(data)
+    with open_log(path) as log:
+        rows = log.table("/ColorRGBA").num_rows
+        assert any(finding.is_loss for finding in log.damage)
+    assert 15 < rows < 40
+
+
+def test_a_message_that_moves_to_another_topic_is_missed_by_metadata(tmp_path, messages):
+    bag = write_rosbag2(tmp_path / "run", messages)
+    with closing(sqlite3.connect(next(bag.glob("*.db3")))) as database, database:
+        database.execute("UPDATE messages SET topic_id = 3 - topic_id WHERE id IN (7, 8, 9)")
+        moved = database.execute("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall()
+    assert {count for _, count in moved} != {200}
+    _, damage = read(bag)
+    assert "metadata.yaml counts 400 messages, the files hold 400" in [
+        finding.what.split(": ")[0] for finding in damage
+    ]
+
+
+def test_messages_of_times_that_no_clock_shows_are_counted(tmp_path, messages):
+    late = [replace(message, log_time_ns=1 << 63) for message in messages[:3]]
+    with open_log(write_mcap(tmp_path / "a.mcap", [*messages, *late])) as log:
+        assert sum(table.num_rows for table in log.tables(log.topics).values()) == len(messages)
+        assert [(finding.what, finding.messages_lost) for finding in log.damage if finding.is_loss] == [
+            ("messages of times after the year 2262", 3)
+        ]
+
+
+@pytest.mark.parametrize("closed", [True, False])
+def test_messages_of_channels_that_nothing_declares_are_counted(tmp_path, messages, closed):
+    path = write_mcap(tmp_path / "a.mcap", messages, compression=CompressionType.NONE, enable_crcs=False)
+    data = bytearray(path.read_bytes())
+    start, _ = chunks_of(path)[1]
+    at = data.index(b"\x05", start + RECORD_HEAD + 40)  # the chunk's first message, of which the channel becomes 77
+    struct.pack_into("<H", data, at + RECORD_HEAD, 77)
+    path.write_bytes(data if closed else data[:-8])
+    with open_log(path) as log:
+        assert sum(table.num_rows for table in log.tables(log.topics).values()) == len(messages) - 1
+        said = [finding for finding in log.damage if finding.what == "messages of channel 77, which nothing declares"]
+        assert [finding.messages_lost for finding in said] == [1]
+
+
+def test_a_chunk_that_was_written_over_another_is_damage(tmp_path, messages):
+    options = {"compression": CompressionType.NONE, "index_types": IndexType.NONE}
+    path = write_mcap(
+        tmp_path / "a.mcap", [replace(m, payload=bytes(40)) for m in messages], chunk_bytes=700, **options
+    )
+    data = path.read_bytes()
+    sizes = {}
+    for start, end in chunks_of(path):
+        sizes.setdefault(end - start, []).append((start, end))
+    (one, one_end), (other, other_end) = next(places for places in sizes.values() if len(places) > 1)[:2]
+    path.write_bytes(data[:other] + data[one:one_end] + data[other_end:])
+    with open_log(path) as log:
+        said = [finding.what for finding in log.damage if finding.is_loss]
+    assert said == [f"a chunk holds the same as the one at byte {one}"]
+
+
+def test_a_bag_whose_index_names_a_chunk_twice_is_walked(tmp_path):
+    path = write_bag(tmp_path / "a.bag", random_messages(1, count=30, types=TYPES, store=ROS1), chunk_bytes=2000)
+    clean, _ = read(path)
+    data = path.read_bytes()
+    *_, before, last = [at for at in range(len(data)) if data.startswith(b"op=\x06", at)]
+    size = last - before
+    path.write_bytes(data[: last - 8] + data[before - 8 : before - 8 + size])
+    assert path.stat().st_size == len(data)
+    tables, damage = read(path)
+    assert [finding.what for finding in damage] == ["the bag's index names a chunk twice; it is read record by record"]
+    assert all(stamps(tables, topic) == stamps(clean, topic) for topic in clean)
+
+
+@pytest.mark.parametrize("number", [0, 1, 77])
+@pytest.mark.parametrize("wanted", [("/Imu",), ("/ColorRGBA",), ("/Imu", "/ColorRGBA")])
+def test_a_bag_whose_index_contradicts_it_says_so(tmp_path, number, wanted):
+    """The summary says that a chunk's messages are another connection's: none is lost, whatever is read."""
+    messages = random_messages(1, count=30, types=TYPES, store=ROS1)
+    path = write_bag(tmp_path / "a.bag", messages, chunk_bytes=2000)
+    clean, _ = read(path)
+    data = bytearray(path.read_bytes())
+    info = data.rindex(b"op=\x06")
+    entries = data.index(struct.pack("<I", 16), info) + 4
+    struct.pack_into("<I", data, entries, number)
+    path.write_bytes(data)
+    with open_log(path) as log:
+        tables = log.tables(wanted)
+        assert all(stamps(tables, topic) == stamps(clean, topic) for topic in wanted)
+        assert number == 0 or any(finding.is_loss for finding in log.damage)

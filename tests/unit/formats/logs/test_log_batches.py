@@ -1,0 +1,111 @@
+"""Piece by piece: the pieces are the tables, in order, none larger than asked; threads change nothing."""
+
+import json
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from random_messages import (
+    ROS1,
+    ROS2,
+    START_NS,
+    TYPES,
+    Message,
+    random_messages,
+    table_bytes,
+    write_bag,
+    write_mcap,
+    write_rosbag2,
+)
+
+from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.pipeline.export import export
+
+LIMIT_BYTES = 40_000
+WRITERS = {
+    "mcap": lambda path, messages: write_mcap(path / "a.mcap", messages, chunk_bytes=4096),
+    "mcap unchunked": lambda path, messages: write_mcap(path / "a.mcap", messages, use_chunking=False),
+    "bag": lambda path, messages: write_bag(path / "a.bag", messages),
+    "db3": lambda path, messages: write_rosbag2(path / "a", messages),
+}
+
+
+def made(kind, *, ragged=True, count=80, types=TYPES):
+    return random_messages(1, count=count, ragged=ragged, types=types, store=ROS1 if kind == "bag" else ROS2)
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+@pytest.mark.parametrize("ragged", [False, True])
+def test_the_pieces_are_the_tables(tmp_path, kind, ragged):
+    path = WRITERS[kind](tmp_path, made(kind, ragged=ragged))
+    with open_log(path) as log:
+        whole = log.tables(log.topics)
+        pieces = list(log.batches(log.topics, batch_bytes=LIMIT_BYTES))
+        assert log.damage == []
+    assert len(pieces) > 3
+    assert set(pieces[-1]) == set(whole)
+    for name, table in whole.items():
+        parts = [piece[name] for piece in pieces if name in piece]
+        assert table_bytes(pa.concat_tables(parts)) == table_bytes(table)
+    assert max(sum(table.nbytes for table in piece.values()) for piece in pieces) < 2 * LIMIT_BYTES
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_threads_change_nothing(tmp_path, kind):
+    path = WRITERS[kind](tmp_path, made(kind))
+    found = {}
+    for threads in (1, 2, 5):
+        with open_log(path) as log:
+            pieces = log.batches(log.topics, batch_bytes=LIMIT_BYTES, threads=threads)
+            found[threads] = [{name: table_bytes(table) for name, table in piece.items()} for piece in pieces]
+    assert found[1] == found[2] == found[5]
+
+
+def test_rows_swapped_nearby_are_sorted_and_rows_far_behind_are_counted(tmp_path):
+    messages = random_messages(2, count=3000, types=("std_msgs/msg/ColorRGBA",))
+    swapped = [message for pair in zip(messages[1::2], messages[::2], strict=True) for message in pair]
+    with open_log(write_mcap(tmp_path / "near.mcap", swapped, chunk_bytes=2048)) as log:
+        parts = [piece["/ColorRGBA"] for piece in log.batches(["/ColorRGBA"], batch_bytes=20_000)]
+        assert log.damage == []
+    stamps = pa.concat_tables(parts)["log_time_ns"].to_pylist()
+    assert len(parts) > 5
+    assert stamps == [message.log_time_ns for message in messages]
+    late = [*messages[10:], *messages[:10]]
+    with open_log(write_mcap(tmp_path / "far.mcap", late, chunk_bytes=2048)) as log:
+        parts = [piece["/ColorRGBA"] for piece in log.batches(["/ColorRGBA"], batch_bytes=20_000)]
+        (finding,) = log.damage
+    assert sum(part.num_rows for part in parts) == len(messages)
+    assert "10 messages lie in the log far behind their time" in finding.what
+    assert finding.messages_lost == 0
+
+
+def test_a_topic_of_few_messages_is_not_cut_into_crumbs(tmp_path):
+    images = random_messages(3, count=400, types=("sensor_msgs/msg/Imu",))
+    rare = random_messages(4, count=40, types=("std_msgs/msg/ColorRGBA",))
+    messages = sorted([*images, *rare], key=lambda message: message.log_time_ns)
+    with open_log(write_mcap(tmp_path / "a.mcap", messages, chunk_bytes=2048)) as log:
+        pieces = list(log.batches(log.topics, batch_bytes=30_000))
+    assert sum("/Imu" in piece for piece in pieces) > 4
+    assert [piece["/ColorRGBA"].num_rows for piece in pieces if "/ColorRGBA" in piece] == [40]
+
+
+def test_messages_that_fit_no_definition_leave_pieces_without_rows(tmp_path):
+    broken = [Message("/a", "std_msgs/msg/ColorRGBA", START_NS + n, b"\x00\x01\x00\x00\x01", None) for n in range(60)]
+    with open_log(write_mcap(tmp_path / "a.mcap", broken, chunk_bytes=512)) as log:
+        pieces = list(log.batches(["/a"], batch_bytes=500))
+        assert sum(piece["/a"].num_rows for piece in pieces) == 0
+        assert sum(finding.messages_lost for finding in log.damage) == 60
+
+
+def test_export_writes_the_tables_row_group_by_row_group(tmp_path, monkeypatch):
+    monkeypatch.setitem(Log.batches.__kwdefaults__, "batch_bytes", LIMIT_BYTES)
+    path = WRITERS["mcap"](tmp_path, made("mcap"))
+    exported = export(path, tmp_path / "out")
+    with open_log(path) as log:
+        tables = log.tables(log.topics)
+    assert {of.topic for of in exported.topics} == set(tables)
+    assert max(pq.read_metadata(of.path).num_row_groups for of in exported.topics) > 1
+    for of in exported.topics:
+        read = pq.read_table(of.path)
+        assert read.num_rows == of.rows == tables[of.topic].num_rows
+        assert json.dumps(read.to_pylist()) == json.dumps(tables[of.topic].to_pylist())

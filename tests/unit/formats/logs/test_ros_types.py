@@ -1,0 +1,128 @@
+"""Definitions found, completed, and refused."""
+
+import pytest
+
+from tcpipe.formats.logs.ros_types import DefinitionError, TypeLibrary
+from tcpipe.logs.wire_types import Array, Record, Scalar, Text
+
+SEPARATOR = "=" * 80 + "\n"
+
+
+def resolve(text, name="acme_msgs/msg/Thing", *, ros1=False, schema_encoding="ros2msg"):
+    return TypeLibrary().message_type(name, definition=text, schema_encoding=schema_encoding, ros1=ros1)
+
+
+def test_fields_constants_defaults_and_comments():
+    found = resolve("# a thing\nuint8 KIND=3\nuint8 kind 5 # its kind\nfloat64[3] xyz\nstring[<=4] names\nchar c\n")
+    assert found.source == "log"
+    assert found.wire.fields == (
+        ("kind", Scalar("u1")),
+        ("xyz", Array(Scalar("f8"), 3)),
+        ("names", Array(Text(), None)),
+        ("c", Scalar("u1")),
+    )
+
+
+def test_a_constant_in_small_letters_does_not_cost_the_topic():
+    found = resolve("int32 small=1\nint32 value\n", ros1=True, schema_encoding="ros1msg")
+    assert [name for name, _ in found.wire.fields] == ["value"]
+
+
+def test_what_rosbags_makes_no_type_of_is_decoded_row_by_row_all_the_same():
+    found = resolve("uint8 KIND=3\nuint8 KIND=4\nuint8 value\n")  # it refuses the constants, which take no bytes
+    assert found.row_decoder("cdr")(b"\0\1\0\0\7") == {"value": 7}
+
+
+_ODD = "acme_msgs/Part';print('run');'"
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("acme_msgs/msg/Thing:\n  pass\nprint('run')\nclass A", "uint8 x\n"),
+        ("acme_msgs/msg/Thing", f"{_ODD} part\n{SEPARATOR}MSG: {_ODD}\nuint8 x\n"),
+        ("acme_msgs/msg/Thing", f"{_ODD}[] parts\n{SEPARATOR}MSG: {_ODD}\nuint8 x\n"),
+    ],
+)
+def test_no_name_in_a_log_becomes_code(name, text, capsys):
+    with pytest.raises(DefinitionError):
+        resolve(text, name=name).row_decoder("cdr")
+    assert capsys.readouterr().out == ""
+
+
+def test_parts_that_the_log_leaves_out_come_from_the_bundled_definitions():
+    header = resolve("std_msgs/Header header\nfloat32 value\n").wire.fields[0][1]
+    assert isinstance(header, Record)
+    assert [name for name, _ in header.fields] == ["stamp", "frame_id"]
+    ros1_header = resolve("Header header\nfloat32 value\n", ros1=True, schema_encoding="ros1msg").wire.fields[0][1]
+    assert [name for name, _ in ros1_header.fields] == ["seq", "stamp", "frame_id"]
+
+
+def test_one_name_may_mean_two_things():
+    library = TypeLibrary()
+    kinds = [
+        library.message_type("a/msg/A", definition=text, schema_encoding="ros2msg", ros1=False).wire.fields
+        for text in ("float32 x\n", "float64 y\n")
+    ]
+    assert kinds == [(("x", Scalar("f4")),), (("y", Scalar("f8")),)]
+
+
+def test_the_events_of_a_service_follow_from_its_definition():
+    text = "Point at\n---\nbool done\n" + SEPARATOR + "MSG: acme_msgs/Point\nfloat64 x\n"
+    text = text.replace("Point at", "acme_msgs/Point at")
+    found = resolve(text, "acme_msgs/srv/Go_Event").wire
+    assert [name for name, _ in found.fields] == ["info", "request", "response"]
+    info, request, response = (of for _, of in found.fields)
+    assert [name for name, _ in info.fields] == ["event_type", "stamp", "client_gid", "sequence_number"]
+    assert [name for name, _ in request.element.fields] == ["at"]
+    assert response.element.fields == (("done", Scalar("?")),)
+
+
+def test_idl():
+    text = (
+        "module acme_msgs { module msg {\n  struct Thing {\n    double x;\n    sequence<float> values;\n"
+        "    string name;\n    uint8 grid[4];\n  };\n}; };\n"
+    )
+    found = resolve(f"{SEPARATOR}IDL: acme_msgs/msg/Thing\n{text}", schema_encoding="ros2idl")
+    assert found.wire.fields == (
+        ("x", Scalar("f8")),
+        ("values", Array(Scalar("f4"), None)),
+        ("name", Text()),
+        ("grid", Array(Scalar("u1"), 4)),
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "is unknown: the log holds no definition of it"),
+        ("  \n", "is unknown: the log holds no definition of it"),
+        ("other_msgs/Missing part\n", "other_msgs/msg/Missing, a part of acme_msgs/msg/Thing, is defined neither"),
+        ("Thing[] children\n", "contains itself: acme_msgs/msg/Thing > acme_msgs/msg/Thing"),
+        ("float64 x\n---\nfloat64 y\n", "that of a service, not of a message"),
+        ("float64 { x\n", "cannot be parsed"),
+        ("float64 x\nint8 y\nfloat32 x\n", "acme_msgs/msg/Thing defines x more than once"),
+    ],
+)
+def test_what_cannot_be_used_is_refused_plainly(text, said):
+    with pytest.raises(DefinitionError) as refused:
+        resolve(text)
+    assert said in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_a_definition_that_unfolds_without_bound_is_refused():
+    parts = [f"MSG: a/L{level}\n" + "".join(f"a/L{level + 1} f{i}\n" for i in range(10)) for level in range(8)]
+    parts.append("MSG: a/L8\nfloat64 x\n")
+    text = "a/L0 root\n" + "".join(SEPARATOR + part for part in parts)
+    with pytest.raises(DefinitionError, match="unfolds to 100000000 columns"):
+        resolve(text, name="a/msg/Top")
+
+
+def test_definitions_bundled_for_robots_are_found():
+    from tcpipe.logs.definitions import DEFINITIONS
+
+    assert "husky_msgs/msg/HuskyStatus" in DEFINITIONS
+    for name in DEFINITIONS:
+        for ros1 in (False, True):
+            assert resolve("", name=name, ros1=ros1).wire.fields

@@ -1,0 +1,514 @@
+"""Rasters of every convention on one grid, against closed forms; and rasters that cannot be placed, refused in one line."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+import rasterio.shutil
+from map_worlds import World, write_tif
+from rasterio import Affine
+from rasterio.control import GroundControlPoint
+from shared_data import shared_data
+
+from tcpipe.errors import MapError
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_files import open_map
+
+WORLD = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=40.0)
+LEFT, TOP = WORLD.x_m - 20.0, WORLD.y_m + 20.0
+NORTH_UP = Affine(0.1, 0.0, LEFT, 0.0, -0.1, TOP)
+
+
+def plane(x, y):
+    return 500.0 + 0.2 * (x - WORLD.x_m) + 0.1 * (y - WORLD.y_m)
+
+
+def raster_of(function, affine, rows=400, cols=400, dtype=np.float32):
+    """Values at pixel centres of an affine of corners, with a band axis."""
+    j, i = np.meshgrid(np.arange(cols) + 0.5, np.arange(rows) + 0.5)
+    x, y = affine.a * j + affine.b * i + affine.c, affine.d * j + affine.e * i + affine.f
+    return np.asarray(function(x, y)).astype(dtype)[None]
+
+
+def built(tmp_path, **options):
+    summary = build_map(tmp_path / "m.zarr", name="m", **options)
+    return summary, open_map(tmp_path / "m.zarr")
+
+
+def heights(source):
+    grid = source.grid
+    return source.height_reference_m + source.read("height", 0, grid.rows, 0, grid.cols).astype(float)
+
+
+def centres(grid):
+    j, i = np.meshgrid(np.arange(grid.cols, dtype=float), np.arange(grid.rows, dtype=float))
+    return np.moveaxis(grid.xy_from_px(np.stack([j, i], -1)), -1, 0)
+
+
+def check_plane(source, tolerance_m=1e-4):
+    found = heights(source)
+    present = np.isfinite(found)
+    assert present.mean() > 0.5
+    assert np.abs(found - plane(*centres(source.grid)))[present].max() < tolerance_m
+    return present
+
+
+def test_a_map_like_its_raster_keeps_every_number(tmp_path):
+    values = raster_of(plane, NORTH_UP)
+    values[0, 7, 9] = np.nan
+    write_tif(tmp_path / "h.tif", values, WORLD.crs, NORTH_UP)
+    summary, source = built(tmp_path, height=tmp_path / "h.tif")
+    assert source.grid.crs == "EPSG:32633"
+    assert (source.grid.rows, source.grid.cols, source.grid.pitch_m) == (400, 400, 0.1)
+    assert source.grid.bounds_m == pytest.approx((LEFT, TOP - 40.0, LEFT + 40.0, TOP))
+    np.testing.assert_allclose(heights(source), values[0].astype(float), atol=1e-5)
+    assert summary.covered == {"height": 1.0 - 1.0 / 160_000.0}
+    assert (summary.height_min_m, summary.height_max_m) == (np.nanmin(values), np.nanmax(values))
+
+
+CONVENTIONS = {
+    "south up": (Affine(0.1, 0.0, LEFT, 0.0, 0.1, TOP - 40.0), {}),
+    "rotated": (Affine(0.08, 0.06, LEFT, 0.06, -0.08, TOP), {}),
+    "flat pixels": (Affine(0.1, 0.0, LEFT, 0.0, -0.2, TOP), {"rows": 200}),
+    "mirrored": (Affine(-0.1, 0.0, LEFT + 40.0, 0.0, -0.1, TOP), {}),
+}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_pixel_conventions_show_the_same_ground(tmp_path, name):
+    affine, size = CONVENTIONS[name]
+    write_tif(tmp_path / "h.tif", raster_of(plane, affine, **size), WORLD.crs, affine)
+    _, source = built(tmp_path, height=tmp_path / "h.tif")
+    check_plane(source)
+
+
+def test_pixel_is_point_is_half_a_pixel_off_pixel_is_area(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP, point=True)
+    _, source = built(tmp_path, height=tmp_path / "h.tif")
+    check_plane(source)
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32634", "EPSG:31256", "EPSG:4326", "EPSG:3857", "EPSG:2263"])
+def test_a_raster_in_another_crs_lands_on_the_same_ground(tmp_path, crs):
+    """The grid is asked for in UTM 33N; the raster is in another zone, a national grid, degrees, Web Mercator, or feet."""
+    to_crs = pyproj.Transformer.from_crs(WORLD.crs, crs, always_xy=True)
+    x, y = to_crs.transform(
+        WORLD.x_m + np.array([-20.0, 20.0, 20.0, -20.0]), WORLD.y_m + np.array([-20, -20, 20, 20.0])
+    )
+    affine = Affine((max(x) - min(x)) / 400, 0.0, min(x), 0.0, -(max(y) - min(y)) / 400, max(y))
+
+    def there(u, v):
+        return plane(*to_crs.transform(u, v, direction="INVERSE"))
+
+    write_tif(tmp_path / "h.tif", raster_of(there, affine), crs, affine)
+    summary, source = built(tmp_path, height=tmp_path / "h.tif", crs=WORLD.crs)
+    assert source.grid.crs == WORLD.crs
+    check_plane(source, 1e-3)
+    assert any("datum" in note for note in summary.warnings) == (crs in {"EPSG:31256", "EPSG:2263"})
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:3857"])
+def test_a_raster_that_is_not_metric_goes_to_its_utm_zone(tmp_path, crs):
+    to_crs = pyproj.Transformer.from_crs(WORLD.crs, crs, always_xy=True)
+    x, y = to_crs.transform(WORLD.x_m + np.array([-20.0, 20.0]), WORLD.y_m + np.array([-20.0, 20.0]))
+    affine = Affine((x[1] - x[0]) / 100, 0.0, x[0], 0.0, -(y[1] - y[0]) / 100, y[1])
+    write_tif(tmp_path / "h.tif", np.full((1, 100, 100), 100.0, np.float32), crs, affine)
+    _, source = built(tmp_path, height=tmp_path / "h.tif")
+    assert source.grid.crs == "EPSG:32633"
+    assert source.grid.pitch_m == pytest.approx(0.4, rel=0.02)
+
+
+@pytest.mark.parametrize("west_deg", [179.9999, -180.0001])
+def test_a_raster_across_the_antimeridian_is_whole(tmp_path, west_deg):
+    """In degrees, 21 m wide; heights rise by 1 m a pixel of 1e-6 degrees from one side to the other."""
+    affine = Affine(1e-6, 0.0, west_deg, 0.0, -1e-6, -16.5)
+    values = np.tile(np.arange(200, dtype=np.float32), (1, 200, 1))
+    write_tif(tmp_path / "h.tif", values, "EPSG:4326", affine)
+    summary, source = built(tmp_path, height=tmp_path / "h.tif")
+    assert summary.covered["height"] > 0.9
+    x, y = centres(source.grid)
+    lon, _ = pyproj.Transformer.from_crs(source.grid.crs, "EPSG:4326", always_xy=True).transform(x, y)
+    wanted = ((lon - west_deg + 180.0) % 360.0 - 180.0) / 1e-6 - 0.5
+    found = heights(source)
+    assert np.nanmax(np.abs(found - wanted)) < 0.01
+
+
+def test_heights_that_are_none_are_told_from_metres(tmp_path):
+    values = raster_of(plane, NORTH_UP)
+    values[0, :9] = -9999.0
+    path = write_tif(tmp_path / "h.tif", values, WORLD.crs, NORTH_UP)
+    with pytest.raises(MapError, match=r"say in the file that -9999 is no data \(gdal_edit -a_nodata -9999\)"):
+        built(tmp_path, height=path)
+
+
+@pytest.mark.parametrize("driver", ["HFA", "VRT", "COG"])
+def test_a_raster_may_be_of_these_kinds_whatever_its_name(tmp_path, driver):
+    path = write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    rasterio.shutil.copy(path, tmp_path / "copy.x", driver=driver)
+    _, source = built(tmp_path, height=tmp_path / "copy.x")
+    assert check_plane(source).all()
+
+
+@pytest.mark.parametrize(("options", "value"), [({"nbits": 1}, 1), ({"photometric": "YCBCR", "compress": "jpeg"}, 120)])
+def test_orthophotos_of_odd_kinds_become_grey(tmp_path, options, value):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    bands = 3 if "photometric" in options else 1
+    write_tif(tmp_path / "o.tif", np.full((bands, 400, 400), value, np.uint8), WORLD.crs, NORTH_UP, **options)
+    _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "o.tif")
+    assert np.unique(source.read("ortho", 0, 400, 0, 400)).tolist() == [255 if bands == 1 else value]
+
+
+def test_layers_on_other_grids_are_put_on_the_finest(tmp_path):
+    coarse = Affine(0.5, 0.0, LEFT - 3.0, 0.0, -0.5, TOP + 3.0)
+    write_tif(tmp_path / "h.tif", raster_of(plane, coarse, 92, 92), WORLD.crs, coarse)
+    grey = raster_of(WORLD.grey, NORTH_UP)[0]
+    write_tif(tmp_path / "o.tif", np.stack([grey.astype(np.uint8)] * 3), WORLD.crs, NORTH_UP)
+    other = Affine(0.25, 0.0, LEFT, 0.0, -0.25, TOP)
+    write_tif(tmp_path / "t.tif", raster_of(WORLD.terrain, other, 160, 160, np.int32), WORLD.crs, other)
+    summary, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "o.tif", terrain=tmp_path / "t.tif")
+    assert source.grid.pitch_m == 0.1
+    assert source.grid.bounds_m == pytest.approx((LEFT - 3.0, TOP - 43.0, LEFT + 43.0, TOP + 3.0))
+    present = check_plane(source)
+    assert not present[:2].any()  # within half a source pixel of the edge nothing is known
+    inside = source.read("ortho", 30, 430, 30, 430)
+    np.testing.assert_allclose(inside, np.floor(grey), atol=1.0)
+    terrain = source.read("terrain", 30, 430, 30, 430)
+    assert (
+        terrain == raster_of(WORLD.terrain, other, 160, 160, np.uint8)[0].repeat(5, 0).repeat(5, 1)[::2, ::2]
+    ).mean() > 0.98
+    assert summary.covered["ortho"] == pytest.approx(400**2 / 460**2)
+
+
+def test_a_finer_layer_is_averaged_and_classes_take_the_majority(tmp_path):
+    rng = np.random.default_rng(0)
+    fine = Affine(0.1, 0.0, LEFT, 0.0, -0.1, TOP)
+    height, grey = rng.normal(100.0, 1.0, (400, 400)), rng.integers(0, 256, (3, 400, 400)).astype(np.uint8)
+    terrain = rng.integers(4, 8, (400, 400)).astype(np.uint8)
+    write_tif(tmp_path / "h.tif", height[None], WORLD.crs, fine)
+    write_tif(tmp_path / "o.tif", grey, WORLD.crs, fine)
+    write_tif(tmp_path / "t.tif", terrain[None], WORLD.crs, fine)
+    layers = {"height": tmp_path / "h.tif", "ortho": tmp_path / "o.tif", "terrain": tmp_path / "t.tif"}
+    _, source = built(tmp_path, **layers, pitch_m=0.5)
+
+    def cells(values):
+        return values.reshape(80, 5, 80, 5).swapaxes(1, 2).reshape(80, 80, 25)
+
+    np.testing.assert_allclose(heights(source), cells(height).mean(-1), atol=1e-5)
+    luma = cells(np.tensordot((0.299, 0.587, 0.114), grey.astype(float), 1)).mean(-1)
+    np.testing.assert_allclose(source.read("ortho", 0, 80, 0, 80), luma, atol=0.501)
+    votes = np.stack([(cells(terrain) == k).sum(-1) for k in range(8)], -1)
+    np.testing.assert_array_equal(source.read("terrain", 0, 80, 0, 80), votes.argmax(-1))
+
+
+def test_units_scale_and_offset_become_metres(tmp_path):
+    centimetres = np.rint(raster_of(plane, NORTH_UP, dtype=np.float64) * 100.0 - 40_000.0).astype(np.int16)
+    path = write_tif(tmp_path / "h.tif", centimetres, WORLD.crs, NORTH_UP, nodata=-9999)
+    with rasterio.open(path, "r+") as dataset:
+        dataset.scales, dataset.offsets, dataset.units = (1.0,), (40_000.0,), ("cm",)
+    _, source = built(tmp_path, height=path)
+    assert check_plane(source, 0.0051).all()
+
+
+def test_feet_of_a_vertical_crs_become_metres(tmp_path):
+    feet = raster_of(plane, NORTH_UP) / np.float32(0.3048)
+    path = write_tif(tmp_path / "h.tif", feet, "EPSG:32633+8228", NORTH_UP)  # NAVD88 height in feet
+    _, source = built(tmp_path, height=path)
+    assert source.grid.crs == WORLD.crs
+    check_plane(source, 2e-4)
+
+
+def test_every_way_of_saying_nodata_is_heard(tmp_path):
+    base = np.full((3, 400, 400), 200, np.uint8)
+    base[:, 50:100, :] = 0
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    write_tif(tmp_path / "tag.tif", base, WORLD.crs, NORTH_UP, nodata=0)
+    alpha = np.where(base[:1] == 0, 0, 255).astype(np.uint8)
+    write_tif(tmp_path / "alpha.tif", np.vstack([base, alpha]), WORLD.crs, NORTH_UP, photometric="RGB", alpha="YES")
+    with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+        write_tif(tmp_path / "mask.tif", base, WORLD.crs, NORTH_UP)
+        with rasterio.open(tmp_path / "mask.tif", "r+") as dataset:
+            dataset.write_mask(alpha[0])
+    write_tif(tmp_path / "black.tif", base, WORLD.crs, NORTH_UP)
+    for name, value in (("tag", 0), ("alpha", 0), ("mask", 0), ("black", 1)):
+        _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / f"{name}.tif")
+        found = source.read("ortho", 0, 400, 0, 400)
+        assert (found[50:100] == value).all(), name
+        assert (found[:50] == 200).all(), name
+
+
+def test_sixteen_bits_grey_and_palettes_become_grey(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    wide = np.full((1, 400, 400), 65535 * 100 // 255, np.uint16)
+    write_tif(tmp_path / "wide.tif", wide, WORLD.crs, NORTH_UP)
+    index = np.tile(np.array([1, 2], np.uint8), (1, 400, 200))
+    write_tif(tmp_path / "palette.tif", index, WORLD.crs, NORTH_UP)
+    with rasterio.open(tmp_path / "palette.tif", "r+") as dataset:
+        dataset.write_colormap(1, {1: (255, 0, 0, 255), 2: (0, 255, 0, 255)})
+    _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "wide.tif")
+    assert (source.read("ortho", 0, 400, 0, 400) == 100).all()
+    _, source = built(tmp_path, height=tmp_path / "h.tif", ortho=tmp_path / "palette.tif")
+    assert source.read("ortho", 0, 1, 0, 4).tolist() == [[76, 150, 76, 150]]
+
+
+def test_class_values_are_mapped_and_unnamed_ones_are_nodata_and_said(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    values = np.full((1, 400, 400), 40, np.uint16)
+    values[0, :100], values[0, 100:110] = 1000, 77
+    write_tif(tmp_path / "t.tif", values, WORLD.crs, NORTH_UP)
+    (tmp_path / "c.csv").write_text("value,id,name,traversable\n40,2,meadow,yes\n1000,1,water,no\n41,2,meadow,yes\n")
+    paths = {"height": tmp_path / "h.tif", "terrain": tmp_path / "t.tif"}
+    summary, source = built(tmp_path, **paths, classes=tmp_path / "c.csv")
+    found = source.read("terrain", 0, 400, 0, 1)[:, 0]
+    assert found.tolist() == [1] * 100 + [0] * 10 + [2] * 290
+    assert summary.class_share == {"water": 100 / 390, "meadow": 290 / 390}
+    assert source.classes.count == 2
+    assert any("77" in note and "4000 pixels" in note for note in summary.warnings)
+    with pytest.raises(MapError, match=r"none of its values 40, 77, 1000 is in the class table"):
+        built(tmp_path, **paths)
+
+
+ATTRIBUTES = """<PAMDataset><PAMRasterBand band="1"><CategoryNames>{categories}</CategoryNames>{table}</PAMRasterBand></PAMDataset>"""
+TABLE = """<GDALRasterAttributeTable tableType="thematic">
+<FieldDefn index="0"><Name>Value</Name><Type>0</Type><Usage>5</Usage></FieldDefn>
+<FieldDefn index="1"><Name>Count</Name><Type>0</Type><Usage>1</Usage></FieldDefn>
+<FieldDefn index="2"><Name>Class_Name</Name><Type>2</Type><Usage>0</Usage></FieldDefn>
+<FieldDefn index="3"><Name>Remark</Name><Type>2</Type><Usage>0</Usage></FieldDefn>
+{rows}</GDALRasterAttributeTable>"""
+
+
+def named_raster(directory, names, *, as_categories=False, name="t.tif"):
+    """Values 0 to 49 in columns of eight pixels, and a file beside that names some, as GDAL keeps them."""
+    values = np.repeat(np.arange(50, dtype=np.uint8), 8)[None, None, :].repeat(400, axis=1)
+    path = write_tif(directory / name, values, WORLD.crs, NORTH_UP)
+    entries = "".join(f"<Category>{names.get(value, '')}</Category>" for value in range(50)) if as_categories else ""
+    rows = "".join(
+        f'<Row index="{n}"><F>{value}</F><F>9</F><F>{text}</F><F>x{n}</F></Row>'
+        for n, (value, text) in enumerate(names.items())
+    )
+    table = "" if as_categories else TABLE.format(rows=rows)
+    path.with_name(f"{name}.aux.xml").write_text(ATTRIBUTES.format(categories=entries, table=table))
+    return path
+
+
+@pytest.mark.parametrize("as_categories", [False, True])
+def test_a_rasters_own_class_names_say_what_its_values_mean(tmp_path, as_categories):
+    """Value 4 is named mud: the name rules, not the number."""
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    names = {4: "Mud", 10: "GRASS", 11: "paved_road", 12: "water"}
+    path = named_raster(tmp_path, names, as_categories=as_categories)
+    summary, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path)
+    found = source.read("terrain", 5, 6, 0, 400)[0, 4::8]
+    wanted = np.zeros(50, np.uint8)
+    wanted[[4, 10, 11]] = 5, 4, 7
+    assert found.tolist() == wanted.tolist()
+    assert source.facts["classes_from"] == "names"
+    assert any("12 (water)" in note or "values 0, 1, 2" in note for note in summary.warnings)
+
+
+def test_names_that_the_class_table_lacks_are_not_guessed(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    path = named_raster(tmp_path, {4: "Wiese", 5: "Wasser"})
+    with pytest.raises(
+        MapError, match=r"none of its class names \(Wiese, Wasser\) is in the class table \(obstacle, .*--classes"
+    ):
+        built(tmp_path, height=tmp_path / "h.tif", terrain=path)
+    (tmp_path / "c.csv").write_text("value,id,name,traversable\n4,1,meadow,yes\n")
+    _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path, classes=tmp_path / "c.csv")
+    assert source.read("terrain", 5, 6, 36, 37).tolist() == [[1]]
+    assert source.facts["classes_from"] == "file"
+
+
+def test_attribute_tables_without_names_or_with_ranges_leave_values_as_ids(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    path = named_raster(tmp_path, {4: "", 5: ""})
+    _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path)
+    assert source.read("terrain", 5, 6, 0, 400)[0, 4::8].tolist() == [0, *range(1, 8), *[0] * 42]
+    assert source.facts["classes_from"] == "default"
+
+
+def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    index = np.repeat(np.array([4, 5, 6, 7], np.uint8), 100)[None, None, :].repeat(400, axis=1)
+    write_tif(tmp_path / "p.tif", index, WORLD.crs, NORTH_UP)
+    opacity = {4: 255, 5: 255, 6: 0, 7: 255}
+    colours = "".join(f'<Entry c1="9" c2="{n}" c3="9" c4="{opacity.get(n, 0)}"/>' for n in range(8))
+    rasterio.shutil.copy(tmp_path / "p.tif", tmp_path / "p.vrt", driver="VRT")
+    document = (tmp_path / "p.vrt").read_text().replace("<ColorInterp>Gray", "<ColorInterp>Palette")
+    document = document.replace("<SimpleSource>", f"<ColorTable>{colours}</ColorTable><SimpleSource>")
+    (tmp_path / "p.vrt").write_text(document)
+    _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=tmp_path / "p.vrt")
+    assert source.read("terrain", 9, 10, 0, 400)[0, 50::100].tolist() == [4, 5, 0, 7]
+
+
+def test_two_builds_are_the_same_bytes_and_replace_each_other(tmp_path):
+    paths = World("EPSG:32633", 560_000.0, 5_215_000.0, side_m=30.0).write(tmp_path, 0.1)
+
+    def digest():
+        built(tmp_path, **paths)
+        files = sorted(path for path in (tmp_path / "m.zarr").rglob("*") if path.is_file())
+        return [(path.name, hashlib.sha256(path.read_bytes()).hexdigest()) for path in files]
+
+    assert digest() == digest()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["height.tif", "m.zarr", "ortho.tif", "terrain.tif"]
+
+
+def test_shards_meet_without_a_seam(tmp_path):
+    affine = Affine(0.1, 0.0, LEFT, 0.0, -0.1, TOP)
+    write_tif(tmp_path / "h.tif", raster_of(plane, affine, 60, 2300), "EPSG:32634", affine)
+    _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32634", pitch_m=0.07)
+    found = heights(source)
+    steps = np.diff(found[10:-10], axis=1)
+    assert np.nanmax(np.abs(steps - 0.2 * 0.07)) < 1e-4
+
+
+def bad_rasters(directory: Path):
+    """Every generated raster that must be refused: role, path, what the line must say."""
+    good = raster_of(plane, NORTH_UP)
+
+    def write(name, values=good, crs=WORLD.crs, affine=NORTH_UP, **options):
+        return write_tif(directory / name, values, crs, affine, **options)
+
+    text = directory / "text.tif"
+    text.write_text("not a raster")
+    whole = write("whole.tif", compress="deflate").read_bytes()
+    cut = directory / "cut.tif"
+    cut.write_bytes(whole[: len(whole) // 2])
+    gcps = [GroundControlPoint(r, c, WORLD.x_m + c, WORLD.y_m - r) for r, c in ((0, 0), (0, 9), (9, 0), (9, 9))]
+    with rasterio.open(
+        directory / "gcps.tif",
+        "w",
+        driver="GTiff",
+        height=9,
+        width=9,
+        count=1,
+        dtype="float32",
+        gcps=gcps,
+        crs=WORLD.crs,
+    ) as dataset:
+        dataset.write(np.zeros((1, 9, 9), np.float32))
+    moon = "+proj=eqc +a=1737400 +b=1737400 +units=m"
+    world = Affine(0.5, 0.0, -180.0, 0.0, -0.5, 90.0)
+    return [
+        ("height", directory / "nothing.tif", "no such file"),
+        ("height", text, "not a raster"),
+        ("height", cut, "damaged|not a raster"),
+        ("height", write("plain.tif", crs=None), "no CRS.*--crs"),
+        ("height", directory / "gcps.tif", "ground control points"),
+        ("height", write("moon.tif", crs=moon), "another body"),
+        ("height", write("globe.tif", np.zeros((1, 360, 720), np.float32), "EPSG:4326", world), "too large"),
+        ("height", write("nodata.tif", np.full_like(good, -9.0), nodata=-9.0), "every pixel is nodata"),
+        ("height", write("nan.tif", np.full_like(good, np.nan)), "every pixel is nodata"),
+        ("height", write("rgb.tif", np.zeros((3, 9, 9), np.uint8)), "3 bands.*wanted one"),
+        ("height", write("complex.tif", np.zeros((1, 9, 9), np.complex64)), "complex64"),
+        ("height", write("cm.tif", good * 100.0), "not metres"),
+        ("ortho", write("float.tif"), "float32, wanted 8-bit or 16-bit"),
+        ("ortho", write("five.tif", np.zeros((5, 9, 9), np.uint8)), "5 bands"),
+        (
+            "ortho",
+            write("away.tif", np.ones((3, 9, 9), np.uint8), affine=Affine(1, 0, 5e5, 0, -1, 5e6)),
+            "no data anywhere",
+        ),
+        ("terrain", write("real.tif"), "float32, wanted integer"),
+        ("terrain", write("empty.tif", np.zeros((1, 400, 400), np.uint8), nodata=0), "no data anywhere"),
+    ]
+
+
+def test_what_cannot_be_placed_is_refused_in_one_line_and_leaves_nothing(tmp_path):
+    good = write_tif(tmp_path / "good.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    (tmp_path / "out").mkdir()
+    for role, path, wanted in bad_rasters(tmp_path):
+        with pytest.raises(MapError, match=wanted) as caught:
+            build_map(tmp_path / "out" / "m.zarr", name="m", **{"height": good, role: path})
+        assert len(caught.value.problems) == 1, path
+        assert str(path) in caught.value.problems[0]
+        assert "\n" not in caught.value.problems[0]
+        assert not list((tmp_path / "out").iterdir()), path
+
+
+def test_several_wrong_rasters_are_named_at_once(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), WORLD.crs, NORTH_UP)
+    with pytest.raises(MapError) as caught:
+        built(tmp_path, height=tmp_path / "no.tif", ortho=tmp_path / "h.tif", terrain=tmp_path / "h.tif")
+    assert len(caught.value.problems) == 3
+
+
+def test_a_wanted_crs_must_be_metric(tmp_path):
+    write_tif(tmp_path / "h.tif", raster_of(plane, NORTH_UP), None, NORTH_UP)
+    for crs, wanted in (("EPSG:3857", "not metric"), ("EPSG:4326", "not metric"), ("nonsense", "not a coordinate")):
+        with pytest.raises(MapError, match=wanted):
+            built(tmp_path, height=tmp_path / "h.tif", crs=crs)
+    _, source = built(tmp_path, height=tmp_path / "h.tif", crs="EPSG:32633")
+    check_plane(source)
+
+
+ODDITIES = {
+    "Copernicus_DSM_10_N45_00_E005_00_DEM.tif": None,
+    "copernicus_status.tif": None,
+    "cog_nodata_nan.tif": None,
+    "float_raster_with_nodata.tif": None,
+    "201404_13SED190110_201404_0x1500m_CL_1.tif": "3 bands",
+    "RGBA.uint16.tif": "4 bands",
+    "cog_cmap.tif": "palette",
+    "cog_gcps.tif": "ground control points",
+    "cog_nonearth.tif": "another body",
+    "cog_scale.tif": "2 bands",
+    "dem_cm.tif": "not metres",
+    "float_nan.tif": "no CRS",
+    "inverted_lat.tif": "too large|nodata",
+    "rotated.tif": "no CRS",
+}
+
+
+@pytest.mark.parametrize("name", ODDITIES)
+def test_odd_rasters_of_others_as_height(tmp_path, name):
+    path, wanted = shared_data(f"rasters/{name}"), ODDITIES[name]
+    if wanted is None:
+        summary, _ = built(tmp_path, height=path)
+        assert summary.grid.crs.startswith("EPSG:326")
+    else:
+        with pytest.raises(MapError, match=wanted) as caught:
+            built(tmp_path, height=path)
+        assert len(caught.value.problems) == 1
+
+
+ORTHOS = {
+    "201404_13SED190110_201404_0x1500m_CL_1.tif": (None, 1.0),
+    "201404_13SED190110_201404_0x1500m_CL_1_alpha.tif": (None, 0.93),
+    "201404_13SED190110_201404_0x1500m_CL_1_mask.tif": (None, 0.97),
+    "201404_13SED190110_201404_0x1500m_CL_1_nodata.tif": (None, 0.97),
+    "OSBS_029.tif": (None, 0.99),
+    "RGBA.uint16.tif": (None, 0.5),
+    "all-nodata.tif": ("no data anywhere", 0.0),
+    "corrupt.tif": ("damaged", 0.0),
+}
+
+
+@pytest.mark.parametrize("name", ORTHOS)
+def test_odd_rasters_of_others_as_ortho(tmp_path, name):
+    """A flat height raster is laid under each."""
+    path, (wanted, covered) = shared_data(f"rasters/{name}"), ORTHOS[name]
+    with rasterio.open(path) as dataset:
+        crs, (left, bottom, right, top) = dataset.crs, dataset.bounds
+    affine = Affine((right - left) / 50, 0.0, left, 0.0, -(top - bottom) / 50, top)
+    flat = write_tif(tmp_path / "flat.tif", np.full((1, 50, 50), 100.0, np.float32), crs, affine)
+    if wanted:
+        with pytest.raises(MapError, match=wanted):
+            built(tmp_path, height=flat, ortho=path)
+        return
+    summary, _ = built(tmp_path, height=flat, ortho=path)
+    assert summary.covered["ortho"] >= 0.93 * covered
+
+
+def test_the_map_of_a_real_site(tmp_path):
+    site = shared_data("warthog_grass_a")
+    layers = {name: site / f"{name}.tif" for name in ("height", "ortho", "terrain")}
+    summary, source = built(tmp_path, **layers)
+    assert (summary.grid.crs, summary.grid.pitch_m, summary.grid.rows) == ("EPSG:32750", 0.25, 400)
+    with rasterio.open(layers["height"]) as dataset:
+        original = dataset.read(1, masked=True)
+    np.testing.assert_allclose(heights(source), original.filled(np.nan), atol=1e-5)
+    with rasterio.open(layers["terrain"]) as dataset:
+        np.testing.assert_array_equal(source.read("terrain", 0, 400, 0, 400), dataset.read(1))

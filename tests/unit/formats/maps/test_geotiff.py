@@ -1,0 +1,32 @@
+"""GeoTIFFs that are written: what other readers find in them."""
+
+import logging
+
+import numpy as np
+import rasterio
+
+from tcpipe.formats.maps.geotiff import write_geotiff
+
+
+def test_a_palette_is_written_before_the_pixels_and_gdal_has_nothing_to_say(tmp_path, caplog):
+    """Larger than GDAL's cache, so that pixels are on disk before the last strip."""
+    side, palette = 1500, {1: (10, 20, 30), 7: (70, 80, 90)}
+    pixels = np.random.default_rng(0).integers(0, 8, (1, side, side), dtype=np.uint8)
+    with caplog.at_level(logging.INFO, "rasterio"), rasterio.Env(GDAL_CACHEMAX=1):
+        write_geotiff(
+            tmp_path / "terrain.tif",
+            lambda first, last: pixels[:, first:last],
+            rows=side,
+            cols=side,
+            affine=(0.05, 0.0, 500_000.0, 0.0, -0.05, 5_200_000.0),
+            crs="EPSG:32633",
+            dtype="uint8",
+            nodata=0,
+            palette=palette,
+        )
+    assert caplog.messages == []
+    with rasterio.open(tmp_path / "terrain.tif") as dataset:
+        assert dataset.colorinterp == (rasterio.enums.ColorInterp.palette,)
+        assert {value: dataset.colormap(1)[value][:3] for value in palette} == palette
+        assert dataset.xy(0, 0) == (500_000.025, 5_199_999.975)
+        np.testing.assert_array_equal(dataset.read(), pixels)

@@ -1,0 +1,152 @@
+"""Maps on disk open in xarray as they are, and what is no map says so."""
+
+import json
+import shutil
+
+import numpy as np
+import pyproj
+import pytest
+import rasterio
+import xarray
+from map_worlds import World
+
+from tcpipe.errors import MapError
+from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
+from tcpipe.formats.seals import write_checksums
+from tcpipe.terrain.classes import PAPER_SCHEME
+from tcpipe.terrain.grid import MapGrid
+
+WORLD = World("EPSG:31256", -68_000.0, 215_000.0, side_m=20.0)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("map")
+    build_map(directory / "m.zarr", name="garden", **WORLD.write(directory, 0.1))
+    return directory / "m.zarr"
+
+
+def test_xarray_decodes_metres_grey_and_classes_with_coordinates(path):
+    with xarray.open_zarr(path) as found:
+        x, y = np.meshgrid(found.x, found.y)
+        np.testing.assert_allclose(found.height, WORLD.height(x, y), atol=1e-4)
+        np.testing.assert_allclose(255.0 * found.ortho, WORLD.grey(x, y), atol=0.51)
+        np.testing.assert_array_equal(found.terrain, WORLD.terrain(x, y))
+        assert pyproj.CRS(found.spatial_ref.attrs["crs_wkt"]) == pyproj.CRS(WORLD.crs)
+        assert found.attrs["proj:code"] == WORLD.crs
+        assert found.height.attrs["units"] == "m"
+        assert found.terrain.attrs["flag_meanings"].split()[3:] == ["grass", "mud", "unpaved_road", "paved_road"]
+        assert found.height.attrs["grid_mapping"] == "spatial_ref"
+
+
+@pytest.mark.skipif(
+    tuple(int(part) for part in rasterio.__gdal_version__.split(".")[:2]) < (3, 13),
+    reason=f"GDAL reads shards from 3.13 on; rasterio brings {rasterio.__gdal_version__}",
+)
+def test_gdal_opens_each_layer_in_its_place(path):
+    grid = open_map(path).grid
+    for layer in ("height", "terrain"):
+        with rasterio.open(f'ZARR:"{path}":/{layer}') as found:
+            assert pyproj.CRS(found.crs.to_wkt()) == pyproj.CRS(WORLD.crs)
+            assert found.transform.to_gdal() == pytest.approx(grid.geotransform)
+            values = found.read(1) * found.scales[0] + found.offsets[0]
+        x, y = np.meshgrid(*(grid.xy_from_px(np.stack([np.arange(200.0)] * 2, 1)).T))
+        wanted = WORLD.height(x, y) if layer == "height" else WORLD.terrain(x, y)
+        np.testing.assert_allclose(values, wanted, atol=1e-4)
+
+
+def test_an_open_map_knows_what_it_is(path):
+    source = open_map(path)
+    assert (source.name, source.layers, source.classes.count) == ("garden", ("height", "ortho", "terrain"), 7)
+    assert source.facts["sources"] == {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif"}
+    assert source.read("height", 3, 5, 7, 11).shape == (2, 4)
+    summary = json.loads(json.dumps(source.summary()))
+    assert (summary["crs"], summary["rows"], summary["pitch_m"]) == (WORLD.crs, 200, 0.1)
+    assert summary["covered"] == {"height": 1.0, "ortho": 1.0, "terrain": 1.0}
+
+
+def test_overviews_are_maps_of_the_same_ground(path):
+    source = open_map(path)
+    assert source.factors == (1, 2, 4, 8)
+    fine = source.height_reference_m + source.read("height", 0, 200, 0, 200).astype(float)
+    classes = source.read("terrain", 0, 200, 0, 200)
+    for factor in (2, 8):
+        level = source.at(factor)
+        count = 200 // factor
+        assert (level.grid.rows, level.grid.pitch_m, level.layers) == (count, factor * 0.1, source.layers)
+        cells = fine.reshape(count, factor, count, factor).mean(axis=(1, 3))
+        found = level.height_reference_m + level.read("height", 0, count, 0, count).astype(float)
+        np.testing.assert_allclose(found, cells, atol=2e-6)
+        votes = [(classes == k).reshape(count, factor, count, factor).sum(axis=(1, 3)) for k in range(8)]
+        np.testing.assert_array_equal(level.read("terrain", 0, count, 0, count), np.argmax(votes, axis=0))
+        with xarray.open_zarr(path, group=f"overviews/{factor}") as decoded:
+            np.testing.assert_allclose(decoded.height, cells, atol=2e-6)
+            np.testing.assert_allclose(decoded.x, level.grid.xy_from_px(np.stack([np.arange(count)] * 2, 1))[:, 0])
+            assert pyproj.CRS(decoded.spatial_ref.attrs["crs_wkt"]) == pyproj.CRS(WORLD.crs)
+
+
+def test_overviews_across_shards_have_no_seam(tmp_path):
+    grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.03, 2100, 2100)
+    rng = np.random.default_rng(0)
+    height, ids = rng.normal(600.0, 1.0, (2100, 2100)), rng.integers(1, 8, (2100, 2100)).astype(np.uint8)
+    writer = MapWriter(tmp_path / "m.zarr", name="m", grid=grid, scheme=PAPER_SCHEME, layers=("height", "terrain"))
+    for row in (0, SHARD_PX):
+        for col in (0, SHARD_PX):
+            for layer, values in (("height", height), ("terrain", ids)):
+                writer.write(layer, row, col, values[row : row + SHARD_PX, col : col + SHARD_PX])
+    writer.finish({})
+    write_checksums(tmp_path / "m.zarr")
+    for factor in (2, 32):
+        level, side = open_map(tmp_path / "m.zarr").at(factor), 2100 // factor
+        cells = height[: side * factor, : side * factor].reshape(side, factor, side, factor).mean(axis=(1, 3))
+        found = level.height_reference_m + level.read("height", 0, side, 0, side).astype(float)
+        np.testing.assert_allclose(found, cells, atol=1e-5)
+        assert (level.read("terrain", 0, side, 0, side) > 0).all()
+
+
+def test_what_is_no_map_says_so(path, tmp_path):
+    with pytest.raises(MapError, match="no Zarr directory"):
+        open_map(tmp_path / "absent.zarr")
+    with pytest.raises(MapError, match="not a map"):
+        open_map(tmp_path)
+    (tmp_path / "zarr.json").write_text(json.dumps({"zarr_format": 3, "node_type": "group", "attributes": {}}))
+    with pytest.raises(MapError, match="not a map of this version"):
+        open_map(tmp_path)
+
+
+@pytest.mark.parametrize("layer", ["height", "ortho", "terrain"])
+def test_one_flipped_byte_is_an_error_not_a_number(path, tmp_path, layer):
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(path, copy)
+    shard = next(p for p in (copy / layer / "c").rglob("*") if p.is_file())
+    raw = bytearray(shard.read_bytes())
+    raw[len(raw) // 3] ^= 0x10
+    shard.write_bytes(raw)
+    with pytest.raises(MapError, match=rf"{layer}, rows 0 to 200.*cannot be read"):
+        open_map(copy).read(layer, 0, 200, 0, 200)
+
+
+def test_a_layer_that_is_gone_is_named(path, tmp_path):
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(path, copy)
+    shutil.rmtree(copy / "ortho")
+    with pytest.raises(MapError, match="the map's ortho is gone"):
+        open_map(copy)
+    shutil.rmtree(copy)
+    shutil.copytree(path, copy)
+    shutil.rmtree(copy / "overviews" / "4")
+    with pytest.raises(MapError, match=r"the map's overviews/4/height, .* is gone"):
+        open_map(copy)
+
+
+def test_tiles_are_windows_and_hold_no_data_beyond_the_map(path):
+    source = open_map(path)
+    for level in (source, source.at(2)):
+        for layer in level.layers:
+            tile = np.full((level.tile_px, level.tile_px), 7, np.float32 if layer == "height" else np.uint8)
+            level.read_tile(layer, 0, 0, tile)
+            part = level.read(layer, 0, level.grid.rows, 0, level.grid.cols)
+            np.testing.assert_array_equal(tile[: part.shape[0], : part.shape[1]], part)
+            beyond = np.concatenate([tile[part.shape[0] :].ravel(), tile[:, part.shape[1] :].ravel()])
+            assert np.isnan(beyond).all() if layer == "height" else not beyond.any()

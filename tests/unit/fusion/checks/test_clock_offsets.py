@@ -1,0 +1,134 @@
+"""From pairs to one clock: who is late is settled by least squares and by the majority; worked out by hand."""
+
+import numpy as np
+import pytest
+
+from tcpipe.fusion.checks.clock_offsets import Pair, _settled, find_clock_offsets
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+
+
+def pair(late, against, offset_s, std_s=0.002, explained=0.9):
+    return Pair(late, against, "speed", offset_s, std_s, explained)
+
+
+def test_the_one_that_differs_is_the_one_that_is_late():
+    found = _settled((pair("gnss", "wheel_odometry", 0.25), pair("wheel_odometry", "imu", 0.001)))
+    assert found.reference == "imu"
+    assert found.offsets["gnss"].offset_s == pytest.approx(0.251)
+    assert {role: offset.noted for role, offset in found.offsets.items()} == {"wheel_odometry": False, "gnss": True}
+
+
+def test_the_majority_rules_over_the_order():
+    pairs = pair("wheel_odometry", "imu", 0.1), pair("visual_odometry", "imu", 0.1), pair("gnss", "wheel_odometry", 0.0)
+    found = _settled(pairs)
+    assert found.reference == "wheel_odometry"
+    assert {role for role, offset in found.offsets.items() if offset.noted} == {"imu"}
+    assert found.offsets["imu"].offset_s == pytest.approx(-0.1)
+
+
+def test_a_doubtful_clock_is_no_reference():
+    """Against power, known to 0.035 s, nobody is surely off; against the wheels the IMU is."""
+    pairs = (
+        pair("wheel_odometry", "imu", 0.1),
+        pair("visual_odometry", "imu", 0.1),
+        pair("power", "wheel_odometry", -0.02, 0.035),
+    )
+    found = _settled(pairs)
+    assert found.reference == "wheel_odometry"
+    assert {role for role, offset in found.offsets.items() if offset.noted} == {"imu"}
+
+
+def test_pairs_in_a_ring_are_weighed_by_their_variances():
+    """0.10 ± 0.01 directly, 0.14 ± 0.01·√2 round the third: weights 2 : 1 give 0.1133 ± 0.01·√(2/3)."""
+    ring = (
+        pair("visual_odometry", "imu", 0.10, 0.01),
+        pair("wheel_odometry", "imu", 0.04, 0.01),
+        pair("visual_odometry", "wheel_odometry", 0.10, 0.01),
+    )
+    offset = _settled(ring).offsets["visual_odometry"]
+    assert offset.offset_s == pytest.approx(0.34 / 3)
+    assert offset.std_s == pytest.approx(0.01 * (2 / 3) ** 0.5)
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "std_s", "explained", "determined"),
+    [
+        (0.0, 0.019, 0.9, True),
+        (0.0, 0.03, 0.9, False),
+        (0.3, 0.05, 0.9, True),
+        (0.3, 0.07, 0.9, False),
+        (0.3, 0.01, 0.2, False),
+    ],
+)
+def test_what_is_not_known_well_is_not_spoken_of(offset_s, std_s, explained, determined):
+    found = _settled((pair("gnss", "wheel_odometry", offset_s, std_s, explained),))
+    assert found.pairs[0].determined == determined
+    assert bool(found.offsets) == determined
+
+
+def test_small_offsets_are_not_noted_and_power_may_be_off_by_more():
+    pairs = pair("gnss", "wheel_odometry", 0.045), pair("power", "wheel_odometry", 0.075)
+    assert not any(offset.noted for offset in _settled(pairs).offsets.values())
+    pairs = pair("gnss", "wheel_odometry", -0.055), pair("power", "wheel_odometry", 0.085)
+    assert all(_settled(pairs).offsets[role].noted for role in ("gnss", "power"))
+
+
+HALF_HOUR = np.arange(0.0, 1900.0, 0.04)
+
+
+def drive_with_clocks(**late_s):
+    """Half an hour of starts, stops and turns by wheels, gyroscope and fixes; ``late_s``: how late a sensor's stamps are, by time."""
+    t = HALF_HOUR
+    speed = np.clip(np.minimum(np.mod(t, 13.0) - 2.0, 11.5 - np.mod(t, 13.0)), 0.0, 1.0)
+    turn = 0.4 * np.sin(0.9 * t + np.sin(0.05 * t)) * (speed > 0)
+    step = speed * np.exp(1j * np.cumsum(turn) * 0.04) * 0.04
+    place = np.cumsum(step) - step / 2
+    rng = np.random.default_rng(7)
+
+    def stamps(sensor):
+        return np.round((t + late_s.get(sensor, np.zeros_like(t))) * 1e9).astype(np.int64)
+
+    nothing, one = np.full(t.size, np.nan), np.ones((t.size, 3))
+    wheels = BodyVelocities(
+        stamps("wheels"),
+        np.column_stack((speed + rng.normal(0, 0.02, t.size), nothing, nothing)),
+        one,
+        turn + rng.normal(0, 0.02, t.size),
+        one[:, 0],
+    )
+    gyro = np.column_stack((rng.normal(0, 0.01, (t.size, 2)), turn + rng.normal(0, 0.01, t.size)))
+    imu = InertialMeasurements(stamps("imu"), gyro, 9.81 * one, np.full((t.size, 4), np.nan), 0.01, 0.1)
+    enu = np.column_stack((place.real, place.imag, 0 * t)) + rng.normal(0, 0.01, (t.size, 3))
+    fixes = slice(None, None, 5)
+    gnss = Positions(stamps("gnss")[fixes], enu[fixes], 1e-4 * one[fixes])
+    return Measurements(gnss=gnss, imu=imu, wheels=wheels)
+
+
+def test_a_clock_that_drifts_is_told_from_one_that_is_off():
+    """The receiver's clock runs 150 ppm slow about a middle of +0.02 s: over half an hour 0.28 s, of which a constant shows nothing."""
+    rate = 150e-6
+    found = find_clock_offsets(drive_with_clocks(gnss=0.02 + rate * (HALF_HOUR - 950.0)), None)
+    gnss = found.offsets["gnss"]
+    assert gnss.drifts
+    assert not gnss.noted
+    assert gnss.drift_s_per_h == pytest.approx(3600 * rate, abs=4 * gnss.drift_std_s_per_h)
+    assert gnss.drift_s_per_h == pytest.approx(3600 * rate, rel=0.1)
+    assert gnss.offset_s == pytest.approx(0.02, abs=0.01)
+    assert not found.offsets["wheel_odometry"].drifts
+    (pair,) = [pair for pair in found.pairs if pair.late == "gnss"]
+    assert [round(offset_s, 1) for _, offset_s, _ in pair.windows] == [-0.1, 0.0, 0.1]
+
+
+def test_steady_clocks_do_not_drift_and_a_late_one_is_only_late():
+    found = find_clock_offsets(drive_with_clocks(gnss=np.full(HALF_HOUR.size, 0.2)), None)
+    assert not any(offset.drifts for offset in found.offsets.values())
+    assert {role for role, offset in found.offsets.items() if offset.noted} == {"gnss"}
+    assert found.offsets["gnss"].offset_s == pytest.approx(0.2, abs=0.01)
+
+
+def test_the_drift_of_the_reference_is_its_own():
+    """Wheels and fixes agree with each other for ever; the gyroscope's clock drifts from both."""
+    found = find_clock_offsets(drive_with_clocks(imu=200e-6 * (HALF_HOUR - 950.0)), None)
+    assert found.reference == "wheel_odometry"
+    assert {role for role, offset in found.offsets.items() if offset.drifts} == {"imu"}
+    assert found.offsets["imu"].drift_s_per_h == pytest.approx(0.72, rel=0.05)

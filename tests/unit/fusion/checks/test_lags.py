@@ -1,0 +1,70 @@
+"""Lags of made signals: sub-sample, through other scales and axes, with an error that is what repeated trials show."""
+
+import numpy as np
+import pytest
+
+from tcpipe.fusion.checks.lags import GRID_NS, GRID_S, averaged, find_lag, grid_ns, gridded
+
+S = 1_000_000_000
+AT = grid_ns(0, 120 * S)
+SECONDS = AT * 1e-9
+
+
+def speed(t):
+    """Starts and stops every 12 s, with ramps of a second."""
+    phase = np.mod(t, 12.0)
+    return np.clip(np.minimum(phase - 2.0, 10.5 - phase), 0.0, 1.0) * (0.9 + 0.05 * np.sin(t))
+
+
+@pytest.mark.parametrize("late_s", [-0.7132, -0.021, 0.0, 0.0067, 0.25, 1.1])
+def test_a_smooth_signal_gives_its_shift_to_a_millisecond(late_s):
+    smooth = [averaged(speed(SECONDS - shift)[:, None], 0.2) for shift in (late_s, 0.0)]
+    found = find_lag(3.0 * smooth[0][:, 0] - 1.0, smooth[1])
+    assert found.offset_s == pytest.approx(late_s, abs=1e-3)
+    assert found.explained == pytest.approx(1.0, abs=2e-4)
+
+
+def test_a_target_is_found_in_axes_turned_and_scaled():
+    rng = np.random.default_rng(3)
+    axes = averaged(np.cumsum(rng.standard_normal((AT.size + 40, 3)), axis=0) * 0.05, 0.1)
+    target, regressors = axes[: AT.size] @ [0.3, -57.0, 12.0], axes[27 : 27 + AT.size]
+    found = find_lag(target, regressors)  # the target tells at row 27 what the regressors told at row 0
+    assert found.offset_s == pytest.approx(27 * GRID_S, abs=1e-3)
+
+
+def test_the_standard_deviation_is_that_of_repeated_trials():
+    rng = np.random.default_rng(5)
+    regressor = averaged(speed(SECONDS)[:, None], 0.2)
+    target = averaged(speed(SECONDS - 0.1)[:, None], 0.2)[:, 0]
+    noise = [averaged(rng.normal(0.0, 0.5, (AT.size, 1)), 0.2)[:, 0] for _ in range(60)]
+    found = [find_lag(target + each, regressor) for each in noise]
+    errors = np.array([each.offset_s - 0.1 for each in found])
+    assert abs(errors.mean()) < 0.4 * errors.std()
+    assert np.median([each.std_s for each in found]) == pytest.approx(errors.std(), rel=0.35)
+
+
+def test_nothing_is_said_of_too_little():
+    flat, noise = np.ones(AT.size), np.random.default_rng(1).standard_normal(AT.size)
+    moving = averaged(speed(SECONDS)[:, None], 0.2)
+    assert find_lag(flat, moving) is None
+    assert find_lag(np.full(AT.size, np.nan), moving) is None
+    assert find_lag(moving[:400, 0], moving[:400]) is None
+    unrelated = find_lag(averaged(noise[:, None], 0.2)[:, 0], moving)
+    assert unrelated is None or unrelated.explained < 0.1
+
+
+def test_cells_are_means_and_gaps_are_unknown():
+    stamp = np.array([0, 1, 2, 3, 9, 10]) * S
+    cells = gridded(stamp, (stamp * 1e-9)[:, None] * 2.0, AT[: 11 * 50], longest_gap_ns=2 * S)[:, 0]
+    known = np.isfinite(cells)
+    inside = (AT[: 11 * 50] + GRID_NS // 2 <= 3 * S) | (AT[: 11 * 50] - GRID_NS // 2 >= 9 * S)
+    np.testing.assert_array_equal(known[50:500], inside[50:500])
+    np.testing.assert_allclose(cells[50:140], AT[50:140] * 2e-9, atol=1e-9)
+
+
+def test_a_running_mean_knows_nothing_beside_a_hole():
+    values = np.arange(20.0)[:, None]
+    values[10] = np.nan
+    mean = averaged(values, 4 * GRID_S)[:, 0]
+    np.testing.assert_array_equal(np.flatnonzero(np.isfinite(mean)), [2, 3, 4, 5, 6, 7, 13, 14, 15, 16, 17])
+    np.testing.assert_allclose(mean[[2, 7, 17]], [2.0, 7.0, 17.0])

@@ -1,0 +1,397 @@
+import json
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file, segments
+
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError, UsageError
+from tcpipe.formats.recipe_toml import recipe_id
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.verify import verify
+from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
+from tcpipe.store import Store
+
+
+@pytest.fixture(scope="module")
+def map_store(tmp_path_factory):
+    """A store with the map alone."""
+    directory = tmp_path_factory.mktemp("maps")
+    store = Store(directory / "store")
+    store.root.mkdir()
+    add_world(store, directory)
+    return store
+
+
+@pytest.fixture
+def store(map_store, tmp_path):
+    """A store of one's own, with the map in it."""
+    import shutil
+
+    root = tmp_path / "store"
+    shutil.copytree(map_store.root, root)
+    return Store(root)
+
+
+def add(store, run_id="a", y_m=(0.0,), *, x=(-10.0, 10.0), start_ns=0, recipe=None, sha256=None, **keywords):
+    table = segments(run_id, *lanes(np.array(y_m), *x), start_ns=start_ns, **keywords)
+    add_run(store, run_id, table, recipe=recipe, sha256=sha256)
+
+
+def build(store, tmp_path, *, page=False, **keywords):
+    """Build into ``out``; drawing the page is nine tenths of so small a build, so only datasets of an odd kind get one."""
+    with pytest.MonkeyPatch.context() as patch:
+        if not page:
+            patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda _: "<!doctype html>")
+        return build_dataset(tmp_path / "out", store=store.root, **{"recipe": Recipe(), **keywords})
+
+
+def refused(store, tmp_path, error=DatasetError, **keywords):
+    """The one line with which building fails; nothing is left behind."""
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with pytest.raises(error) as caught:
+        build(store, tmp_path, **keywords)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    assert len(caught.value.problems) == 1
+    return caught.value.problems[0]
+
+
+def test_no_store(tmp_path):
+    assert "there is no store here" in refused(Store(tmp_path / "nowhere"), tmp_path, UsageError)
+
+
+def test_no_runs(store, tmp_path):
+    assert "no runs in the store" in refused(store, tmp_path)
+
+
+def test_no_map(tmp_path):
+    store = Store(tmp_path / "store")
+    add(store)
+    assert "no map in the store" in refused(store, tmp_path)
+
+
+def test_several_maps_are_listed_with_the_flag(store, tmp_path):
+    add(store)
+    add_world(store, tmp_path / "more", name="yard")
+    line = refused(store, tmp_path)
+    assert "(site, yard)" in line
+    assert "--map" in line
+    assert "no map 'field'" in refused(store, tmp_path, map_name="field")
+    assert build(store, tmp_path, map_name="yard").samples == 20
+
+
+def test_two_robots_are_not_pooled_unasked(store, tmp_path):
+    add(store)
+    add(store, "b", (3.0,), robot="warthog")
+    line = refused(store, tmp_path)
+    assert "husky, warthog" in line
+    assert "--robot" in line
+    assert "no run of robot 'jackal'" in refused(store, tmp_path, robot="jackal")
+    assert build(store, tmp_path, robot="warthog").samples == 20
+
+
+def test_runs_of_another_recipe_are_left_out_and_named(store, tmp_path):
+    other = Recipe(label=LabelConfig(velocity="fused"))
+    add(store, "b", recipe=other)
+    assert "none ingested with this recipe" in refused(store, tmp_path)
+    add(store)
+    result = build(store, tmp_path)
+    line = result.problems[0]
+    assert line == (
+        f"1 of 2 runs have no ingestion under this recipe (they have {recipe_id(other, 'husky')}): b; "
+        "ingest their logs again: tcpipe ingest /logs/b.mcap"
+    )
+    assert (result.samples, result.exit_code) == (20, 3)
+
+
+def test_a_recording_under_two_names_counts_once(store, tmp_path):
+    add(store, sha256="5ad0")
+    add(store, "copy", sha256="5ad0")
+    result = build(store, tmp_path)
+    assert result.samples == 20
+    assert "run copy: the same recording as run a; used once" in result.warnings
+
+
+def test_one_drive_recorded_twice_counts_once(store, tmp_path):
+    add(store, start_ns=10**18)
+    add(store, "b", start_ns=10**18 + 300_000_000)
+    result = build(store, tmp_path)
+    assert result.samples == 20
+    assert "run b: all 20 segments lie when and where those of run a do: the same drive; used once" in result.warnings
+    assert [run["run_id"] for run in open_dataset(tmp_path / "out").card["runs"]] == ["a"]
+
+
+@pytest.mark.parametrize(("names", "skew_ns"), [(("a", "b"), 0), (("b", "a"), 300_000_000), (("a", "b"), -900_000_000)])
+def test_a_recording_that_overlaps_another_counts_once_where_it_does(store, tmp_path, names, skew_ns):
+    """One drive of 40 m; its second recording has the last 20 m of the first one and 10 m more."""
+    whole, late = names
+    add(store, whole, x=(-19.0, 11.0), start_ns=10**18)
+    add(store, late, x=(-9.0, 18.0), start_ns=10**18 + 10 * 1_200_000_000 + skew_ns)
+    result = build(store, tmp_path)
+    starts_m = np.sort(pq.read_table(tmp_path / "out" / "samples.parquet")["start_lon_deg"].to_numpy())
+    assert result.samples == 37
+    assert np.diff(starts_m).min() > 0.9 * np.median(np.diff(starts_m))  # no metre of it twice
+    assert result.ledger_m["recorded_twice"] == pytest.approx(20)
+    assert any("20 of " in line and "the same drive; used once" in line for line in result.warnings)
+    assert sum(result.ledger_m.values()) == pytest.approx(30 + 27 + 5)
+    assert verify(tmp_path / "out").problems == ()
+
+
+def test_a_drive_that_was_recorded_in_two_pieces_is_one_and_a_short_one_after_it_too(store, tmp_path):
+    add(store, "a", x=(-15.0, 5.0), start_ns=10**18)
+    add(store, "b", x=(5.0, 7.0), start_ns=10**18 + 20 * 1_200_000_000 + 50_000_000)
+    result = build(store, tmp_path)
+    assert result.samples == 22
+    assert not any("the same drive" in line for line in result.warnings)
+
+
+def test_two_robots_at_one_time_and_one_robot_at_two_times_are_two_drives(store, tmp_path):
+    add(store, start_ns=10**18)
+    add(store, "b", (5.0,), start_ns=10**18)  # elsewhere
+    add(store, "c", start_ns=2 * 10**18)  # the same place, later
+    assert build(store, tmp_path).samples == 60
+
+
+def test_no_segments(store, tmp_path):
+    add_run(store, "a", segments("a", *lanes(0.0, 0.0, 1.0)).slice(0, 0), ledger_m={"kept": 0.0, "standing": 3.0})
+    assert "no segment in them: 3 m standing" in refused(store, tmp_path)
+
+
+def test_no_power_is_no_sample(store, tmp_path):
+    add(store, powered=False)
+    assert "none with power" in refused(store, tmp_path)
+    add(store, "b", (3.0,))
+    result = build(store, tmp_path, page=True)
+    assert result.samples == 20
+    assert result.ledger_m["no_power"] == pytest.approx(20)
+    assert "run a: without power: no label" in result.warnings
+    assert sum(result.ledger_m.values()) == pytest.approx(45)
+
+
+def test_a_map_that_does_not_cover_the_runs(store, tmp_path):
+    add(store, x=(100.0, 120.0))
+    line = refused(store, tmp_path)
+    assert "none of 20 segments gives a sample (20 m outside map)" in line
+    assert "the map covers" in line
+
+
+@pytest.mark.parametrize("lost", ["terrain/c", "checksums.json", "height/zarr.json"])
+def test_a_map_that_lost_a_part_is_refused_and_not_taken_for_a_hole(store, tmp_path, lost):
+    add(store)
+    part = store.map_path("site") / lost
+    for path in [part] if part.is_file() else sorted(path for path in part.rglob("*") if path.is_file()):
+        path.unlink()
+    line = refused(store, tmp_path, MapError)
+    assert "map site: not as it was written" in line
+    assert "add the map again" in line
+
+
+def test_metres_off_the_map_are_in_the_ledger(store, tmp_path):
+    add(store, x=(9.5, 29.5))
+    result = build(store, tmp_path)
+    assert result.samples == 10
+    assert result.ledger_m["outside_map"] == pytest.approx(10)
+    assert result.ledger_m["kept"] == pytest.approx(10)
+
+
+def test_a_region_elsewhere(store, tmp_path):
+    add(store)
+    region = region_file(tmp_path / "r.geojson", box(1000, 0, 1100, 100))
+    line = refused(store, tmp_path, split=region)
+    assert "covers none of the 20 samples" in line
+    assert "about 0.99 km" in line
+
+
+def test_a_region_with_swapped_axes_within_range(store, tmp_path):
+    add(store)
+    ring = lonlat([*box(-20, -20, 20, 20), (-20, -20)])[:, ::-1].tolist()
+    path = tmp_path / "r.geojson"
+    path.write_text(json.dumps({"type": "Polygon", "coordinates": [ring]}))
+    assert "axes swapped" in refused(store, tmp_path, split=path)
+
+
+def test_a_region_too_thin_for_a_footprint(store, tmp_path):
+    add(store)
+    region = region_file(tmp_path / "r.geojson", box(-20, -0.4, 20, 0.4))
+    assert "no whole footprint" in refused(store, tmp_path, split=region)
+
+
+def test_a_region_that_excludes_everything(store, tmp_path):
+    add(store)
+    both = box(-20, -20, 20, 20), box(-20, -20, 20, 20)
+    region = region_file(tmp_path / "r.geojson", *both, splits=(None, "exclude"))
+    assert "20 of 20 samples lie in its exclude polygons" in refused(store, tmp_path, split=region)
+
+
+def test_a_broken_region(store, tmp_path):
+    add(store)
+    (tmp_path / "r.geojson").write_text("{")
+    assert "not GeoJSON" in refused(store, tmp_path, RegionError, split=tmp_path / "r.geojson")
+
+
+def test_an_exclude_region_takes_samples_out_of_the_dataset(store, tmp_path):
+    add(store)
+    region = region_file(tmp_path / "r.geojson", box(-20, -20, 20, 20), box(-5, -2, 5, 2), splits=(None, "exclude"))
+    result = build(store, tmp_path, page=True, split=region)
+    # 20 segments from -10 to 10: 10 lie in the exclude region, 1 m of gap to each border goes to the buffer
+    assert result.ledger_m["split_excluded"] == pytest.approx(10)
+    assert result.splits["buffer"] == 4
+    assert result.samples == 10
+
+
+@pytest.mark.parametrize("kind", ["file", "directory", "dataset with notes"])
+def test_what_is_no_dataset_is_left_alone(store, tmp_path, kind):
+    add(store)
+    out = tmp_path / "out"
+    if kind == "file":
+        out.write_text("precious")
+    elif kind == "directory":
+        out.mkdir()
+        (out / "notes.txt").write_text("precious")
+    else:
+        build(store, tmp_path)
+        (out / "notes.txt").write_text("precious")
+    line = refused(store, tmp_path, UsageError, holdout="sample")
+    assert "give another OUT" in line
+    assert (out if kind == "file" else out / "notes.txt").read_text() == "precious"
+
+
+def test_a_dataset_gives_way_to_one_of_other_inputs(store, tmp_path):
+    add(store)
+    first = build(store, tmp_path)
+    add(store, "b", (3.0,), start_ns=10**15)
+    second = build(store, tmp_path)
+    assert (first.status, second.status) == ("done", "done")
+    assert len(open_dataset(tmp_path / "out")["train"]) + len(open_dataset(tmp_path / "out")["test"]) == 40
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+
+
+def test_a_dataset_that_lost_a_file_is_built_again(store, tmp_path):
+    add(store)
+    build(store, tmp_path)
+    (tmp_path / "out" / "samples.parquet").unlink()
+    assert build(store, tmp_path).status == "done"
+    assert (tmp_path / "out" / "samples.parquet").exists()
+
+
+def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
+    add(store)
+    sample = build(store, tmp_path, holdout="sample")
+    assert (sample.splits["train"], sample.splits["test"]) == (16, 4)
+    first = set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist())
+    build(store, tmp_path, holdout="sample", seed=1)
+    assert set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist()) != first
+
+
+def test_one_run_cannot_be_held_out_and_it_is_said(store, tmp_path):
+    add(store)
+    result = build(store, tmp_path, page=True, holdout="run")
+    assert result.splits["test"] == 0
+    assert any("no sample tests" in problem for problem in result.problems)
+    assert result.exit_code == 3
+
+
+def test_what_the_call_says_instead_of_the_recipe_is_checked_as_the_recipe_is(store, tmp_path):
+    with pytest.raises(RecipeError) as caught:
+        build(store, tmp_path, holdout="samples", seed=-1)
+    assert len(caught.value.problems) == 2
+
+
+def test_the_fused_velocity_can_be_the_label(store, tmp_path):
+    recipe = Recipe(label=LabelConfig(velocity="fused"))
+    add(store, recipe=recipe)
+    build(store, tmp_path, page=True, recipe=recipe)
+    assert open_dataset(tmp_path / "out")["train"].labels[:, 1].min() >= 0.9
+
+
+def test_a_map_of_height_alone_has_no_other_layers(tmp_path):
+    store = Store(tmp_path / "store")
+    add_world(store, tmp_path / "rasters", layers=())
+    add(store)
+    build(store, tmp_path, page=True)
+    train = open_dataset(tmp_path / "out")["train"]
+    assert train.channels == ("height",)
+    assert train.patches.shape[1:] == (40, 40, 1)
+    assert train.samples["terrain_class"].null_count == len(train)
+
+
+def test_a_place_that_cannot_be_written(store, tmp_path):
+    add(store)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot be written"):
+        build_dataset(tmp_path / "file" / "out", store=store.root, recipe=Recipe())
+
+
+_FULL_DISK = """
+import resource, sys
+import tcpipe.report.figures  # fonts are cached before the disk is full
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.formats.recipe_toml import recipe_id
+from tcpipe.pipeline.verify import verify
+from tcpipe.errors import DatasetError, StoreError
+from tcpipe.recipe import Recipe
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[3]), resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+try:
+    build_dataset(sys.argv[1], store=sys.argv[2], recipe=Recipe())
+except (DatasetError, StoreError) as error:
+    print(len(error.problems), error)
+"""
+
+
+@pytest.mark.parametrize("limit_bytes", [10_000, 40_000, 70_000])
+def test_a_disk_that_fills_up_leaves_nothing_half_written(store, tmp_path, limit_bytes):
+    import subprocess
+    import sys
+
+    add(store)
+    command = [sys.executable, "-c", _FULL_DISK, str(tmp_path / "out"), str(store.root), str(limit_bytes)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("1 ")
+    assert "cannot be written" in done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["store"]
+
+
+def splits_by_id(directory):
+    samples = pq.read_table(directory / "samples.parquet", columns=["sample_id", "split", "fold"])
+    return {row["sample_id"]: (row["split"], row["fold"]) for row in samples.to_pylist()}
+
+
+@pytest.mark.parametrize("holdout", ["block", "run"])
+def test_growth_takes_no_block_and_no_run_out_of_test(store, tmp_path, holdout):
+    lanes_m = -15.0 + 6.0 * np.arange(5)
+    recipe = Recipe(split=SplitConfig(block_m=4.0))
+    before = {}
+    for number, y_m in enumerate(lanes_m):
+        add(store, f"run{number}", (y_m,), x=(-14.0, 14.0), start_ns=number * 10**15)
+        build(store, tmp_path, holdout=holdout, recipe=recipe)
+        now = splits_by_id(tmp_path / "out")
+        for sample, (split, fold) in before.items():
+            assert now[sample][1] == fold
+            assert now[sample][0] == "test" or split == "train"
+        before = now
+    share = np.mean([split == "test" for split, _ in before.values()])
+    assert 0.15 <= share <= 0.25
+    assert {fold for _, fold in before.values()} == {0, 1, 2, 3, 4}
+
+
+@pytest.mark.parametrize("holdout", ["sample", "block", "run"])
+def test_a_kept_split_moves_nothing_whatever_the_rules_are_now(store, tmp_path, holdout):
+    add(store)
+    add(store, "b", (3.0,), start_ns=10**15)
+    build(store, tmp_path, holdout="sample")
+    before = splits_by_id(tmp_path / "out")
+    add(store, "c", (-3.0, 6.0), start_ns=-(10**15))  # recorded before the others
+    region = region_file(tmp_path / "r.geojson", box(-20, -20, 2, 20))
+    result = build(store, tmp_path, holdout=holdout, seed=7, split=region, keep_split=tmp_path / "out")
+    now = splits_by_id(tmp_path / "out")
+    assert {sample: now[sample] for sample in before} == before
+    assert len(now) == 80
+    assert {"unseen", "buffer"} <= {split for sample, (split, _) in now.items() if sample.startswith("c-")}
+    assert open_dataset(result.path).card["split"]["kept"] == {"samples": 40, "gone": 0}
+
+
+def test_a_split_to_keep_must_be_a_dataset(store, tmp_path):
+    add(store)
+    assert "there is no such directory" in refused(store, tmp_path, UsageError, keep_split=tmp_path / "nowhere")

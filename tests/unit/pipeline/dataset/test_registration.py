@@ -1,0 +1,72 @@
+"""A map that is off the tracks is said to be, run by run, when a dataset is built."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, segments
+
+from tcpipe.formats.dataset_files import read_card
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+from tcpipe.tables.levels import GATED_TRACK
+
+GEOID_M = 46.3
+
+
+def track_at(xy_m, ground_xy_m, *, std_m=0.02):
+    """Return a track at ``xy_m`` whose heights are those of the world's ground at ``ground_xy_m`` [m from its middle]."""
+    count = len(xy_m)
+    position = lonlat(xy_m)
+    height = WORLD.height(WORLD.x_m + ground_xy_m[:, 0], WORLD.y_m + ground_xy_m[:, 1]) + GEOID_M
+    noise = np.random.default_rng(3).normal(0.0, 0.01, count)
+    given = {"lon_deg": position[:, 0], "lat_deg": position[:, 1], "alt_m": height + noise}
+    given |= {"x_std_m": np.full(count, std_m), "y_std_m": np.full(count, std_m)}
+    rest = {
+        column.name: np.zeros(count, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
+        for column in GATED_TRACK.columns
+        if column.name not in given
+    }
+    return GATED_TRACK.table(**given, **rest)
+
+
+def winding(count=3000):
+    """A drive of 170 m inside the site."""
+    s = np.linspace(0.0, 4.0 * np.pi, count)
+    return np.stack([14.0 * np.sin(s), 13.0 * np.cos(1.5 * s)], 1)
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    directory = tmp_path_factory.mktemp("registered")
+    store = Store(directory / "store")
+    store.root.mkdir()
+    add_world(store, directory)
+    xy = winding()
+    for number, (run_id, shift_m, std_m) in enumerate(
+        [("fits", (0.0, 0.0), 0.02), ("off", (-1.5, 0.8), 0.02), ("vague", (-1.5, 0.8), 0.5)]
+    ):
+        start, end = lanes([4.0 * number - 6.0], -10.0, 10.0)
+        track = track_at(xy, np.add(xy, shift_m), std_m=std_m)
+        add_run(store, run_id, segments(run_id, start, end, start_ns=number * 10**12), track=track)
+    result = build_dataset(directory / "out", store=store.root, recipe=Recipe())
+    return result, read_card(directory / "out")
+
+
+def test_a_run_whose_ground_lies_elsewhere_on_the_map_is_a_warning(built):
+    result, _ = built
+    (line,) = [line for line in result.warnings if "its ground lies" in line]
+    assert line.startswith("run off: its ground lies 1.7 m off on map site (1.5 m west and 0.8 m north, ± 0.0")
+    assert "read.gnss_crs" in line
+    assert f"warning: {line}" in str(result)
+
+
+def test_the_card_keeps_every_runs_registration(built):
+    _, card = built
+    found = {entry["run_id"]: entry for entry in card["maps"][0]["registration"]}
+    assert sorted(found) == ["fits", "off"]  # the third is never sure enough of its place
+    assert found["fits"]["shift_xy_m"] == pytest.approx([0.0, 0.0], abs=0.03)
+    assert not found["fits"]["significant"]
+    assert found["off"]["shift_xy_m"] == pytest.approx([-1.5, 0.8], abs=0.03)
+    assert found["off"]["height_offset_m"] == pytest.approx(GEOID_M, abs=0.02)
+    assert found["off"]["misfit_m"] > 3.0 * found["off"]["shifted_misfit_m"]
