@@ -53,6 +53,15 @@ def test_links_lead_somewhere(page: Path) -> None:
     assert not lost
 
 
+def test_every_decision_stands_once_in_the_index() -> None:
+    decisions = ROOT / "docs/adr"
+    listed = re.findall(
+        r"^- \[(\d+)\. (.+)\]\((.+)\)$", (decisions / "README.md").read_text(encoding="utf-8"), re.MULTILINE
+    )
+    pages = {page.name: page.read_text(encoding="utf-8").splitlines()[0] for page in decisions.glob("[0-9]*.md")}
+    assert sorted((name, f"# {number}. {title}") for number, title, name in listed) == sorted(pages.items())
+
+
 def _command_lines(page: Path) -> Iterator[str]:
     """Yield every ``tcpipe …`` command in the page's plain and console blocks, and in its inline code."""
     text = page.read_text(encoding="utf-8").replace("\\\n", " ")
