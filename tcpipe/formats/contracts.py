@@ -6,26 +6,24 @@ from typing import Any
 
 import pyarrow as pa
 
-from tcpipe.formats.json_files import to_json
+from tcpipe.formats.json_files import DIALECT, to_json
 from tcpipe.formats.recipe_toml import recipe_schema
 from tcpipe.tables.bits import name_of
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
-
-_DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def contracts() -> dict[str, str]:
     """Return file name → JSON Schema text, for every table (one row as an object) and the recipe."""
     tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
     found = {f"{table.name}.schema.json": to_json(_table_schema(table)) for table in tables}
-    found["recipe.schema.json"] = to_json({"$schema": _DIALECT, **recipe_schema()})
+    found["recipe.schema.json"] = to_json({"$schema": DIALECT, **recipe_schema()})
     return found
 
 
 def _table_schema(table: TableSchema) -> dict[str, Any]:
     return {
-        "$schema": _DIALECT,
+        "$schema": DIALECT,
         "title": table.name,
         "description": f"{table.doc} One row.",
         "x-level": table.level,

@@ -5,14 +5,22 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, is_dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import msgspec
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_text
+
+T = TypeVar("T")
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+"""Of every schema in ``schemas/``."""
 
 MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
@@ -101,17 +109,59 @@ def misfit(value: Any, form: Any, where: str = "") -> str | None:
         wanted = (dict,) if isinstance(form, dict) else (list,) if isinstance(form, list) else form
         types = wanted if isinstance(wanted, tuple) else (wanted,)
         fits = type(value) in types or (type(value) is int and float in types)
-        names = " or ".join(_JSON_NAMES[of] for of in types)
-        found = "missing" if value is _ABSENT else _JSON_NAMES[type(value)]
+        names = " or ".join(_FORM_NAMES[of] for of in types)
+        found = "missing" if value is _ABSENT else _FORM_NAMES[type(value)]
         return None if fits else f"{where.rstrip('.')} is {found}, wanted {names}"
     return next((line for name, part, of in pairs if (line := misfit(part, of, f"{name}."))), None)
 
 
 _ABSENT = object()
-_JSON_NAMES = {
+_FORM_NAMES = {
     dict: "an object", list: "a list", str: "a text", int: "a whole number", float: "a number", bool: "true or false",
     type(None): "null",
 }  # fmt: skip
+
+
+def read_as(path: Path, cls: type[T]) -> T:
+    """Read one JSON object as a dataclass; `StoreError` names a file that cannot be read, or the file and the key of what does not fit."""
+    return typed(read_json(path), cls, path)
+
+
+def typed(value: object, cls: type[T], path: Path) -> T:
+    """Return a JSON object as a dataclass: a key that it lacks is its default, one that the dataclass lacks is left aside.
+
+    Raises
+    ------
+    StoreError
+        A value is missing, or of another type; the line names ``path`` and the key.
+
+    """
+    try:
+        return msgspec.convert(value, cls)
+    except msgspec.ValidationError as error:
+        raise StoreError(f"{path}: is not what this version writes: {_in_words(str(error))}") from None
+
+
+def _in_words(message: str) -> str:
+    """Return what msgspec finds wrong, the key first: of ``Expected `int`, got `str` - at `$.counts.segments``` and such."""
+    what, _, place = message.partition(" - at ")
+    key = re.sub(r"^key in ", "", place.strip("`")).removeprefix("$").removeprefix(".")
+    if missing := re.fullmatch(r"Object missing required field `(.+)`", what):
+        return f"{key}.{missing[1]} is missing".removeprefix(".")
+    plain_names = re.sub(
+        r"`(.+?)`", lambda name: " or ".join(_JSON_NAMES.get(n, n) for n in name[1].split(" | ")), what
+    )
+    return f"{key}: {plain_names.replace('Expected', 'wanted')}".removeprefix(": ")
+
+
+_JSON_NAMES = {
+    "object": "an object", "array": "a list", "str": "a text", "int": "a whole number", "float": "a number", "bool": "true or false",
+}  # fmt: skip
+
+
+def schema_of(cls: type) -> str:
+    """Return the JSON Schema of a dataclass as text: of what `to_json` writes of it, and `read_as` reads."""
+    return to_json({"$schema": DIALECT, **msgspec.json.schema(cls)})
 
 
 def digest(value: Any) -> str:

@@ -1,0 +1,74 @@
+"""JSON documents as dataclasses: what is written is read again, and what does not fit is named by file and key."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import pytest
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import read_as, schema_of, typed, write_json
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How many of what."""
+
+    segments: int
+    lost_m: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """A document."""
+
+    counts: Counts
+    names: tuple[str, ...] = ()
+    place_m: tuple[float, float] = (0.0, 0.0)
+    by_role: Mapping[str, Counts] = field(default_factory=dict)
+
+
+def test_what_is_written_is_read_again(tmp_path):
+    document = Document(Counts(3, 0.5), ("a", "ü"), (1.0, -2.0), {"imu": Counts(0)})
+    write_json(tmp_path / "document.json", document)
+    assert read_as(tmp_path / "document.json", Document) == document
+
+
+def test_keys_that_are_missing_have_defaults_and_unknown_ones_are_left_aside():
+    document = typed({"counts": {"segments": 1, "later": []}, "new": None}, Document, Path("x"))
+    assert document == Document(Counts(1))
+
+
+def test_a_whole_number_is_a_number():
+    assert typed({"counts": {"segments": 1, "lost_m": 2}}, Document, Path("x")).counts.lost_m == 2.0
+
+
+@pytest.mark.parametrize(
+    ("value", "line"),
+    [
+        ({}, "counts is missing"),
+        ({"counts": {}}, "counts.segments is missing"),
+        ({"counts": {"segments": "3"}}, "counts.segments: wanted a whole number, got a text"),
+        ({"counts": {"segments": 0.5}}, "counts.segments: wanted a whole number, got a number"),
+        ({"counts": {"segments": True}}, "counts.segments: wanted a whole number, got true or false"),
+        ({"counts": {"segments": 1, "lost_m": []}}, "counts.lost_m: wanted a number or null, got a list"),
+        ({"counts": None}, "counts: wanted an object, got null"),
+        ({"counts": {"segments": 1}, "names": ["a", 1]}, "names[1]: wanted a text, got a whole number"),
+        ({"counts": {"segments": 1}, "place_m": [1.0]}, "place_m: wanted a list of length 2"),
+        ({"counts": {"segments": 1}, "by_role": {"imu": {}}}, "by_role[...].segments is missing"),
+    ],
+)
+def test_what_does_not_fit_is_named_by_file_and_key(tmp_path, value, line):
+    path = tmp_path / "document.json"
+    path.write_text(json.dumps(value))
+    with pytest.raises(StoreError) as caught:
+        read_as(path, Document)
+    assert str(caught.value).removesuffix(", got 1") == f"{path}: is not what this version writes: {line}"
+
+
+def test_a_schema_names_every_key_and_its_type():
+    schema = json.loads(schema_of(Document))
+    assert schema["$schema"].endswith("2020-12/schema")
+    assert schema["$defs"]["Counts"]["properties"]["segments"] == {"type": "integer"}
+    assert schema["$defs"]["Document"]["required"] == ["counts"]
