@@ -26,6 +26,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from tcpipe.cost.budget import EnergyBudget
 from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
 from tcpipe.formats.json_files import digest
@@ -84,6 +85,12 @@ class RunDirectory:
     def version(self) -> str:
         """The data model it was written in."""
         return str(self.manifest.get("data_model_version"))
+
+    @property
+    def energy_budget(self) -> EnergyBudget | None:
+        """The noise floor of its labels' energy; None without energies."""
+        found = self.manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget")
+        return None if found is None else EnergyBudget(**found)
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""

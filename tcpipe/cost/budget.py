@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +12,33 @@ CAUSES = ("position", "rate", "current", "voltage")
 """Displacement of both ends; what the current did between samples; noise and rounding of the current; the voltage's."""
 
 
+@dataclass(frozen=True, slots=True)
+class EnergyBudget:
+    """The noise floor of E over some segments: shares of the mean energy, root mean square over the segments [1]."""
+
+    segments: int
+    """Segments with an energy."""
+    mean_energy_joule: float
+    """Mean of its absolute value [J]."""
+    total: float
+    """All `CAUSES` together."""
+    position: float
+    rate: float
+    current: float
+    voltage: float
+    at_20_hz: float
+    """What power at 20 Hz would leave of the total."""
+
+
 def energy_budget(
     energy_joule: NDArray[np.float64], variance_j2: Mapping[str, NDArray[np.float64]]
-) -> dict[str, Any] | None:
-    """Return the noise floor of E as shares of the mean energy, [1], root mean square over segments; None without energies.
+) -> EnergyBudget | None:
+    """Return the noise floor of E; None without energies.
 
     Parameters
     ----------
     energy_joule : [J], shape (M,); NaN where there is no label.
-    variance_j2 : [J²], shape (M,), by name; the `CAUSES` are independent and add up, other names are told beside them.
+    variance_j2 : [J²], shape (M,), by name: the `CAUSES`, which are independent and add up, and ``at_20_hz``.
     """
     known = np.isfinite(energy_joule)
     mean_joule = float(np.abs(energy_joule[known]).mean()) if known.any() else 0.0
@@ -28,39 +46,35 @@ def energy_budget(
         return None
     mean_square = {name: float(values[known].mean()) for name, values in variance_j2.items()}
     total = sum(mean_square[cause] for cause in CAUSES)
-    return {
-        "segments": int(known.sum()),
-        "mean_energy_joule": mean_joule,
-        "total": float(np.sqrt(total)) / mean_joule,
-        **{name: float(np.sqrt(value)) / mean_joule for name, value in mean_square.items()},
-    }
+    shares = {name: float(np.sqrt(value)) / mean_joule for name, value in {"total": total, **mean_square}.items()}
+    return EnergyBudget(int(known.sum()), mean_joule, **shares)
 
 
-def pooled(budgets: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def pooled(budgets: Iterable[EnergyBudget | None]) -> EnergyBudget | None:
     """Return the budget of several sets of segments together; None of none."""
-    count = sum(each["segments"] for each in budgets)
+    known = [asdict(budget) for budget in budgets if budget is not None]
+    count = sum(each["segments"] for each in known)
     if not count:
         return None
-    mean_joule = sum(each["segments"] * each["mean_energy_joule"] for each in budgets) / count
-    shares = [name for name in budgets[0] if name not in {"segments", "mean_energy_joule"}]
+    mean_joule = sum(each["segments"] * each["mean_energy_joule"] for each in known) / count
     squares = {
-        name: sum(each["segments"] * (each[name] * each["mean_energy_joule"]) ** 2 for each in budgets) / count
-        for name in shares
+        name: sum(each["segments"] * (each[name] * each["mean_energy_joule"]) ** 2 for each in known) / count
+        for name in ("total", *CAUSES, "at_20_hz")
     }
-    return {
-        "segments": count,
-        "mean_energy_joule": mean_joule,
-        **{name: float(np.sqrt(square)) / mean_joule for name, square in squares.items()},
-    }
+    return EnergyBudget(
+        count, mean_joule, **{name: float(np.sqrt(square)) / mean_joule for name, square in squares.items()}
+    )
 
 
-def in_words(budget: Mapping[str, Any]) -> str:
+def in_words(budget: EnergyBudget) -> str:
     """Return the budget as a sentence: the floor, its causes from the largest, and what power at 20 Hz would leave where that is less."""
     names = {"position": "position", "rate": "power rate", "current": "current noise", "voltage": "voltage"}
-    ordered = sorted(CAUSES, key=lambda cause: -budget[cause])
-    causes = ", ".join(f"{names[cause]} {100 * budget[cause]:.1f}" for cause in ordered)
-    floor = f"Noise floor of E {100 * budget['total']:.1f} % of a segment's mean {budget['mean_energy_joule']:.0f} J"
+    shares = {cause: getattr(budget, cause) for cause in CAUSES}
+    causes = ", ".join(
+        f"{names[cause]} {100 * shares[cause]:.1f}" for cause in sorted(CAUSES, key=lambda c: -shares[c])
+    )
+    floor = f"Noise floor of E {100 * budget.total:.1f} % of a segment's mean {budget.mean_energy_joule:.0f} J"
     text = f"{floor}: {causes} (they add in square)"
-    if budget["at_20_hz"] < 0.95 * budget["total"]:
-        text += f"; power at 20 Hz would leave {100 * budget['at_20_hz']:.1f} %"
+    if budget.at_20_hz < 0.95 * budget.total:
+        text += f"; power at 20 Hz would leave {100 * budget.at_20_hz:.1f} %"
     return text + "."

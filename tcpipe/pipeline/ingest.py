@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from tcpipe import __version__
+from tcpipe.cost.budget import EnergyBudget
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.json_files import digest, plain
@@ -86,7 +87,7 @@ class IngestResult:
     segments: int = 0
     distance_m: float = 0.0
     kept_m: float = 0.0
-    energy_budget: Mapping[str, Any] | None = None
+    energy_budget: EnergyBudget | None = None
     """The noise floor of the labels' energy and its causes, as shares of their mean (`tcpipe.cost.budget`)."""
     warnings: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
@@ -519,7 +520,7 @@ def _result(source: LogSource, status: Status, run: RunDirectory, sha256: str, *
         segments=manifest["counts"]["segments"],
         distance_m=sum(ledger.values()),
         kept_m=ledger.get("kept", 0.0),
-        energy_budget=manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget"),
+        energy_budget=run.energy_budget,
         warnings=tuple(manifest["warnings"]),
         damage=damage,
         same_as=same_as,

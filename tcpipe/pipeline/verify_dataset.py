@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tcpipe.cost.budget import pooled
+from tcpipe.cost.budget import EnergyBudget, pooled
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -126,7 +126,10 @@ def _wrong_runs(samples: pa.Table, card: Mapping[str, Any]) -> Iterator[str]:
     driven_m, ledger_m = [run.get("driven_m") for run in card["runs"]], math.fsum(card["ledger_m"].values())
     if None not in driven_m and not math.isclose(math.fsum(driven_m), ledger_m, rel_tol=1e-9, abs_tol=1e-6):
         yield f"the ledger sums to {ledger_m:.3f} m, its runs drove {math.fsum(driven_m):.3f} m"
-    if plain(pooled([run["energy_budget"] for run in card["runs"] if run["energy_budget"]])) != card["energy_budget"]:
+    if (
+        plain(pooled([EnergyBudget(**run["energy_budget"]) for run in card["runs"] if run["energy_budget"]]))
+        != card["energy_budget"]
+    ):
         yield "its energy budget is not that of its runs"
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from tcpipe.cost.budget import EnergyBudget
 from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_current_card, read_samples, rows_in_files
 from tcpipe.report.balance import balance_sections
 from tcpipe.report.error_budget import budget_sections
@@ -64,7 +65,7 @@ def dataset_report(directory: Path) -> str:
             _gallery_section(directory, card, samples),
             *_label_sections(card, samples),
             *quality_sections(_quality_counts(samples), "samples"),
-            *budget_sections(card.get("energy_budget")),
+            *budget_sections(None if card.get("energy_budget") is None else EnergyBudget(**card["energy_budget"])),
             Section(
                 "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card["ledger_m"])
             ),

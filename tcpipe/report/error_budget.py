@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-from tcpipe.cost.budget import in_words
+from tcpipe.cost.budget import EnergyBudget, in_words
 from tcpipe.report.page import Section
 
 _ROWS = {
@@ -18,9 +15,9 @@ _ROWS = {
 }
 
 
-def budget_sections(budget: Mapping[str, Any] | None) -> list[Section]:
+def budget_sections(budget: EnergyBudget | None) -> list[Section]:
     """Return the section on the noise floor of E; none where no segment has an energy."""
     if budget is None:
         return []
-    rows = [(text, f"{100 * budget[name]:.2f} %") for name, text in _ROWS.items()]
+    rows = [(text, f"{100 * getattr(budget, name):.2f} %") for name, text in _ROWS.items()]
     return [Section("How wrong a label may be", in_words(budget), header=("from", "of E"), rows=rows, figures_from=1)]

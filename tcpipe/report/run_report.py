@@ -57,7 +57,7 @@ def run_report(store: Store, run: RunDirectory) -> str:
             *_segment_sections(
                 segments, ledger, manifest["info"]["findings"]["facts"].get("label", {}).get("physics", {})
             ),
-            *budget_sections(manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget")),
+            *budget_sections(run.energy_budget),
             *sensor_sections(source, manifest, run.rejections()),
         ],
     )

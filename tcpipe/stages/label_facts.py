@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import energy_budget
+from tcpipe.cost.budget import EnergyBudget, energy_budget
 from tcpipe.cost.power import Rail, Rule
 from tcpipe.stages.label_power import rail_facts
 from tcpipe.tables.arrays import numbers
@@ -64,7 +64,7 @@ def label_facts(
 
 def _budget(
     energy_joule: NDArray[np.float64], variance_j2: Sequence[Mapping[str, NDArray[np.float64]]]
-) -> dict[str, Any] | None:
+) -> EnergyBudget | None:
     if not variance_j2:
         return None
     return energy_budget(

@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from tcpipe.cost.budget import in_words
+from tcpipe.cost.budget import EnergyBudget, in_words
 from tcpipe.errors import DatasetError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
@@ -79,7 +79,7 @@ class BuildResult:
     warnings: tuple[str, ...]
     problems: tuple[str, ...] = ()
     """Runs that belong in and are left out, and splits that were asked for and are empty: the dataset is not what it should be."""
-    energy_budget: Mapping[str, Any] | None = None
+    energy_budget: EnergyBudget | None = None
 
     @property
     def exit_code(self) -> int:
@@ -206,7 +206,7 @@ def _result(place: Path, status: str, card: Mapping[str, Any], problems: Sequenc
         audit=tuple(HeldOut(**part) for part in card["split"]["audit"]),
         warnings=tuple(card["warnings"]),
         problems=(*problems, *empty_splits(card)),
-        energy_budget=card.get("energy_budget"),
+        energy_budget=None if card.get("energy_budget") is None else EnergyBudget(**card["energy_budget"]),
     )
 
 

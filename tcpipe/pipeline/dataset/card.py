@@ -88,7 +88,7 @@ def dataset_card(samples: pa.Table, recipe: Recipe, facts: CardFacts) -> dict[st
             "columns": ["power_watt", VELOCITY_COLUMN[recipe.label.velocity]],
             "velocity": recipe.label.velocity,
         },
-        "energy_budget": pooled([run["energy_budget"] for run in facts.runs if run.get("energy_budget")]),
+        "energy_budget": pooled(run["energy_budget"] for run in facts.runs),
         "split": {
             **asdict(recipe.split),
             "buffer_m": facts.buffer_m,

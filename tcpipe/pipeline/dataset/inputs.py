@@ -143,7 +143,7 @@ def run_source(run: RunDirectory, log: Mapping[str, Any]) -> dict[str, Any]:
         "segments_sha256": run.manifest["checksums"]["segments.parquet"]["sha256"],
         "driven_m": math.fsum(run.manifest["ledger_m"].values()),
         "warnings": list(run.manifest["warnings"]),
-        "energy_budget": run.manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget"),
+        "energy_budget": run.energy_budget,
     }
 
 

@@ -204,10 +204,10 @@ def test_error_budget_adds_up_to_the_deviations():
     labelled = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(0.2, amp=rough)}))
     budget = labelled.info.findings.facts["label"]["energy_budget"]
     energy, std = floats(labelled.table, "energy_joule"), floats(labelled.table, "energy_std_joule")
-    assert budget["total"] == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
-    assert budget["total"] ** 2 == pytest.approx(sum(budget[cause] ** 2 for cause in CAUSES))
-    assert budget["position"] == pytest.approx(144 * 0.004 * 1.25 / 0.8 / 180, rel=0.05)
-    assert budget["position"] < budget["at_20_hz"] < 0.7 * budget["total"]
+    assert budget.total == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
+    assert budget.total**2 == pytest.approx(sum(getattr(budget, cause) ** 2 for cause in CAUSES))
+    assert budget.position == pytest.approx(144 * 0.004 * 1.25 / 0.8 / 180, rel=0.05)
+    assert budget.position < budget.at_20_hz < 0.7 * budget.total
     assert "20 Hz" in in_words(budget)
 
 
