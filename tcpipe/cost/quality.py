@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.noise import median_period_s
-from tcpipe.cost.power import Rail, Samples
+from tcpipe.power.noise import median_period_s
+from tcpipe.power.rails import Rail, Samples
 from tcpipe.tables.bits import Quality
 
 Floats = NDArray[np.float64]
@@ -23,11 +23,12 @@ def bits(flags: dict[Quality, NDArray[np.bool_]], count: int) -> NDArray[np.uint
     return quality
 
 
-def low_power_rate(rails: list[Rail], *, averaged: bool) -> bool:
+def low_power_rate(rails: list[Rail]) -> bool:
     """Return whether the voltage or current of any rail comes more slowly than 10 Hz (2 Hz if averaged by its source)."""
-    slowest = max((median_period_s(s) for each in rails for s in (each.voltage, each.current)), default=0.0)
-    return (
-        1.0 / slowest < _RATE_TOLERANCE * (MIN_AVERAGED_HZ if averaged else MIN_INSTANTANEOUS_HZ) if slowest else False
+    return any(
+        1.0 / median_period_s(signal) < _RATE_TOLERANCE * (MIN_AVERAGED_HZ if each.averaged else MIN_INSTANTANEOUS_HZ)
+        for each in rails
+        for signal in (each.voltage, each.current)
     )
 
 

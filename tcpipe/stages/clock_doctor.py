@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.checks.clock_offsets import POWER, ClockOffsets, Offset, Pair, PowerSignal, find_clock_offsets
-from tcpipe.fusion.rails import power_at
-from tcpipe.stages.fuse_inputs import Inputs, rails_of
+from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Offset, Pair, PowerSignal, find_clock_offsets
+from tcpipe.power.rails import power_at
+from tcpipe.stages.fuse_inputs import Inputs
 from tcpipe.stages.fuse_sanity import longest_epoch
-from tcpipe.tables.arrays import rows_where
+from tcpipe.stages.power_rails import rails_of
 from tcpipe.tables.levels import Findings, Streams
 
 _MAX_GAP_NS = 300_000_000
@@ -73,13 +73,10 @@ def _means(found: ClockOffsets, role: str) -> str:
 
 
 def _power(streams: Streams, epoch: int) -> PowerSignal | None:
-    if POWER not in streams.tables:
+    rails = rails_of(streams, epoch)
+    if not rails or any(rail.current.stamp_ns.size < 2 for rail in rails):
         return None
-    table = streams.tables[POWER]
-    rails = rails_of(rows_where(table, "epoch", epoch))
-    if not rails or any(rail.current_ns.size < 2 for rail in rails):
-        return None
-    stamp_ns = np.unique(np.concatenate([rail.current_ns for rail in rails]))
-    _, _, watt = power_at(rails, stamp_ns, averaged=streams.power_averaged, max_gap_ns=_MAX_GAP_NS)
+    stamp_ns = np.unique(np.concatenate([rail.current.stamp_ns for rail in rails]))
+    _, _, watt = power_at(rails, stamp_ns, max_gap_ns=_MAX_GAP_NS)
     known = np.isfinite(watt)
     return PowerSignal(stamp_ns[known], watt[known], streams.power_averaged) if known.sum() > 1 else None

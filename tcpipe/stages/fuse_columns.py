@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities
-from tcpipe.fusion.rails import power_at
 from tcpipe.fusion.signals import hold_last, in_gap, median_period_ns, seconds
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
-from tcpipe.stages.fuse_inputs import rails_of
+from tcpipe.power.rails import power_at
+from tcpipe.stages.power_rails import rails_of
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import Streams
@@ -56,13 +55,14 @@ def wheel_column(wheels: BodyVelocities | None, at_ns: NDArray[np.int64], *, max
 
 def command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:
     """Return the last command at each stamp; NaN before the first and without commands."""
-    table = _of_epoch(streams, "command", epoch)
+    table = streams.tables.get("command")
     names = {
         "commanded_velocity_mps": "forward_velocity_mps",
         "commanded_yaw_rate_radps": "yaw_rate_radps",
     }
     if table is None:
         return {name: np.full(at_ns.size, np.nan) for name in names}
+    table = rows_where(table, "epoch", epoch)
     order = np.argsort(integers(table, "stamp_ns"), kind="stable")
     stamp = integers(table, "stamp_ns")[order]
     return {name: hold_last(stamp, floats(table, source)[order], at_ns) for name, source in names.items()}
@@ -70,15 +70,5 @@ def command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> A
 
 def power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *, max_gap_ns: int) -> Arrays:
     """Return voltage, current and power at each stamp; NaN in power gaps and without power."""
-    table = _of_epoch(streams, "power", epoch)
-    rails = [] if table is None else rails_of(table)
-    values = power_at(rails, at_ns, averaged=streams.power_averaged, max_gap_ns=max_gap_ns)
+    values = power_at(rails_of(streams, epoch), at_ns, max_gap_ns=max_gap_ns)
     return dict(zip(("voltage_volt", "current_amp", "power_watt"), values, strict=True))
-
-
-def _of_epoch(streams: Streams, role: str, epoch: int) -> pa.Table | None:
-    if role not in streams.tables:
-        return None
-    table = streams.tables[role]
-    part = rows_where(table, "epoch", epoch)
-    return part if part.num_rows else None

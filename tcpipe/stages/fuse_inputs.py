@@ -1,4 +1,4 @@
-"""What fusing needs of the streams: measurements by clock epoch, rails of power, commands; and what was set aside on the way."""
+"""What fusing needs of the streams: measurements by clock epoch; and what was set aside on the way."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ from tcpipe.fusion import preparation
 from tcpipe.fusion.checks.stamp_jitter import steadied
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
-from tcpipe.fusion.rails import RailSamples
 from tcpipe.recipe import FuseConfig
 from tcpipe.tables.arrays import rows_where
-from tcpipe.tables.columns import FloatColumns, floats, integers
+from tcpipe.tables.columns import FloatColumns, integers
 from tcpipe.tables.levels import Sensor, Streams
 
 
@@ -97,21 +96,3 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
         )
     inputs.note(role, prepared)
     return made if made.stamp_ns.size else None
-
-
-def rails_of(table: pa.Table) -> list[RailSamples]:
-    """Return the rails of a power table, in order of their names; voltage and current may stand in different rows."""
-    rails = []
-    for name in sorted(pc.unique(table["rail"]).to_pylist()):
-        part = rows_where(table, "rail", name)
-        stamp = integers(part, "stamp_ns")
-        volt, amp = floats(part, "voltage_volt"), floats(part, "current_amp")
-        rails.append(RailSamples(*_known(stamp, volt), *_known(stamp, amp)))
-    return rails
-
-
-def _known(stamp_ns: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the rows with a value, in order of time, one a stamp."""
-    rows = np.flatnonzero(np.isfinite(values))
-    _, first = np.unique(stamp_ns[rows], return_index=True)
-    return stamp_ns[rows][first], values[rows][first]

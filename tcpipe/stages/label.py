@@ -9,14 +9,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.cost.labels import Labels
-from tcpipe.cost.power import Rule, samples_inside
 from tcpipe.cost.quality import bits, means_differ
+from tcpipe.power.energy import Rule, samples_inside
 from tcpipe.recipe import LabelConfig
 from tcpipe.stages.label_cost import segment_costs
 from tcpipe.stages.label_facts import label_facts, label_warnings
 from tcpipe.stages.label_physics import with_physics
-from tcpipe.stages.label_power import energy_entries, rails_of
 from tcpipe.stages.label_quality import clock_doubtful, motion_flags, power_flags
+from tcpipe.stages.power_rails import energy_entries, rails_of
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import integers
@@ -53,7 +53,7 @@ def label_segments(
         flags = {
             Quality.MEAN_POWER_DIFFERS: means_differ(mean_watt, cost.power_watt),
             Quality.CLOCK_DOUBTFUL: np.full(cut.num_rows, clock_doubtful(streams, gated.info)),
-            **power_flags(cut, rails, range_volt=voltage_range_volt, averaged=streams.power_averaged),
+            **power_flags(cut, rails, range_volt=voltage_range_volt),
             **motion_flags(
                 cut,
                 rows,

@@ -7,12 +7,13 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.cost.labels import Labels, labels
-from tcpipe.cost.noise import energy_noise
-from tcpipe.cost.power import Rail, Rule, energy_joule, power_watt
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.pieces import piece_of_rows, runs
 from tcpipe.motion.uncertainty import along_std_m, between_durations_m, displacement_std_m
+from tcpipe.power.energy import Rule, energy_joule
+from tcpipe.power.noise import energy_noise
+from tcpipe.power.rails import Rail, power_watt
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import floats, integers
@@ -33,8 +34,8 @@ def segment_costs(
     """
     start_ns, end_ns, stamp_ns = integers(cut, "start_ns"), integers(cut, "end_ns"), integers(rows, "stamp_ns")
     spans = start_ns, end_ns, _still_ns(rows, info.rate_hz)
-    noise = energy_noise(rails, *spans, averaged=rule == "averaged")
-    better = energy_noise(rails, *spans, averaged=rule == "averaged", rate_hz=_BETTER_HZ)
+    noise = energy_noise(rails, *spans)
+    better = energy_noise(rails, *spans, rate_hz=_BETTER_HZ)
     ground_mps = np.hypot(floats(rows, "east_velocity_mps"), floats(rows, "north_velocity_mps"))
     end_watt = power_watt(rails, end_ns)
     cost = labels(

@@ -10,8 +10,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.cost.budget import EnergyBudget, energy_budget
-from tcpipe.cost.power import Rail, Rule
-from tcpipe.stages.label_power import rail_facts
+from tcpipe.power.energy import Rule
+from tcpipe.power.rails import Rail
+from tcpipe.stages.power_rails import rail_facts
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats

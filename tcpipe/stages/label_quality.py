@@ -6,10 +6,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.power import Rail
 from tcpipe.cost.quality import low_power_rate, near, slipping, voltage_outside
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.power.rails import Rail
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import floats, integers
@@ -18,17 +18,16 @@ from tcpipe.tables.levels import Streams, TrackInfo
 Flags = dict[Quality, NDArray[np.bool_]]
 
 
-def power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None, averaged: bool) -> Flags:
+def power_flags(cut: pa.Table, rails: list[Rail], *, range_volt: tuple[float, float] | None) -> Flags:
     """Return the flags that the power samples of one epoch give its segments.
 
     Parameters
     ----------
     range_volt : [V], of the robot's profile; None flags nothing.
-    averaged : whether the source averages over its message period.
     """
     spans = integers(cut, "start_ns"), integers(cut, "end_ns")
     return {
-        Quality.LOW_POWER_RATE: np.full(cut.num_rows, low_power_rate(rails, averaged=averaged)),
+        Quality.LOW_POWER_RATE: np.full(cut.num_rows, low_power_rate(rails)),
         Quality.VOLTAGE_OUT_OF_RANGE: voltage_outside(rails, *spans, range_volt=range_volt),
     }
 

@@ -7,7 +7,8 @@ import pytest
 from made_tracks import stamps
 from scipy.integrate import quad
 
-from tcpipe.cost.power import energy_joule, rail, samples
+from tcpipe.power.energy import energy_joule
+from tcpipe.power.rails import rail, samples
 
 
 def uneven(rng, count, mean_ns):

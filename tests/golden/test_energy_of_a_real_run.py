@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from shared_data import shared_data
 
-from tcpipe.cost.power import rail, recorded_energy_joule, samples
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.power.energy import recorded_energy_joule
+from tcpipe.power.rails import rail, samples
 from tcpipe.recipe import ReadConfig
-from tcpipe.stages.label_power import rails_of
+from tcpipe.stages.power_rails import rails_of
 from tcpipe.stages.read import read_run
 
 

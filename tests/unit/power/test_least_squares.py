@@ -6,18 +6,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import nnls
 
-from tcpipe.cost import roughness
-from tcpipe.cost.least_squares import non_negative
+from tcpipe.power import signal_model
+from tcpipe.power.least_squares import non_negative
 
 
 @given(st.integers(0, 2**32), st.integers(1, 10), st.floats(0.0, 1.0), st.booleans())
 def test_as_scipy_of_what_a_signal_is_made_of(seed, spacings, noise, averaged):
     draw = np.random.default_rng(seed)
     period_s = draw.choice([0.02, 0.1, 1.0])
-    spacing = np.array(roughness._SPACINGS[:spacings])
-    taus = [*((tau, False) for tau in roughness._ROUGH_TAU), *((tau, True) for tau in roughness._SMOOTH_TAU)]
+    spacing = np.array(signal_model._SPACINGS[:spacings])
+    taus = [*((tau, False) for tau in signal_model._ROUGH_TAU), *((tau, True) for tau in signal_model._SMOOTH_TAU)]
     made = np.stack(
-        [roughness._expected(spacing, period_s, tau * period_s, smooth=s, averaged=averaged) for tau, s in taus]
+        [signal_model._expected(spacing, period_s, tau * period_s, smooth=s, averaged=averaged) for tau, s in taus]
     )
     size = np.where(draw.random(len(taus)) < 0.3, draw.exponential(size=len(taus)), 0.0)
     seen = np.abs(size @ made * (1.0 + noise * draw.normal(size=spacings))) + 1e-6

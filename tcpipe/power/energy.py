@@ -11,76 +11,15 @@ Every rule is prorated at both ends of a span. Negative power (regeneration) cou
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.geometry.piecewise_linear import held_back_integral_to, interpolate, product_integral_to
+from tcpipe.geometry.piecewise_linear import held_back_integral_to, product_integral_to
+from tcpipe.power.rails import Rail
 
 Rule = Literal["exact", "averaged", "right_endpoint"]
-
-
-@dataclass(frozen=True, slots=True)
-class Samples:
-    """One measured signal: stamps [ns], shape (N,), int64, strictly increasing, and values, shape (N,)."""
-
-    stamp_ns: NDArray[np.int64]
-    value: NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Rail:
-    """One drive rail in one clock epoch: its samples, and both signals on the union of their stamps where both are known.
-
-    Attributes
-    ----------
-    voltage, current : samples as measured, [V] and [A], current positive when drawn.
-    stamp_ns : [ns], shape (N,), union of both stamps from the later first to the earlier last; empty if they never overlap.
-    voltage_volt, current_amp : [V], [A], shape (N,), at those stamps.
-    """
-
-    name: str
-    voltage: Samples
-    current: Samples
-    stamp_ns: NDArray[np.int64]
-    voltage_volt: NDArray[np.float64]
-    current_amp: NDArray[np.float64]
-
-
-def samples(stamp_ns: NDArray[np.int64], value: NDArray[np.float64]) -> Samples:
-    """Return the finite values in time order; of several at one time the last given."""
-    known = np.isfinite(value)
-    newest_first, index = np.unique(stamp_ns[known][::-1], return_index=True)
-    return Samples(newest_first, value[known][::-1][index])
-
-
-def rail(name: str, voltage: Samples, current: Samples, *, averaged: bool) -> Rail:
-    """Return a rail with both signals on the union of their stamps.
-
-    Parameters
-    ----------
-    voltage, current : [V], [A].
-    averaged : whether a sample is the mean since the one before it, so that a value holds backwards from its stamp, instead of
-        being joined to its neighbours by straight lines.
-    """
-    union = np.union1d(voltage.stamp_ns, current.stamp_ns)
-    if not len(voltage.stamp_ns) or not len(current.stamp_ns):
-        nothing = np.empty(0)
-        return Rail(name, voltage, current, union[:0], nothing, nothing)
-    begin = max(voltage.stamp_ns[0], current.stamp_ns[0])
-    end = min(voltage.stamp_ns[-1], current.stamp_ns[-1])
-    union = union[(union >= begin) & (union <= end)]
-    at = _held_back if averaged else interpolate
-    return Rail(
-        name,
-        voltage,
-        current,
-        union,
-        at(voltage.stamp_ns, voltage.value, union),
-        at(current.stamp_ns, current.value, union),
-    )
 
 
 def energy_joule(
@@ -99,18 +38,6 @@ def energy_joule(
             inside = (start_ns >= each.stamp_ns[0]) & (end_ns <= each.stamp_ns[-1])
             energy[inside] = _energy_to(each, end_ns[inside], rule) - _energy_to(each, start_ns[inside], rule)
         total += energy
-    return total
-
-
-def power_watt(rails: list[Rail], at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Return the power of all rails at each time, [W], shape (M,), ends held; NaN if a rail is never known, or there is none."""
-    total = np.full(len(at_ns), np.nan if not rails else 0.0)
-    for each in rails:
-        if not len(each.stamp_ns):
-            return np.full(len(at_ns), np.nan)
-        total += interpolate(each.stamp_ns, each.voltage_volt, at_ns) * interpolate(
-            each.stamp_ns, each.current_amp, at_ns
-        )
     return total
 
 
@@ -160,9 +87,3 @@ def _energy_to(each: Rail, at_ns: NDArray[np.int64], rule: Rule) -> NDArray[np.f
     if rule == "exact":
         return product_integral_to(each.stamp_ns, each.voltage_volt, each.current_amp, at_ns)
     return held_back_integral_to(each.stamp_ns, each.voltage_volt * each.current_amp, at_ns)
-
-
-def _held_back(
-    stamp_ns: NDArray[np.int64], value: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    return value[np.searchsorted(stamp_ns, at_ns, side="left")]

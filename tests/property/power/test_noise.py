@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_tracks import stamps
 
-from tcpipe.cost.noise import energy_noise
-from tcpipe.cost.power import rail, samples
+from tcpipe.power.noise import energy_noise
+from tcpipe.power.rails import rail, samples
 
 
 @st.composite
@@ -28,7 +28,7 @@ def records(draw):
 
 def noise_of(stamp_ns, amp, spans, *, averaged, rate_hz=None):
     signals = (samples(stamp_ns, value) for value in (np.full(len(stamp_ns), 24.0), amp))
-    return energy_noise([rail("drive", *signals, averaged=averaged)], *spans, averaged=averaged, rate_hz=rate_hz)
+    return energy_noise([rail("drive", *signals, averaged=averaged)], *spans, rate_hz=rate_hz)
 
 
 @settings(max_examples=80, deadline=None)

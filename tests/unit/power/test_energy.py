@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from made_tracks import stamps
 
-from tcpipe.cost.power import energy_joule, power_watt, rail, recorded_energy_joule, samples, samples_inside
+from tcpipe.power.energy import energy_joule, recorded_energy_joule, samples_inside
+from tcpipe.power.rails import power_watt, rail, samples
 
 ZERO = stamps(1)[0]
 
@@ -55,12 +56,6 @@ def test_a_rail_whose_signals_never_overlap_has_no_energy():
     assert len(apart.stamp_ns) == 0
     assert np.isnan(energy_joule([apart], seconds(0.5), seconds(2.5), rule="exact")).all()
     assert np.isnan(power_watt([apart], seconds(1.0))).all()
-
-
-def test_samples_are_sorted_finite_and_unique():
-    got = samples(seconds(2, 1, 1, 3), np.array([5.0, 1.0, 7.0, np.nan]))
-    assert got.stamp_ns.tolist() == seconds(1, 2).tolist()
-    assert got.value.tolist() == [7.0, 5.0]
 
 
 def test_samples_inside_are_counted_and_averaged():

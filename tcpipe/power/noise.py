@@ -3,7 +3,7 @@
 The energy of a span is a weighted sum of samples; its error is that sum less the integral of what the current truly did. For a process
 with covariance K(t - t') the variance of that error is the double integral of e(t) K(t - t') e(t'), where e is the samples' weights as
 impulses less one over the span. It is exact for any sampling, regular or not, and for sources that average: there a sample's weight is
-spread over its period, and e vanishes but where a segment's end divides a period. What the processes are is told by `roughness`.
+spread over its period, and e vanishes but where a segment's end divides a period. What the processes are is told by `signal_model`.
 Independent errors of samples add their variance times the sum of the squared weights.
 """
 
@@ -14,9 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.power import Rail, Samples
-from tcpipe.cost.roughness import Roughness, local_scale, roughness
-from tcpipe.geometry.piecewise_linear import interpolate
+from tcpipe.power.rails import Rail, Samples, rail_at
+from tcpipe.power.signal_model import SignalModel, local_scale, signal_model
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -53,7 +52,6 @@ def energy_noise(
     end_ns: Stamps,
     still_ns: Stamps,
     *,
-    averaged: bool,
     rate_hz: float | None = None,
 ) -> EnergyNoise:
     """Return how uncertain each span's energy is from sampling, noise and quantisation.
@@ -63,7 +61,6 @@ def energy_noise(
     rails : voltage and current of the drive.
     start_ns, end_ns : [ns], shape (M,), the spans of steady driving that a label is wanted of, in time order.
     still_ns : [ns], shape (S, 2), begin and end of every stretch in which the robot stands.
-    averaged : whether a sample is the mean since the one before it.
     rate_hz : [Hz], as if power had been sampled so; None as it was.
     """
     rate, current, voltage = np.zeros((3, len(start_ns)))
@@ -71,16 +68,14 @@ def energy_noise(
     for each in rails:
         if not len(each.stamp_ns) or not len(start_ns):
             continue
-        volt = interpolate(each.stamp_ns, each.voltage_volt, middle)
-        amp = interpolate(each.stamp_ns, each.current_amp, middle)
-        between, error = _integral_variance(
-            each.current, start_ns, end_ns, still_ns, averaged=averaged, rate_hz=rate_hz
+        volt, amp = rail_at(each, middle)
+        (between, error), of_voltage = (
+            _integral_variance(signal, start_ns, end_ns, still_ns, averaged=each.averaged, rate_hz=rate_hz)
+            for signal in (each.current, each.voltage)
         )
         rate += volt**2 * between
         current += volt**2 * error
-        voltage += amp**2 * sum(
-            _integral_variance(each.voltage, start_ns, end_ns, still_ns, averaged=averaged, rate_hz=rate_hz)
-        )
+        voltage += amp**2 * sum(of_voltage)
     return EnergyNoise(rate, current, voltage)
 
 
@@ -105,7 +100,7 @@ def _integral_variance(
     if len(signal.value) < 3:
         return np.zeros(len(start_ns)), np.zeros(len(start_ns))
     steady = _steady(signal.stamp_ns, start_ns, end_ns)
-    rough = roughness(signal, steady, _still(signal, still_ns, averaged=averaged), averaged=averaged)
+    model = signal_model(signal, steady, _still(signal, still_ns, averaged=averaged), averaged=averaged)
     stamp_ns = signal.stamp_ns
     if rate_hz is not None:
         period_ns = round(1e9 / rate_hz)
@@ -113,9 +108,9 @@ def _integral_variance(
     between = np.empty(len(start_ns))
     for first in range(0, len(start_ns), _CHUNK):
         part = slice(first, first + _CHUNK)
-        between[part] = _process_variance(rough, stamp_ns, start_ns[part], end_ns[part], averaged=averaged)
-    between *= local_scale(rough, signal, steady, start_ns, end_ns)
-    error = rough.error_variance * squared_weights_s2(stamp_ns, start_ns, end_ns, averaged=averaged)
+        between[part] = _process_variance(model, stamp_ns, start_ns[part], end_ns[part], averaged=averaged)
+    between *= local_scale(model, signal, steady, start_ns, end_ns)
+    error = model.error_variance * squared_weights_s2(stamp_ns, start_ns, end_ns, averaged=averaged)
     return between, error + _rounding(signal, start_ns, end_ns)
 
 
@@ -157,7 +152,7 @@ def _rounding(signal: Samples, start_ns: Stamps, end_ns: Stamps) -> Floats:
 
 
 def _process_variance(
-    rough: Roughness, stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, averaged: bool
+    model: SignalModel, stamp_ns: Stamps, start_ns: Stamps, end_ns: Stamps, *, averaged: bool
 ) -> Floats:
     """Return the double integral of e K e over each span, on a grid over all samples that it uses, shape (M,)."""
     first, last = _first_and_last(stamp_ns, start_ns, end_ns)
@@ -177,7 +172,7 @@ def _process_variance(
     pairs = np.fft.irfft(np.abs(np.fft.rfft(mass, 2 * _NODES, axis=1)) ** 2, axis=1)[:, :_NODES]
     pairs[:, 1:] *= 2.0
     lag_s: Floats = np.arange(_NODES) * step_s[:, None]
-    variance: Floats = np.sum(pairs * rough.covariance(lag_s), axis=1)
+    variance: Floats = np.sum(pairs * model.covariance(lag_s), axis=1)
     return np.maximum(variance, 0.0)
 
 

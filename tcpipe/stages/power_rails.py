@@ -9,21 +9,24 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.cost.noise import median_period_s, resolution
-from tcpipe.cost.power import Rail, Rule, rail, recorded_energy_joule, samples
 from tcpipe.motion.ledger import by_reason, interval_reason
 from tcpipe.motion.pieces import piece_of_rows
+from tcpipe.power.energy import Rule, recorded_energy_joule
+from tcpipe.power.noise import median_period_s, resolution
+from tcpipe.power.rails import Rail, rail, samples
 from tcpipe.tables.arrays import numbers, rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import Streams
 
 
 def rails_of(streams: Streams, epoch: int) -> list[Rail]:
-    """Return the drive rails of one clock epoch, in the order of their names; none without power."""
+    """Return the drive rails of one clock epoch, for all who ask for power, in the order of their names; none without power."""
     table = streams.tables.get("power")
     if table is None:
         return []
-    names = sorted(pc.unique(table["rail"]).to_pylist())
+    names = sorted(
+        pc.unique(table["rail"]).to_pylist()
+    )  # of the whole run: a rail that is silent in an epoch is not known there
     table = rows_where(table, "epoch", epoch)
     rails = []
     for name in names:

@@ -5,9 +5,10 @@ import pytest
 from made_tracks import stamps
 from scipy.signal import lfilter
 
-from tcpipe.cost.noise import energy_noise, resolution
-from tcpipe.cost.power import energy_joule, rail, samples
-from tcpipe.cost.roughness import local_scale, roughness
+from tcpipe.power.energy import energy_joule
+from tcpipe.power.noise import energy_noise, resolution
+from tcpipe.power.rails import rail, samples
+from tcpipe.power.signal_model import local_scale, signal_model
 
 ZERO = stamps(1)[0]
 STARTS = ZERO + (np.arange(5, 595, 1.3) * 1e9).astype(np.int64)
@@ -16,8 +17,8 @@ ENDS = STARTS + 1_200_000_000
 NEVER_STILL = np.empty((0, 2), dtype=np.int64)
 
 
-def energy_noise_joule(rails, start_ns, end_ns, *, averaged, still_ns=NEVER_STILL):
-    return energy_noise(rails, start_ns, end_ns, still_ns, averaged=averaged).std_joule()
+def energy_noise_joule(rails, start_ns, end_ns, *, still_ns=NEVER_STILL):
+    return energy_noise(rails, start_ns, end_ns, still_ns).std_joule()
 
 
 def record(t, amp, *, averaged=False):
@@ -29,7 +30,7 @@ def test_white_noise_of_samples():
     t = np.arange(0, 600, 0.05)
     made = [record(t, 6 + np.random.default_rng(1).normal(0, 0.5, len(t)))]
     error = energy_joule(made, STARTS, ENDS, rule="exact") - 24 * 6 * 1.2
-    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    got = energy_noise_joule(made, STARTS, ENDS)
     assert np.sqrt((got**2).mean()) == pytest.approx(error.std(), rel=0.1)
 
 
@@ -44,7 +45,7 @@ def test_a_rough_current_sampled_slowly(period_s):
     step = round(period_s / fine)
     made = [record(t[::step], amp[::step])]
     error = energy_joule(made, STARTS, ENDS, rule="exact") - truth
-    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    got = energy_noise_joule(made, STARTS, ENDS)
     assert 0.9 < np.sqrt((got**2).mean()) / error.std() < 1.5
 
 
@@ -57,14 +58,14 @@ def test_a_current_that_the_sampling_resolves_with_noise_on_top(white_amp):
     truth = energy_joule([record(t, amp)], STARTS, ENDS, rule="exact")
     made = [record(t[::10], amp[::10] + rng.normal(0, white_amp, 12_000))]
     error = energy_joule(made, STARTS, ENDS, rule="exact") - truth
-    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    got = energy_noise_joule(made, STARTS, ENDS)
     assert np.sqrt((got**2).mean()) == pytest.approx(error.std(), rel=0.15)
 
 
 def test_a_smooth_current_has_no_noise():
     t = np.arange(0, 600, 0.05)
     made = [record(t, 6 + np.sin(t / 5))]
-    assert energy_noise_joule(made, STARTS, ENDS, averaged=False).max() < 0.02
+    assert energy_noise_joule(made, STARTS, ENDS).max() < 0.02
 
 
 def test_rounding_shows_as_resolution_and_noise_as_none():
@@ -76,7 +77,7 @@ def test_rounding_shows_as_resolution_and_noise_as_none():
     error = energy_joule(made, STARTS, ENDS, rule="exact") - energy_joule(
         [record(t, 6 + np.sin(t / 40))], STARTS, ENDS, rule="exact"
     )
-    got = energy_noise_joule(made, STARTS, ENDS, averaged=False)
+    got = energy_noise_joule(made, STARTS, ENDS)
     assert np.sqrt((got**2).mean()) == pytest.approx(error.std(), rel=0.25)
 
 
@@ -93,18 +94,18 @@ def test_means_err_by_their_noise_and_where_a_segment_divides_one(correlation_s,
     means = amp.reshape(-1, 40).mean(axis=1) + rng.normal(0, white_amp, 3_000)
     made = [record(t[39::40], means, averaged=True)]
     error = energy_joule(made, *spans, rule="averaged") - truth
-    got = energy_noise_joule(made, *spans, averaged=True)
+    got = energy_noise_joule(made, *spans)
     assert 0.8 < np.sqrt((got**2).mean()) / error.std() < 1.6
 
 
-def test_roughness_is_local():
+def test_how_much_a_signal_changes_is_local():
     rng = np.random.default_rng(4)
     t = np.arange(0, 600, 0.05)
     decay = np.exp(-0.05 / 0.15)
     rough = lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 1, len(t)))
     signal = samples(ZERO + np.round(t * 1e9).astype(np.int64), rough * np.where(t < 300, 0.2, 2.0))
     everywhere, nowhere = np.ones(len(t), dtype=bool), np.zeros(len(t), dtype=bool)
-    found = roughness(signal, everywhere, nowhere, averaged=False)
+    found = signal_model(signal, everywhere, nowhere, averaged=False)
     got = local_scale(found, signal, everywhere, STARTS, ENDS)
     early = (ENDS - ZERO) * 1e-9 < 290
     late = (STARTS - ZERO) * 1e-9 > 310
@@ -125,7 +126,7 @@ def test_what_scatters_while_standing_is_noise(averaged):
     moving = ENDS < ZERO + 505_000_000_000
     spans = STARTS[moving], ENDS[moving]
     still_ns = ZERO + np.array([[510, 600]]) * 1_000_000_000
-    got = energy_noise(made, *spans, still_ns, averaged=averaged)
+    got = energy_noise(made, *spans, still_ns)
     assert np.sqrt(got.current.mean()) == pytest.approx(24 * 0.2 * np.sqrt(1.2 * 0.05), rel=0.1)
     truth = energy_joule([record(t, amp, averaged=averaged)], *spans, rule="averaged" if averaged else "exact")
     error = energy_joule(made, *spans, rule="averaged" if averaged else "exact") - truth
@@ -138,7 +139,7 @@ def test_what_a_faster_source_would_leave():
     amp = 6 + lfilter([np.sqrt(1 - decay**2)], [1, -decay], rng.normal(0, 1.0, 120_000))
     t = np.arange(120_000) * fine
     slow, fast = ([record(t[::step], amp[::step])] for step in (60, 10))
-    told = energy_noise(slow, STARTS, ENDS, NEVER_STILL, averaged=False, rate_hz=20.0).rate.mean()
+    told = energy_noise(slow, STARTS, ENDS, NEVER_STILL, rate_hz=20.0).rate.mean()
     truth = energy_joule([record(t, amp)], STARTS, ENDS, rule="exact")
     error = energy_joule(fast, STARTS, ENDS, rule="exact") - truth
     assert np.sqrt(told) == pytest.approx(error.std(), rel=0.25)

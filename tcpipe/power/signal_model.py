@@ -1,4 +1,4 @@
-"""How rough a sampled signal is, by the time over which it changes, read off the record itself.
+"""What a sampled voltage or current is made of, by the time over which it changes, read off the record itself.
 
 A signal is taken as a sum of processes, each with a variance and a correlation time, plus independent errors of its samples (noise,
 rounding). What tells them apart is the scatter of second differences at several spacings: independent errors scatter alike at all of
@@ -9,7 +9,7 @@ Williams, Gaussian Processes for Machine Learning, section 4.2.1: Matern with nu
 scatter by while the robot stands. Where it hardly does, they are fitted too, in place of what changes within a period; for means, which
 differ from those, they are the scatter where the record is calmest.
 
-How rough a drive is differs from place to place. The processes hold for the whole record; their size near a segment is that of the second
+A drive is not alike everywhere. The processes hold for the whole record; their size near a segment is that of the second
 differences there.
 """
 
@@ -20,8 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.cost.least_squares import non_negative
-from tcpipe.cost.power import Samples
+from tcpipe.power.least_squares import non_negative
+from tcpipe.power.rails import Samples
 
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
@@ -45,7 +45,7 @@ _NODES = 24
 
 
 @dataclass(frozen=True, slots=True)
-class Roughness:
+class SignalModel:
     """What a signal is made of; variances in its unit squared.
 
     Attributes
@@ -71,7 +71,9 @@ class Roughness:
         return total
 
 
-def roughness(signal: Samples, steady: NDArray[np.bool_], still: NDArray[np.bool_], *, averaged: bool) -> Roughness:
+def signal_model(
+    signal: Samples, steady: NDArray[np.bool_], still: NDArray[np.bool_], *, averaged: bool
+) -> SignalModel:
     """Return what the signal is made of where it counts.
 
     Parameters
@@ -88,7 +90,7 @@ def roughness(signal: Samples, steady: NDArray[np.bool_], still: NDArray[np.bool
     tau_s = period_s * np.array(_ROUGH_TAU + _SMOOTH_TAU)
     smooth = np.arange(len(tau_s)) >= len(_ROUGH_TAU)
     if not len(spacing):
-        return Roughness(period_s, 0.0, np.zeros(len(tau_s)), tau_s, smooth, 0.0)
+        return SignalModel(period_s, 0.0, np.zeros(len(tau_s)), tau_s, smooth, 0.0)
     made = np.stack(
         [
             _expected(spacing, period_s, tau, smooth=bool(kind), averaged=averaged)
@@ -106,17 +108,17 @@ def roughness(signal: Samples, steady: NDArray[np.bool_], still: NDArray[np.bool
     else:
         error = min(error, float(seen.min()))
         variance[:] = _fitted(made, seen - error, weight)
-    return Roughness(period_s, error, variance, tau_s, smooth, float(variance @ made[:, 0]))
+    return SignalModel(period_s, error, variance, tau_s, smooth, float(variance @ made[:, 0]))
 
 
 def local_scale(
-    rough: Roughness, signal: Samples, steady: NDArray[np.bool_], start_ns: Stamps, end_ns: Stamps
+    model: SignalModel, signal: Samples, steady: NDArray[np.bool_], start_ns: Stamps, end_ns: Stamps
 ) -> Floats:
     """Return how large the processes' variance is near each span against the record's, [1], shape (M,).
 
     Taken over the steady samples from 2 s before to 2 s after the span, with the whole record as a prior of 4 samples.
     """
-    if rough.curvature_variance <= 0.0 or len(signal.value) < 3:
+    if model.curvature_variance <= 0.0 or len(signal.value) < 3:
         return np.ones(len(start_ns))
     counted = steady[1:-1]
     if not counted.any():
@@ -126,9 +128,9 @@ def local_scale(
     inner = signal.stamp_ns[1:-1]
     first = np.searchsorted(inner, start_ns - _LOCAL_NS, side="left")
     last = np.searchsorted(inner, end_ns + _LOCAL_NS, side="right")
-    expected = rough.curvature_variance + rough.error_variance
+    expected = model.curvature_variance + model.error_variance
     here = (sums[last] - sums[first] + _PRIOR_SAMPLES * expected) / (counts[last] - counts[first] + _PRIOR_SAMPLES)
-    scale: Floats = np.maximum(here - rough.error_variance, 0.05 * rough.curvature_variance) / rough.curvature_variance
+    scale: Floats = np.maximum(here - model.error_variance, 0.05 * model.curvature_variance) / model.curvature_variance
     return scale
 
 

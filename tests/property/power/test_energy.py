@@ -5,7 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_tracks import stamps
 
-from tcpipe.cost.power import energy_joule, rail, recorded_energy_joule, samples
+from tcpipe.power.energy import energy_joule, recorded_energy_joule
+from tcpipe.power.rails import rail, samples
 
 
 @st.composite
