@@ -1,4 +1,4 @@
-"""Chunks whose messages are few among what is not wanted, read as if they were one chunk.
+"""How the chunks of a log are read, whatever its format: by their index as far as the chunks bear it out, else record by record.
 
 In a log with cameras most bytes of a chunk are not wanted. What is wanted of several such chunks is laid together, and looked at once
 for all of them: what a look costs, however short, is paid once for thousands of messages instead of for each chunk.
@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.log_part import DamageError, Int64Array
+from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, blocks_by_channel, in_order
+from tcpipe.logs.topics import Damage
 
 GROUP_BYTES = 1 << 23
 """Chunks of about this size together are planned at once."""
@@ -87,6 +89,174 @@ class Excerpt:
         """Return it without the messages of some chunks."""
         left = ~np.isin(self.entries.chunk, chunks)
         return Excerpt(self.data, self.offset[left], self.entries.at(left), self.lost)
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """Messages in ``data``: where the record of each and its payload begin, how long that is, and its times, shape (N,) each."""
+
+    data: memoryview
+    channel: Int64Array
+    offset: Int64Array
+    payload: Int64Array
+    length: Int64Array
+    log_time_ns: Int64Array
+    publish_time_ns: Int64Array
+
+    def at(self, chosen: Int64Array | NDArray[np.bool_]) -> Messages:
+        """Return some of them."""
+        of = (self.channel, self.offset, self.payload, self.length, self.log_time_ns, self.publish_time_ns)
+        return Messages(self.data, *(values[chosen] for values in of))
+
+    def blocks(self, ordinal: Int64Array) -> list[MessageBlock]:
+        """Return them as one block a channel; ``ordinal`` is their order within the file, shape (N,)."""
+        found = self
+        if (self.channel[1:] < self.channel[:-1]).any():
+            order = np.argsort(self.channel, kind="stable")
+            found, ordinal = self.at(order), ordinal[order]
+        return blocks_by_channel(
+            found.data,
+            found.channel,
+            found.payload,
+            found.length,
+            log_time_ns=found.log_time_ns,
+            publish_time_ns=found.publish_time_ns,
+            ordinals=ordinal,
+        )
+
+
+class PlacedChunk(Protocol):
+    """A chunk: the byte of the file where it begins, and how many bytes its records take, as far as it says."""
+
+    @property
+    def offset(self) -> int:
+        """Where it begins."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of its records."""
+
+
+Chunk = TypeVar("Chunk", bound=PlacedChunk)
+
+
+class ChunkedFile(Protocol[Chunk]):
+    """A file of chunks: what `chunk_blocks` asks of it. `DamageError` where a chunk is lost."""
+
+    name: str
+    damage: dict[Damage, None]
+
+    def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
+        """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
+
+    def entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+        """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
+
+    def load(self, chunk: Chunk) -> memoryview:
+        """Return all records of a chunk."""
+
+    def copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
+        """Copy pieces (start, stop, place) of a chunk."""
+
+    def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+
+    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
+        """Return the wanted messages of a chunk by its records; what these lack is added to ``noted``."""
+
+    def is_proved(self, chunk: Chunk) -> bool:
+        """Tell whether a checksum covers the chunk's records, so that it is the index that is wrong where they differ."""
+
+    def needs_index(self, chunk: Chunk) -> bool:
+        """Tell whether a broken index of this chunk is worth a word."""
+
+    def lost(self, chunk: Chunk, why: str) -> Damage:
+        """Return what to say of a chunk that is lost as a whole."""
+
+
+def chunk_blocks(file: ChunkedFile[Chunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
+    """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
+
+    def read(planned: tuple[Run, list[tuple[int, Chunk]]]) -> tuple[list[MessageBlock], list[Damage]]:
+        noted: list[Damage] = []
+        return list(_run_blocks(file, *planned, wanted, noted)), noted
+
+    for blocks, noted in in_order(read, _planned(file, wanted), threads=threads):
+        file.damage.update(dict.fromkeys(noted))
+        yield from blocks
+
+
+def _planned(file: ChunkedFile[Chunk], wanted: frozenset[int]) -> Iterator[tuple[Run, list[tuple[int, Chunk]]]]:
+    """Yield what to read at once, and the chunks of its group; the indexes of a group are read ahead."""
+    chunks = file.chunks_with(wanted)
+    for group in groups(chunk.size for _, chunk in chunks):
+        members = chunks[group.start : group.stop]
+        sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
+        entries, sound = file.entries([chunk for _, chunk in members], sizes)
+        for run in runs(entries, sizes, sound, sorted(wanted)):
+            yield run, members
+
+
+def _run_blocks(
+    file: ChunkedFile[Chunk],
+    run: Run,
+    members: list[tuple[int, Chunk]],
+    wanted: frozenset[int],
+    noted: list[Damage],
+) -> Iterator[MessageBlock]:
+    """Yield the wanted messages of a run; what is lost or contradicts itself is added to ``noted``."""
+    doubtful: Sequence[int] = run.chunks
+    if run.entries is not None:
+        found = excerpt(
+            run,
+            run.entries,
+            load=lambda number: file.load(members[number][1]),
+            copy=lambda number, places, to: file.copy(members[number][1], places, to),
+        )
+        noted += [file.lost(members[number][1], str(error)) for number, error in found.lost]
+        messages, true = file.indexed(found)
+        ordinal = np.array([base for base, _ in members], np.int64)[found.entries.chunk] + found.entries.offset
+        doubtful = np.unique(found.entries.chunk[~true]).tolist()
+        if doubtful:
+            right = ~np.isin(found.entries.chunk, doubtful)
+            messages, ordinal = messages.at(right), ordinal[right]
+        yield from _in_time(file.name, messages, ordinal, noted)
+    for number in doubtful:
+        base, chunk = members[number]
+        try:
+            data = file.load(chunk)
+        except DamageError as error:
+            noted.append(file.lost(chunk, str(error)))
+        else:
+            messages = file.walked(chunk, data, wanted, noted)
+            entries = None if run.entries is None else run.entries.of_chunk(number)
+            noted += _disagreement(file, chunk, messages, entries)
+            yield from _in_time(file.name, messages, base + messages.offset, noted)
+
+
+def _in_time(name: str, messages: Messages, ordinal: Int64Array, noted: list[Damage]) -> list[MessageBlock]:
+    """Return messages as blocks, without those whose time is past what 63 bits hold."""
+    times = (messages.log_time_ns >= 0) & (messages.publish_time_ns >= 0)
+    if not times.all():
+        noted.append(Damage(name, "messages of times after the year 2262", messages_lost=int((~times).sum())))
+        messages, ordinal = messages.at(times), ordinal[times]
+    return messages.blocks(ordinal)
+
+
+def _disagreement(file: ChunkedFile[Chunk], chunk: Chunk, messages: Messages, entries: Entries | None) -> list[Damage]:
+    """Return what to say where a chunk's index is broken, or names other messages than its records hold."""
+    what, lost = "the index of a chunk is broken; its messages are read without it", 0
+    if entries is None and (chunk.size > MAX_PLANNED_BYTES or not file.needs_index(chunk)):
+        return []
+    if entries is not None:
+        held = messages.at(np.argsort(messages.offset, kind="stable"))
+        mine = np.stack([held.offset, held.channel, held.log_time_ns])
+        if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
+            return []
+        what = "the index of a chunk names other messages than the chunk holds, which are read"
+        lost = max(len(entries.offset) - len(held.offset), 0)
+    where = f"{file.name}, byte {chunk.offset}"
+    return [Damage(where, what, messages_lost=0 if file.is_proved(chunk) else lost or None)]
 
 
 def groups(sizes: Iterable[int]) -> Iterator[range]:

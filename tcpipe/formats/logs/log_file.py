@@ -16,7 +16,7 @@ from typing import Self
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs import bag_file, mcap_records, sqlite_file
+from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
 from tcpipe.formats.logs.arrow_columns import TopicTable
 from tcpipe.formats.logs.bag_file import BagPart
 from tcpipe.formats.logs.log_part import Channel, LogPart, MessageBlock
@@ -486,7 +486,7 @@ def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
     part: LogPart
     if magic.startswith(mcap_records.MAGIC) or _tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
         part = MessageDecompressing(McapPart(path, name))
-    elif magic.startswith(bag_file.MAGIC):
+    elif magic.startswith(bag_records.MAGIC):
         part = BagPart(path, name)
     elif magic.startswith(sqlite_file.MAGIC):
         part = MessageDecompressing(SqlitePart(path, name))
@@ -500,7 +500,7 @@ def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
 def _container(path: Path) -> str:
     name = path.name.removesuffix(".zstd")
     magic = _magic(path)
-    if magic.startswith(bag_file.MAGIC):
+    if magic.startswith(bag_records.MAGIC):
         return "bag"
     return "mcap" if magic.startswith(mcap_records.MAGIC) or name.endswith(".mcap") else "rosbag2"
 

@@ -6,11 +6,10 @@ covers) is believed only as far as the chunk's own records bear it out.
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,15 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.chunk_runs import MAX_PLANNED_BYTES, Entries, Run, by_place, copy_pieces, excerpt, groups, runs
+from tcpipe.formats.logs.chunk_runs import (
+    MAX_PLANNED_BYTES,
+    Entries,
+    Excerpt,
+    Messages,
+    by_place,
+    chunk_blocks,
+    copy_pieces,
+)
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     Bounds,
@@ -31,7 +38,6 @@ from tcpipe.formats.logs.log_part import (
     decompressed_prefix,
     gathered,
     grouped,
-    in_order,
     listed,
 )
 from tcpipe.formats.logs.mcap_records import (
@@ -42,56 +48,27 @@ from tcpipe.formats.logs.mcap_records import (
     MESSAGE_HEAD,
     OP_CHANNEL,
     OP_CHUNK,
-    OP_CHUNK_INDEX,
     OP_DATA_END,
     OP_FOOTER,
     OP_LAST,
     OP_MESSAGE,
     OP_MESSAGE_INDEX,
     OP_SCHEMA,
-    OP_STATISTICS,
     RECORD_HEAD,
-    ChannelRecord,
     Chunk,
     Schema,
-    Statistics,
-    borne_out,
     index_entries,
     index_messages,
-    message_blocks,
-    message_heads,
     message_offsets,
-    parse_channel,
+    messages_at,
     parse_chunk_head,
-    parse_chunk_index,
-    parse_schema,
-    parse_statistics,
     record_offsets,
 )
+from tcpipe.formats.logs.mcap_summary import Contents, read_summary
 from tcpipe.logs.topics import Damage, normalized_type_name
 
-_DATA_END = RECORD_HEAD + 4
-"""Bytes of the record that ends the data, right before the summary."""
 _RUN_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
-
-
-@dataclass(slots=True)
-class _Contents:
-    """What is known of a file so far."""
-
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, ChannelRecord] = field(default_factory=dict)
-    chunks: list[Chunk] = field(default_factory=list)
-    statistics: Statistics | None = None
-
-    def note(self, opcode: int, content: bytes | memoryview) -> None:
-        """Remember a schema or channel; the first of a number holds, and others are not looked at, however many there are."""
-        number = int.from_bytes(content[:2], "little")
-        if opcode == OP_SCHEMA and number not in self.schemas:
-            self.schemas.setdefault(*parse_schema(content))
-        elif opcode == OP_CHANNEL and number not in self.channels:
-            self.channels.setdefault(*parse_channel(content))
 
 
 @dataclass(slots=True)
@@ -130,12 +107,12 @@ class McapPart:
         try:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
                 self._note(0, "the file's first bytes are not those of an MCAP file", messages_lost=0)
-            self._contents = self._summary()
+            self._contents = read_summary(self._bytes)
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
         except DamageError as error:
             if str(error):
                 self._note(self._bytes.size, f"{error}; it is read record by record")
-            self._contents = _Contents()
+            self._contents = Contents()
             if not self._walk(self._contents, len(MAGIC), self._bytes.size):
                 self._distrust_last_index(self._contents)
             self._complete = True
@@ -157,20 +134,13 @@ class McapPart:
         """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
         if not self._complete:
             self._fill_gaps()
-
         if any(chunk.index is not None and wanted.isdisjoint(chunk.index) for chunk in self._contents.chunks):
             self._bytes.skips()
 
-        def read(run: _ChunkRun) -> tuple[list[MessageBlock], list[Damage]]:
-            noted: list[Damage] = []
-            return list(self._run_blocks(run, wanted, noted)), noted
-
-        for blocks, noted in in_order(read, self._runs(wanted), threads=threads):
-            self.damage.update(dict.fromkeys(noted))
-            yield from blocks
+        yield from chunk_blocks(self, wanted, threads=threads)
         self._note_odd_ones_without_crc()
 
-    def _wanted_chunks(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
+    def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
         """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
         base, found = 0, []
         for chunk in self._contents.chunks:
@@ -179,50 +149,13 @@ class McapPart:
             base += min(chunk.size, MAX_CHUNK_BYTES)
         return found
 
-    def _runs(self, wanted: frozenset[int]) -> Iterator[_ChunkRun]:
-        """Yield what to read at once; the indexes of some chunks are read ahead."""
-        chunks = self._wanted_chunks(wanted)
-        for group in groups(chunk.size for _, chunk in chunks):
-            members = chunks[group.start : group.stop]
-            sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
-            entries, sound = self._entries([chunk for _, chunk in members], sizes)
-            bases = np.array([base for base, _ in members], np.int64)
-            for run in runs(entries, sizes, sound, sorted(wanted)):
-                yield _ChunkRun(run, members, bases)
-
-    def _run_blocks(self, run: _ChunkRun, wanted: frozenset[int], noted: list[Damage]) -> Iterator[MessageBlock]:
-        """Yield the wanted messages of a run; what is lost or contradicts itself is added to ``noted``."""
-        doubtful = list(run.plan.chunks)
-        if run.plan.entries is not None:
-            found = excerpt(
-                run.plan,
-                run.plan.entries,
-                load=lambda number: self._load(run.members[number][1]),
-                copy=lambda number, places, to: self._copy(run.members[number][1], places, to),
-            )
-            noted += [self._lost(run.members[number][1], str(error)) for number, error in found.lost]
-            heads = message_heads(found.data, found.offset)
-            true = borne_out(heads, found.entries)
-            doubtful = np.unique(found.entries.chunk[~true]).tolist()
-            if doubtful:
-                found = found.without(doubtful)
-                heads = message_heads(found.data, found.offset)
-            ordinals = run.bases[found.entries.chunk] + found.entries.offset
-            yield from self._in_time(found.data, found.offset, heads, ordinals, noted)
-        for number in doubtful:
-            base, chunk = run.members[number]
-            try:
-                data = self._load(chunk)
-            except DamageError as error:
-                noted.append(self._lost(chunk, str(error)))
-            else:
-                offsets = self._walked_messages(chunk, data, noted)
-                heads = message_heads(data, offsets)
-                chosen = _chosen(wanted)[heads["channel"]]
-                offsets, heads = offsets[chosen], heads[chosen]
-                entries = None if run.plan.entries is None else run.plan.entries.of_chunk(number)
-                noted += self._disagreement(chunk, offsets, heads, entries)
-                yield from self._in_time(data, offsets, heads, offsets + base, noted)
+    def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
+        """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
+        messages, right = messages_at(found.data, found.offset)
+        entries = found.entries
+        room = entries.end - entries.offset - RECORD_HEAD - MESSAGE_HEAD
+        same = (messages.channel == entries.channel) & (messages.log_time_ns == entries.log_time_ns)
+        return messages, right & same & (messages.length <= room)
 
     def _records(self, chunk: Chunk, data: memoryview) -> tuple[Int64Array, int]:
         """Return where the records of a chunk begin, and where they end."""
@@ -230,55 +163,35 @@ class McapPart:
         self._bounds.walk(chunk.offset, len(records))
         return records, end
 
-    def _walked_messages(self, chunk: Chunk, data: memoryview, noted: list[Damage]) -> Int64Array:
-        """Return where the messages of a chunk begin, by its records; where these end too early, or are none, that is noted."""
+    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
+        """Return the wanted messages of a chunk by its records; where these end too early, or are none, that is noted."""
         records, end = self._records(chunk, data)
-        messages = message_offsets(data, records)
-        lost = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) - len(messages) if len(records) else 0
-        channels = message_heads(data, messages)["channel"]
+        messages, _ = messages_at(data, message_offsets(data, records))
+        every = int((np.frombuffer(data, np.uint8)[records] == OP_MESSAGE).sum()) if len(records) else 0
         where = f"{self.name}, byte {chunk.offset}"
-        if lost:
+        if lost := every - len(messages.offset):
             noted.append(Damage(where, "messages without times", messages_lost=lost))
         if end < len(data) and not chunk.cut:
             noted.append(Damage(where, "the records of a chunk end before it does", bytes_lost=len(data) - end))
-        unknown = [number for number in np.unique(channels).tolist() if number not in self._contents.channels]
+        unknown = [n for n in np.unique(messages.channel).tolist() if n not in self._contents.channels]
         counted = chunk.headless or (chunk.index is None and not self._contents.statistics)  # when the file was opened
         if unknown and not counted:
             what = f"messages of {listed('channel', unknown)}, which nothing declares"
-            noted.append(Damage(where, what, messages_lost=int(np.isin(channels, unknown).sum())))
-        return messages
+            noted.append(Damage(where, what, messages_lost=int(np.isin(messages.channel, unknown).sum())))
+        return messages.at(np.isin(messages.channel, sorted(wanted)))
 
-    def _disagreement(
-        self, chunk: Chunk, offsets: Int64Array, heads: NDArray[np.void], entries: Entries | None
-    ) -> list[Damage]:
-        """Return what to say where a chunk's index is broken, or names other messages; with a CRC the chunk is right."""
-        checked, large = self._crc(chunk), chunk.size > MAX_PLANNED_BYTES
-        if entries is None and (checked or chunk.index is None or chunk.cut or large):
-            return []
-        what, lost = "the index of a chunk is broken; its messages are read without it", 0
-        if entries is not None:
-            mine = np.stack([offsets, heads["channel"].astype(np.int64), heads["log_time_ns"]])
-            if np.array_equal(mine, np.stack([entries.offset, entries.channel, entries.log_time_ns])):
-                return []
-            what = "the index of a chunk names other messages than the chunk holds, which are read"
-            lost = max(len(entries.offset) - len(offsets), 0)
-        return [Damage(f"{self.name}, byte {chunk.offset}", what, messages_lost=0 if checked else lost or None)]
+    def is_proved(self, chunk: Chunk) -> bool:
+        """Tell whether the chunk has a CRC."""
+        return bool(self._crc(chunk))
 
-    def _in_time(
-        self, data: memoryview, offsets: Int64Array, heads: NDArray[np.void], ordinals: Int64Array, noted: list[Damage]
-    ) -> list[MessageBlock]:
-        """Return messages as blocks, without those whose time is past what 63 bits hold."""
-        times = (heads["log_time_ns"] >= 0) & (heads["publish_time_ns"] >= 0)
-        if not times.all():
-            what = "messages of times after the year 2262"
-            noted.append(Damage(self.name, what, messages_lost=int((~times).sum())))
-            offsets, heads, ordinals = offsets[times], heads[times], ordinals[times]
-        return message_blocks(data, offsets, heads, ordinals)
+    def needs_index(self, chunk: Chunk) -> bool:
+        """Tell whether a broken index is worth a word: nothing else proves what the chunk holds."""
+        return chunk.index is not None and not chunk.cut and not self._crc(chunk)
 
-    def _copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
+    def copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
         """Copy pieces (start, stop, place) of a chunk; what need not be read as a whole, to check or decompress it, is not."""
         if chunk.compression or self._crc(chunk):
-            copy_pieces(self._load(chunk, once=True), places, to)
+            copy_pieces(self.load(chunk, once=True), places, to)
             return
         self._note_read(chunk, checked=False)
         self._bytes.read_pieces([(chunk.data_offset + start, to[at : at + stop - start]) for start, stop, at in places])
@@ -313,7 +226,7 @@ class McapPart:
         if not checked:
             self._without_crc.add(chunk.offset)
 
-    def _load(self, chunk: Chunk, *, once: bool = False) -> memoryview:
+    def load(self, chunk: Chunk, *, once: bool = False) -> memoryview:
         """Return the chunk's records, its CRC checked; of a chunk that the file's end cuts, what can still be had.
 
         With ``once`` they may be overwritten when this thread reads again.
@@ -339,7 +252,7 @@ class McapPart:
         )
         return kept
 
-    def _entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+    def entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of several chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
         regions: list[memoryview | bytes] = []
         places: list[tuple[int, int, int, int]] = []
@@ -389,44 +302,6 @@ class McapPart:
             raise DamageError("a message index runs past the file's end")
         return self._bytes.read(offset, RECORD_HEAD + length)
 
-    def _summary(self) -> _Contents:
-        """Read the summary section; `DamageError` (without text where there simply is none) when it cannot be used."""
-        tail_bytes = RECORD_HEAD + FOOTER + len(MAGIC)
-        tail = bytes(self._bytes.read(max(self._bytes.size - tail_bytes, 0), min(tail_bytes, self._bytes.size)))
-        if not tail.endswith(MAGIC) or tail[0] != OP_FOOTER or int.from_bytes(tail[1:9], "little") != FOOTER:
-            raise DamageError("the file is not closed (no footer)")
-        start, crc = int.from_bytes(tail[9:17], "little"), int.from_bytes(tail[25:29], "little")
-        if not start:
-            raise DamageError
-        end = self._bytes.size - tail_bytes
-        if not len(MAGIC) <= start <= end:
-            raise DamageError("the footer points outside the file")
-        if self._bytes.peek(start - _DATA_END, RECORD_HEAD) != bytes([OP_DATA_END, _DATA_END - RECORD_HEAD, *bytes(7)]):
-            raise DamageError("the footer does not point behind the data")
-        section = self._bytes.read(start, end - start + RECORD_HEAD + 16)
-        if crc and crc32(section) != crc:
-            raise DamageError("the summary's CRC does not match")
-        contents = _parse_summary(section[: end - start])
-        self._check_summary(contents)
-        return contents
-
-    def _check_summary(self, contents: _Contents) -> None:
-        """Raise `DamageError` when the summary does not name what a reader needs."""
-        indexed = {channel for chunk in contents.chunks for channel in chunk.index or ()}
-        counted = contents.statistics.messages_by_channel if contents.statistics else {}
-        if not (indexed | counted.keys()) <= contents.channels.keys() or not contents.channels:
-            raise DamageError
-        if any(channel.schema and channel.schema not in contents.schemas for channel in contents.channels.values()):
-            raise DamageError
-        if contents.statistics is None or contents.statistics.chunks != len(contents.chunks):
-            raise DamageError
-        if contents.statistics.messages != sum(counted.values()):  # a writer need not count them by channel
-            raise DamageError
-        if any(chunk.end > self._bytes.size or chunk.offset < len(MAGIC) for chunk in contents.chunks):
-            raise DamageError("the summary points outside the file")
-        if any(later.offset < chunk.end for chunk, later in itertools.pairwise(contents.chunks)):
-            raise DamageError("the summary names a chunk twice")
-
     def _fill_gaps(self) -> None:
         """Walk what lies between the chunks that the summary names: message indexes, and messages outside chunks."""
         self._complete = True
@@ -439,7 +314,7 @@ class McapPart:
         self._walk(self._contents, position, self._bytes.size)
         self._note_odd_messages()
 
-    def _check_data_section(self, contents: _Contents, end: int) -> None:
+    def _check_data_section(self, contents: Contents, end: int) -> None:
         """Compare the CRC of all data, where there is one, if messages lie outside chunks: nothing else covers these."""
         crc = int.from_bytes(self._bytes.peek(end + RECORD_HEAD, 4), "little")
         if not crc or not any(chunk.headless for chunk in contents.chunks):
@@ -450,7 +325,7 @@ class McapPart:
         if found != crc:
             self._note(end, "the CRC of the data does not match; messages outside chunks may be wrong or missing")
 
-    def _walk(self, contents: _Contents, start: int, end: int) -> bool:
+    def _walk(self, contents: Contents, start: int, end: int) -> bool:
         """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
         position = start
         run = _MessageRun()
@@ -484,14 +359,14 @@ class McapPart:
             self._check_data_section(contents, position)
         return closed
 
-    def _stepped_over(self, contents: _Contents, position: int, end: int, error: DamageError) -> int:
+    def _stepped_over(self, contents: Contents, position: int, end: int, error: DamageError) -> int:
         """Note what cannot be at ``position``; return where the next chunk begins."""
         after = self._next_chunk(position + 1, end)
         self._note(position, str(error), bytes_lost=after - position)
         self._distrust_last_index(contents)
         return after
 
-    def _take_record(self, contents: _Contents, opcode: int, position: int, after: int, end: int) -> None:
+    def _take_record(self, contents: Contents, opcode: int, position: int, after: int, end: int) -> None:
         if opcode == OP_CHUNK:
             contents.chunks.append(self._walked_chunk(position, after))
             self._bounds.count(len(contents.chunks), 0)
@@ -518,7 +393,7 @@ class McapPart:
             return replace(chunk, data_bytes=self._bytes.size - chunk.data_offset, cut=True)
         return chunk
 
-    def _take_message_index(self, contents: _Contents, position: int, after: int) -> None:
+    def _take_message_index(self, contents: Contents, position: int, after: int) -> None:
         if after - position < RECORD_HEAD + 6:
             raise DamageError("a message index contradicts itself")
         channel = int.from_bytes(self._bytes.peek(position + RECORD_HEAD, 2), "little")
@@ -531,7 +406,7 @@ class McapPart:
         index[channel] = position
         contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
 
-    def _distrust_last_index(self, contents: _Contents) -> None:
+    def _distrust_last_index(self, contents: Contents) -> None:
         """Forget the index of the last chunk: where the file breaks off behind it, some of it may be missing."""
         if contents.chunks:
             contents.chunks[-1] = replace(contents.chunks[-1], index=None)
@@ -579,9 +454,9 @@ class McapPart:
 
     def _declare_and_count(self, chunk: Chunk) -> None:
         try:
-            data = self._load(chunk)
+            data = self.load(chunk)
         except DamageError as error:
-            self.damage[self._lost(chunk, str(error))] = None
+            self.damage[self.lost(chunk, str(error))] = None
             return
         records, _ = self._records(chunk, data)
         self._declare(chunk, data, records)
@@ -646,7 +521,7 @@ class McapPart:
         where = f"{self.name}, byte {offset}"
         self.damage[Damage(where, what, messages_lost=messages_lost, bytes_lost=bytes_lost)] = None
 
-    def _lost(self, chunk: Chunk, what: str) -> Damage:
+    def lost(self, chunk: Chunk, why: str) -> Damage:
         """Return what to say of a chunk that is lost as a whole, counted by the message index beside it."""
         try:
             lost = sum(len(self._index_entries(at, channel)) for channel, at in (chunk.index or {}).items())
@@ -654,22 +529,12 @@ class McapPart:
             lost = 0
         return Damage(
             f"{self.name}, byte {chunk.offset}",
-            f"a chunk is lost: {what}",
+            f"a chunk is lost: {why}",
             messages_lost=lost or None,
             bytes_lost=chunk.uncompressed_bytes,
             start_ns=chunk.start_ns,
             end_ns=chunk.end_ns,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class _ChunkRun:
-    """A run of chunks to read: its plan, and the chunks of its group, each with the number of bytes in all chunks before it."""
-
-    plan: Run
-    members: list[tuple[int, Chunk]]
-    bases: Int64Array
-    """These numbers once more, shape (members,)."""
 
 
 class _MessageRun:
@@ -692,32 +557,6 @@ class _MessageRun:
         if size:
             chunks.append(Chunk(self._start, self._start, size, "", size, 0, 0, headless=True))
         self._start = self._end = 0
-
-
-@functools.lru_cache(maxsize=4)
-def _chosen(wanted: frozenset[int]) -> NDArray[np.bool_]:
-    """Return of every channel number whether it is wanted."""
-    found = np.zeros(1 << 16, np.bool_)
-    found[list(wanted)] = True
-    return found
-
-
-def _parse_summary(section: memoryview) -> _Contents:
-    contents = _Contents()
-    records, end = record_offsets(section, len(section))
-    if end < len(section):
-        raise DamageError("the summary contradicts itself")
-    for offset in records.tolist():
-        length = int.from_bytes(section[offset + 1 : offset + RECORD_HEAD], "little")
-        content = section[offset + RECORD_HEAD : offset + RECORD_HEAD + length]
-        if section[offset] == OP_CHUNK_INDEX:
-            contents.chunks.append(parse_chunk_index(content))
-        elif section[offset] == OP_STATISTICS:
-            contents.statistics = parse_statistics(content)
-        else:
-            contents.note(section[offset], content)
-    contents.chunks.sort(key=lambda chunk: chunk.offset)
-    return contents
 
 
 def _possible_chunks(block: memoryview, size: int) -> list[int]:

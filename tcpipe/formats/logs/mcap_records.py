@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.chunk_runs import Entries
-from tcpipe.formats.logs.log_part import DamageError, Int64Array, MessageBlock, blocks_by_channel, gathered
+from tcpipe.formats.logs.chunk_runs import Messages
+from tcpipe.formats.logs.log_part import DamageError, Int64Array, gathered
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_CRC = 33
@@ -243,43 +243,21 @@ def index_messages(
     return right, record, gathered(data, places, "i8"), gathered(data, places + 8, "i8")
 
 
-def message_heads(data: memoryview, offsets: Int64Array) -> NDArray[np.void]:
-    """Return the heads of the messages that begin at ``offsets``; each must lie within the data."""
+def messages_at(data: memoryview, offsets: Int64Array) -> tuple[Messages, NDArray[np.bool_]]:
+    """Return the messages whose records begin at ``offsets``, within the data, and which of them are messages by opcode and length."""
     count = max(len(data) - _MESSAGE.itemsize + 1, 0)
     windows: NDArray[np.void] = np.ndarray((count,), f"V{_MESSAGE.itemsize}", data if count else b"", 0, (1,))
-    return windows[offsets].view(_MESSAGE)
-
-
-def borne_out(heads: NDArray[np.void], entries: Entries) -> NDArray[np.bool_]:
-    """Return at which index entries there really is a message of that channel and log time that ends before the next, shape (N,)."""
-    lengths = heads["length"]
-    found: NDArray[np.bool_] = (
-        (heads["opcode"] == OP_MESSAGE)
-        & (heads["channel"] == entries.channel)
-        & (heads["log_time_ns"] == entries.log_time_ns)
-        & (lengths >= MESSAGE_HEAD)
-        & (lengths <= entries.end - entries.offset - RECORD_HEAD)
-    )
-    return found
-
-
-def message_blocks(
-    data: memoryview, offsets: Int64Array, heads: NDArray[np.void], ordinals: Int64Array
-) -> list[MessageBlock]:
-    """Return messages as one block a channel; ``offsets``, ``heads`` and ``ordinals`` have shape (N,)."""
-    channels = heads["channel"]
-    if (channels[1:] < channels[:-1]).any():
-        order = np.argsort(channels, kind="stable")
-        offsets, heads, ordinals = offsets[order], heads[order], ordinals[order]
-    return blocks_by_channel(
+    heads = windows[offsets].view(_MESSAGE)
+    messages = Messages(
         data,
-        heads["channel"],
+        heads["channel"].astype(np.int64),
+        offsets,
         offsets + (RECORD_HEAD + MESSAGE_HEAD),
         heads["length"] - MESSAGE_HEAD,
-        log_time_ns=heads["log_time_ns"].astype(np.int64),
-        publish_time_ns=heads["publish_time_ns"].astype(np.int64),
-        ordinals=ordinals,
+        heads["log_time_ns"].astype(np.int64),
+        heads["publish_time_ns"].astype(np.int64),
     )
+    return messages, (heads["opcode"] == OP_MESSAGE) & (heads["length"] >= MESSAGE_HEAD)
 
 
 def record_offsets(data: bytes | memoryview, most: int) -> tuple[Int64Array, int]:

@@ -20,7 +20,9 @@ from random_messages import (
 )
 from rosbags.rosbag1 import Writer as BagWriter
 
-from tcpipe.formats.logs.bag_file import BagPart, _borne_out
+from tcpipe.formats.logs.bag_file import BagPart
+from tcpipe.formats.logs.bag_records import indexed_messages
+from tcpipe.formats.logs.chunk_runs import Excerpt
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.mcap_records import OP_CHUNK, RECORD_HEAD, record_offsets
 
@@ -239,19 +241,24 @@ def test_texts_that_are_not_utf8_are_replaced_and_counted(tmp_path):
 def test_the_index_of_an_intact_bag_is_used(tmp_path):
     messages = random_messages(8, count=50, types=TYPES, store=ROS1)
     part = BagPart(write_bag(tmp_path / "run.bag", messages), "run.bag")
-    (run,) = part._runs(frozenset({0, 1}))
-    data, entries = part._load(part._chunks[0]), run.plan.entries
+    ((_, chunk),) = part.chunks_with(frozenset({0, 1}))
+    data, (entries, sound) = part.load(chunk), part.entries([chunk], np.array([chunk.size]))
+    assert sound.all()
     assert len(entries.offset) == len(messages)
-    assert _borne_out(data, entries.offset, entries).all()
+
+    def borne_out(offset, entries):
+        return indexed_messages(Excerpt(data, offset, entries, []))[1]
+
+    assert borne_out(entries.offset, entries).all()
     for wrong in (
         replace(entries, log_time_ns=entries.log_time_ns + 1),
         replace(entries, channel=1 - entries.channel),
         replace(entries, end=entries.offset + 20),
     ):
-        assert not _borne_out(data, entries.offset, wrong).any()
-    assert not _borne_out(data, entries.offset + 1, entries).any()
+        assert not borne_out(entries.offset, wrong).any()
+    assert not borne_out(entries.offset + 1, entries).any()
     one_wrong = replace(entries, log_time_ns=entries.log_time_ns + (np.arange(len(messages)) == 20))
-    assert np.flatnonzero(~_borne_out(data, entries.offset, one_wrong)).tolist() == [20]
+    assert np.flatnonzero(~borne_out(entries.offset, one_wrong)).tolist() == [20]
     part.close()
 
 
