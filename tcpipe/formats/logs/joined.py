@@ -1,39 +1,52 @@
-"""Several files of one drive read as one log: ROS 1 splits, power logged apart."""
+"""Several files of one drive read as one log: ROS 1 splits, power logged apart; and what a later part of a split lacks.
+
+`rosbag record --split` writes ``drive_0.bag``, ``drive_1.bag``, … (with the time of each before the number, unless that is left out), and
+latched messages only into the part in which they came: a part that is read alone takes its static transforms from an earlier one beside it.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import pyarrow as pa
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import Log, open_log
-from tcpipe.formats.logs.split_bag import PartOfDrive, open_part
-from tcpipe.logs.topics import Topic
+from tcpipe.logs.topics import Damage, Topic
+
+_PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
+_DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
+_STATIC = "tf_static"
+_GAP_NS = 5_000_000_000
+"""Parts of one recording follow one another within so much."""
 
 
 class JoinedLog:
-    """Logs behind one face: topics merged, tables concatenated in log-time order."""
+    """Logs behind one face: topics merged, tables in log-time order; with the static transforms of an ``earlier`` part."""
 
-    def __init__(self, logs: Sequence[Log], stack: ExitStack) -> None:
-        self._logs = logs
-        self._stack = stack
-        self.topics = _merged_topics(logs)
+    def __init__(self, logs: Sequence[Log], earlier: Log | None) -> None:
+        self._logs, self._earlier = logs, earlier
+        self.topics = (_static_topics(earlier) if earlier else {}) | _merged_topics(logs)
 
     @property
-    def damage(self) -> list[Any]:
+    def damage(self) -> list[Damage]:
         """Damage of every file."""
         return [damage for log in self._logs for damage in log.damage]
 
     @property
     def remarks(self) -> list[str]:
         """What is worth saying of every file, and costs nothing."""
-        return [remark for log in self._logs for remark in log.remarks]
+        found = [remark for log in self._logs for remark in log.remarks]
+        if self._earlier:
+            where = f"goes on where {self._earlier.path.name} ends, whose static transforms are taken: it has none"
+            found.append(f"{self._logs[0].path.name}: {where}")
+        return found
 
     @property
     def size_bytes(self) -> int:
@@ -41,13 +54,13 @@ class JoinedLog:
         return sum(log.size_bytes for log in self._logs)
 
     def sha256(self) -> str:
-        """Return the hash of the files' hashes, in their order; `LogError` when two files are the same recording."""
+        """Return the file's hash; of several, that of their hashes, in order. `LogError` when two files are the same recording."""
         digests: dict[str, Log] = {}
         for log in self._logs:
             twin = digests.setdefault(log.sha256(), log)
             if twin is not log:
                 raise LogError(f"{log.path}: the same recording as {twin.path}; give each part once")
-        return hashlib.sha256("".join(digests).encode()).hexdigest()
+        return hashlib.sha256("".join(digests).encode()).hexdigest() if len(digests) > 1 else next(iter(digests))
 
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return each topic's table over all files, in log-time order."""
@@ -55,7 +68,9 @@ class JoinedLog:
         for log in self._logs:
             for name, table in log.tables([topic for topic in topics if topic in log.topics]).items():
                 parts.setdefault(name, []).append(table)
-        return {name: _joined(name, tables).sort_by("log_time_ns") for name, tables in parts.items()}
+        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
+        of_earlier = self._earlier.tables(lent) if self._earlier and lent else {}
+        return {name: _joined(name, tables) for name, tables in parts.items()} | of_earlier
 
     def __enter__(self) -> Self:
         """Return self; the files are open already."""
@@ -65,12 +80,15 @@ class JoinedLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close every file."""
-        self._stack.close()
+        for log in (*self._logs, *([self._earlier] if self._earlier else [])):
+            log.close()
 
 
 def _joined(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
+    if len(tables) == 1:  # in order already
+        return tables[0]
     try:
-        return pa.concat_tables(tables)
+        return pa.concat_tables(tables).sort_by("log_time_ns")
     except pa.ArrowInvalid:
         columns = [set(table.schema) for table in tables]
         odd = sorted({field.name for fields in columns for field in fields ^ columns[0]})
@@ -80,13 +98,53 @@ def _joined(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
         ) from None
 
 
-def open_logs(paths: Sequence[Path], *, message_definitions: Path | None = None) -> Log | PartOfDrive | JoinedLog:
+def open_logs(paths: Sequence[Path], *, message_definitions: Path | None = None) -> Log | JoinedLog:
     """Open one log, or several as one; `LogError` when a topic has different types in two of them."""
-    if len(paths) == 1:
-        return open_part(paths[0], message_definitions=message_definitions)
     with ExitStack() as stack:
         logs = [stack.enter_context(open_log(path, message_definitions=message_definitions)) for path in sorted(paths)]
-        return JoinedLog(logs, stack.pop_all())
+        earlier = _earlier_part(logs[0]) if len(logs) == 1 and not _static_topics(logs[0]) else None
+        if earlier:
+            stack.enter_context(earlier)
+        joined = JoinedLog(logs, earlier)
+        stack.pop_all()
+    return joined if earlier or len(logs) > 1 else logs[0]
+
+
+def _earlier_part(log: Log) -> Log | None:
+    """Return the nearest earlier part that has static transforms, open; None where the chain of parts breaks before."""
+    part: Log | None = log
+    while part is not None:
+        before = _part_before(part)
+        if part is not log:
+            part.close()
+        if before is not None and _static_topics(before):
+            return before
+        part = before
+    return None
+
+
+def _part_before(log: Log) -> Log | None:
+    """Return the part of the same recording that ends where this one begins, open."""
+    mine = _PART.fullmatch(log.path.name)
+    starts = [topic.start_ns for topic in log.topics.values() if topic.start_ns is not None]
+    if mine is None or not starts or log.path.is_dir():
+        return None
+    for path in sorted(log.path.parent.iterdir()):
+        other = _PART.fullmatch(path.name)
+        if (
+            other
+            and int(other["number"]) == int(mine["number"]) - 1
+            and _DATE.sub("", other["name"]) == _DATE.sub("", mine["name"])
+        ):
+            try:
+                found = open_log(path)
+            except (LogError, OSError):
+                continue
+            ends = [topic.end_ns for topic in found.topics.values() if topic.end_ns is not None]
+            if ends and abs(min(starts) - max(ends)) <= _GAP_NS:
+                return found
+            found.close()
+    return None
 
 
 def _merged_topics(logs: Sequence[Log]) -> dict[str, Topic]:
@@ -101,3 +159,7 @@ def _merged_topics(logs: Sequence[Log]) -> dict[str, Topic]:
                 )
             merged[name] = topic if before is None else before.joined(topic)
     return merged
+
+
+def _static_topics(log: Log) -> dict[str, Topic]:
+    return {name: topic for name, topic in log.topics.items() if name.endswith(_STATIC)}

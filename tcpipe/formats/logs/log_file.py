@@ -26,7 +26,7 @@ from tcpipe.formats.logs.rosbag2 import (
     METADATA,
     STORAGE_SUFFIXES,
     ZSTD_MAGIC,
-    MessageDecompressing,
+    decompressed_blocks,
     decompressed_file,
     is_one_bag,
     rosbag2_files,
@@ -360,7 +360,7 @@ class Log:
                     what = f"the topic changes its type to {channel.type_name} ({channel.encoding}); these messages are left out"
                     self._damage[Damage(part.name, what, channel.topic, channel.message_count)] = None
         if channels:
-            for block in part.blocks(frozenset(channels), threads=threads):
+            for block in decompressed_blocks(part, frozenset(channels), threads=threads):
                 later = replace(block, ordinal=block.ordinal + (index << 48)) if index else block
                 yield channels[block.channel], later
 
@@ -485,11 +485,11 @@ def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
         magic = _magic(path)
     part: LogPart
     if magic.startswith(mcap_records.MAGIC) or _tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
-        part = MessageDecompressing(McapPart(path, name))
+        part = McapPart(path, name)
     elif magic.startswith(bag_records.MAGIC):
         part = BagPart(path, name)
     elif magic.startswith(sqlite_file.MAGIC):
-        part = MessageDecompressing(SqlitePart(path, name))
+        part = SqlitePart(path, name)
     else:
         held = "" if path == given else "what it holds, decompressed: "
         raise LogError(f"{given}: not a log: {held}{_described(path, magic)}; {_WANTED}")

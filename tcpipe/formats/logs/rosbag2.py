@@ -15,7 +15,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, Channel, LogPart, MessageBlock, is_bomb, no_room
+from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, is_bomb, no_room
 from tcpipe.logs.topics import Damage
 
 METADATA = "metadata.yaml"
@@ -169,58 +169,38 @@ def _decompressed_blocks(path: Path) -> Iterator[bytes]:
             yield block
 
 
-class MessageDecompressing:
-    """A part whose messages are zstd frames each (``compression_mode: MESSAGE``); others pass as they are."""
+def decompressed_blocks(part: LogPart, wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
+    """Yield a part's messages of the wanted channels; those that are zstd frames each (``compression_mode: MESSAGE``) decompressed."""
+    compressed: dict[int, bool] = {}
+    for block in part.blocks(wanted, threads=threads):
+        if block.channel not in compressed:
+            compressed[block.channel] = part.channels[block.channel].encoding == "cdr" and _is_compressed(block)
+        yield _decompressed(block, part) if compressed[block.channel] else block
 
-    def __init__(self, part: LogPart) -> None:
-        self._part = part
-        self.name, self.damage = part.name, part.damage
 
-    @property
-    def channels(self) -> Mapping[int, Channel]:
-        """Return every channel by its number."""
-        return self._part.channels
-
-    @property
-    def unchecked(self) -> str:
-        """What was read that no checksum covers."""
-        return self._part.unchecked
-
-    def close(self) -> None:
-        """Close the file."""
-        self._part.close()
-
-    def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
-        """Yield the messages of the wanted channels, decompressed."""
-        compressed: dict[int, bool] = {}
-        for block in self._part.blocks(wanted, threads=threads):
-            if block.channel not in compressed:
-                compressed[block.channel] = _is_compressed(block)
-            yield self._decompressed(block) if compressed[block.channel] else block
-
-    def _decompressed(self, block: MessageBlock) -> MessageBlock:
-        payloads, kept = [], []
-        for row, (offset, length) in enumerate(zip(block.offsets.tolist(), block.lengths.tolist(), strict=True)):
-            payload = _unframed(block.buffer[offset : offset + length])
-            if payload is not None:
-                payloads.append(payload)
-                kept.append(row)
-        lost = len(block.offsets) - len(kept)
-        if lost:
-            topic = self.channels[block.channel].topic
-            self.damage[Damage(self.name, "messages do not decompress", topic=topic, messages_lost=lost)] = None
-        lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
-        rows = np.array(kept, np.int64)
-        return MessageBlock(
-            block.channel,
-            memoryview(b"".join(payloads)),
-            np.cumsum(lengths) - lengths,
-            lengths,
-            block.log_time_ns[rows],
-            block.publish_time_ns[rows],
-            block.ordinal[rows],
-            None,
-        )
+def _decompressed(block: MessageBlock, part: LogPart) -> MessageBlock:
+    payloads, kept = [], []
+    for row, (offset, length) in enumerate(zip(block.offsets.tolist(), block.lengths.tolist(), strict=True)):
+        payload = _unframed(block.buffer[offset : offset + length])
+        if payload is not None:
+            payloads.append(payload)
+            kept.append(row)
+    lost = len(block.offsets) - len(kept)
+    if lost:
+        topic = part.channels[block.channel].topic
+        part.damage[Damage(part.name, "messages do not decompress", topic=topic, messages_lost=lost)] = None
+    lengths = np.fromiter(map(len, payloads), np.int64, len(payloads))
+    rows = np.array(kept, np.int64)
+    return MessageBlock(
+        block.channel,
+        memoryview(b"".join(payloads)),
+        np.cumsum(lengths) - lengths,
+        lengths,
+        block.log_time_ns[rows],
+        block.publish_time_ns[rows],
+        block.ordinal[rows],
+        None,
+    )
 
 
 def _is_compressed(block: MessageBlock) -> bool:
