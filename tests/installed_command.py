@@ -1,32 +1,54 @@
-"""The installed ``tcpipe`` command, run as a user runs it."""
+"""The installed ``tcpipe`` command, run as a user runs it.
 
+``make test`` runs it in forks of a process that has loaded the libraries (`command_server`); with ``TEST_START=anew``, as in CI, each
+call starts Python anew.
+"""
+
+import atexit
 import json
 import os
+import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 COMMAND = Path(sys.executable).parent / "tcpipe"
 HANGS_S = 3600.0
 """After this long a command hangs; a machine that others use takes its time."""
+_ANEW = os.environ.get("TEST_START") == "anew"
+_LEARNING = {"train", "evaluate", "reproduce", "predict-path", "cost-map", "plan-path"}
 
 
-def tcpipe(
-    *arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None, timeout_s: float = HANGS_S
-) -> subprocess.CompletedProcess[str]:
+def tcpipe(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run the command; nothing of the caller's TCPIPE_ environment reaches it."""
-    clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")}
-    return subprocess.run(
-        [COMMAND, *map(str, arguments)],
-        cwd=cwd,
-        env={**clean, **(env or {})},
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        check=False,
-    )
+    clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")} | dict(env or {})
+    command = [str(COMMAND), *map(str, arguments)]
+    if _ANEW:
+        return subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, timeout=HANGS_S, check=False)
+    server = _server("learning" if arguments[0] in _LEARNING else "other")
+    with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
+        request = json.dumps({"arguments": command, "cwd": str(cwd), "env": clean})
+        socket.send_fds(server, [request.encode()], [out.fileno(), err.fileno()])
+        code = json.loads(server.recv(100))
+        printed = [os.pread(stream.fileno(), os.fstat(stream.fileno()).st_size, 0).decode() for stream in (out, err)]
+    return subprocess.CompletedProcess(command, code, *printed)
+
+
+@cache
+def _server(kind: str) -> socket.socket:
+    """Start a server of commands, which ends with this process."""
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours.settimeout(HANGS_S)
+    program = [sys.executable, Path(__file__).with_name("command_server.py"), str(theirs.fileno()), kind]
+    with theirs:
+        process = subprocess.Popen(program, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
+    atexit.register(process.wait)
+    atexit.register(ours.close)
+    return ours
 
 
 def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:

@@ -186,7 +186,9 @@ def outcomes(tmp_path_factory):
         write(place / name)
     paths = [str(place / name) for name in HOSTILE]
     done = subprocess.run([sys.executable, "-c", READ, *paths], capture_output=True, text=True, check=False)
-    subprocess.run(["rm", "-rf", place], check=True)  # pytest's own way to clear up is Python's, which cannot go so deep
+    subprocess.run(
+        ["rm", "-rf", place], check=True
+    )  # pytest's own way to clear up is Python's, which cannot go so deep
     assert done.returncode == 0, done.stderr[-3000:]
     found = {}
     for line in done.stdout.splitlines():
