@@ -26,24 +26,22 @@ from typing import Any
 
 import pyarrow as pa
 
-from tcpipe.cost.budget import EnergyBudget
 from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
-from tcpipe.formats.json_files import digest
+from tcpipe.formats.json_files import digest, plain, typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.places import local_output
 from tcpipe.formats.record_files import put_record, read_record, read_records, record_name
 from tcpipe.formats.seals import CHECKSUMS, checksums_to_json, prove_files, read_sealed, write_checksums, write_sealed
+from tcpipe.tables.findings import EnergyBudget, Findings, RunFacts
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
-    Findings,
     GatedTrack,
     LabelledSegments,
     Sensor,
     Streams,
     Track,
-    info_from_json,
-    info_to_json,
+    TrackInfo,
     metadata_of,
     with_metadata,
 )
@@ -89,8 +87,13 @@ class RunDirectory:
     @property
     def energy_budget(self) -> EnergyBudget | None:
         """The noise floor of its labels' energy; None without energies."""
-        found = self.manifest["info"]["findings"]["facts"].get("label", {}).get("energy_budget")
-        return None if found is None else EnergyBudget(**found)
+        label = self.info.findings.facts.label
+        return None if label is None else label.energy_budget
+
+    @property
+    def info(self) -> TrackInfo:
+        """What belongs to the whole track, with what every stage noticed."""
+        return typed(self.manifest["info"], TrackInfo, self.path / "manifest.json")
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
@@ -108,11 +111,11 @@ class RunDirectory:
 
     def labelled_segments(self) -> LabelledSegments:
         """Read the labelled segments as a checked level, with the run's info and ledger."""
-        return LabelledSegments(self.segments(), info_from_json(self.manifest["info"]), self.manifest["ledger_m"])
+        return LabelledSegments(self.segments(), self.info, self.manifest["ledger_m"])
 
     def track(self) -> GatedTrack:
         """Read the gated track as a checked level."""
-        return GatedTrack(self.table("track"), info_from_json(self.manifest["info"]))
+        return GatedTrack(self.table("track"), self.info)
 
     def rejections(self) -> pa.Table:
         """Read the measurements that the filter refused (schema REJECTIONS)."""
@@ -310,7 +313,7 @@ class Store:
             "robot": streams.robot,
             "gnss_crs": streams.gnss_crs,
             "power_averaged": streams.power_averaged,
-            "findings": asdict(streams.findings),
+            "findings": plain(streams.findings),
         }
         with atomic_directory(self.runs_path / run_id / "streams") as directory:
             for role, table in streams.tables.items():
@@ -344,10 +347,10 @@ class Store:
             tables[path.stem] = table.replace_schema_metadata(None)
         if not tables:
             return None
-        findings = Findings(tuple(shared["findings"]["warnings"]), shared["findings"]["facts"])
         try:
+            findings = typed(shared["findings"], Findings[RunFacts], directory)
             return Streams(tables, sensors, shared["robot"], shared["gnss_crs"], shared["power_averaged"], findings)
-        except TableError:
+        except (TableError, StoreError):
             return None
 
     def write_run(
@@ -362,7 +365,7 @@ class Store:
     ) -> Path:
         """Write one ingestion; the directory appears by one rename."""
         path = self.runs_path / run_id / recipe_id
-        info = info_to_json(labelled.info)
+        info = plain(labelled.info)
         with atomic_directory(path) as directory:
             for name, table in (
                 ("track", gated.table),

@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.tables.findings import EnergyBudget
+
 CAUSES = ("position", "rate", "current", "voltage")
 """Displacement of both ends; what the current did between samples; noise and rounding of the current; the voltage's."""
-
-
-@dataclass(frozen=True, slots=True)
-class EnergyBudget:
-    """The noise floor of E over some segments: shares of the mean energy, root mean square over the segments [1]."""
-
-    segments: int
-    """Segments with an energy."""
-    mean_energy_joule: float
-    """Mean of its absolute value [J]."""
-    total: float
-    """All `CAUSES` together."""
-    position: float
-    rate: float
-    current: float
-    voltage: float
-    at_20_hz: float
-    """What power at 20 Hz would leave of the total."""
 
 
 def energy_budget(

@@ -7,7 +7,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import asdict, is_dataclass
+from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
@@ -29,7 +29,8 @@ MOST_BYTES = 32 << 20
 def plain(value: Any) -> Any:
     """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
     if is_dataclass(value) and not isinstance(value, type):
-        value = asdict(value)
+        told = ((of.name, getattr(value, of.name), "json" in of.metadata) for of in fields(value))
+        value = {name: item for name, item, left_out in told if item is not None or not left_out}
     elif isinstance(value, Enum):
         value = value.value
     elif hasattr(value, "tolist"):  # numpy scalars and arrays

@@ -32,6 +32,7 @@ from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.timeline import Timeline, build_timeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix
+from tcpipe.tables.findings import StretchFacts, vector
 
 _WIDTH = 30  # of a row of outputs, see `error_state_kernel._saved`; 81 more with covariances
 _BLOCK = 2048
@@ -468,26 +469,26 @@ def _rejections(timeline: Timeline, run: _Run) -> Rejections:
     )
 
 
-def _facts(timeline: Timeline, run: _Run) -> dict[str, Any]:
-    facts: dict[str, Any] = {"nis_mean": {}, "measurements": {}, "rejected": {}, "reopened": {}}
-    for kind, role in _ROLES.items():
-        of_kind = timeline.kind == kind
-        if of_kind.any():
-            accepted = of_kind & (run.verdict == kernel.ACCEPTED)
-            mean = float(run.nis[accepted].mean()) / _DOF[kind] if accepted.any() else None
-            facts["nis_mean"][role] = mean
-            facts["measurements"][role] = int(of_kind.sum())
-            facts["rejected"][role] = int((of_kind & (run.verdict == kernel.REFUSED)).sum())
-            facts["reopened"][role] = int((of_kind & (run.verdict == kernel.REOPENED)).sum())
+def _facts(timeline: Timeline, run: _Run) -> StretchFacts:
+    kinds = {role: timeline.kind == kind for kind, role in _ROLES.items() if (timeline.kind == kind).any()}
+    taken = {role: of_kind & (run.verdict == kernel.ACCEPTED) for role, of_kind in kinds.items()}
+    dof = {role: _DOF[kind] for kind, role in _ROLES.items()}
     x, deviation = run.last.x, np.sqrt(np.diag(run.last.P))
-    facts["events"] = int(timeline.stamp_ns.size)
-    facts["standing_updates"] = int((timeline.kind == kernel.STANDING).sum())
-    facts["gnss_variance_factor"] = run.gnss_factor
-    facts["gnss_lasting_error_m"] = float(np.sqrt(run.lasting_m2[0]))
-    facts["covariance_repairs"] = int(run.repairs)
-    facts["gyro_bias_radps"] = None if run.turn_scale_std else x[9:12].tolist()
-    facts["turn_scale"] = float(1 + x[11]) if run.turn_scale_std else None
-    facts["accelerometer_bias_mps2"] = x[12:15].tolist()
-    facts["wheel_scale"], facts["wheel_scale_std"] = float(1 + x[21]), float(deviation[15])
-    facts["visual_scale"], facts["visual_scale_std"] = float(1 + x[22]), float(deviation[16])
-    return facts
+    return StretchFacts(
+        nis_mean={role: float(run.nis[t].mean()) / dof[role] if t.any() else None for role, t in taken.items()},
+        measurements={role: int(of_kind.sum()) for role, of_kind in kinds.items()},
+        rejected={role: int((of_kind & (run.verdict == kernel.REFUSED)).sum()) for role, of_kind in kinds.items()},
+        reopened={role: int((of_kind & (run.verdict == kernel.REOPENED)).sum()) for role, of_kind in kinds.items()},
+        events=int(timeline.stamp_ns.size),
+        standing_updates=int((timeline.kind == kernel.STANDING).sum()),
+        gnss_variance_factor=run.gnss_factor,
+        gnss_lasting_error_m=float(np.sqrt(run.lasting_m2[0])),
+        covariance_repairs=int(run.repairs),
+        gyro_bias_radps=None if run.turn_scale_std else vector(x[9:12]),
+        turn_scale=float(1 + x[11]) if run.turn_scale_std else None,
+        accelerometer_bias_mps2=vector(x[12:15]),
+        wheel_scale=float(1 + x[21]),
+        wheel_scale_std=float(deviation[15]),
+        visual_scale=float(1 + x[22]),
+        visual_scale_std=float(deviation[16]),
+    )

@@ -10,12 +10,12 @@ Both estimators are called alike::
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tcpipe.tables.findings import StretchFacts
 
 DISPLACEMENT_LAGS_S = (0.5, 1.0, 2.0, 4.0)
 """Durations over which a smoother tells the uncertainty of a displacement [s]."""
@@ -58,8 +58,7 @@ class Trajectory:
     displacement_std_m : [m], shape (N, 4), of the horizontal displacement from each row to the one `DISPLACEMENT_LAGS_S` later, along
         its direction, the correlation of both ends counted exactly; NaN where no row stands there, and throughout in a forward filter,
         which does not know it. In between the variance may be interpolated in time, from zero at no time.
-    facts : JSON values for the manifest. Both estimators give ``nis_mean`` (by role, normalised innovation squared over degrees of
-        freedom, refused measurements left out), ``measurements`` and ``rejected`` (counts by role).
+    facts : what the filter counted and settled on.
     covariance : shape (N, 9, 9), of the error (rotation vector in base_link axes [rad], velocity [m/s] and position [m] in ENU); None
         where it was not asked for.
     """
@@ -74,7 +73,7 @@ class Trajectory:
     forward_velocity_std_mps: NDArray[np.float64]
     rejections: Rejections
     displacement_std_m: NDArray[np.float64]
-    facts: Mapping[str, Any] = field(default_factory=dict)
+    facts: StretchFacts
     covariance: NDArray[np.float64] | None = None
 
 

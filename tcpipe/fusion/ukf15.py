@@ -49,6 +49,7 @@ from tcpipe.fusion.ukf15_kernel import (
     Sources,
 )
 from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
+from tcpipe.tables.findings import StretchFacts
 
 POSITION, VELOCITY, TURN, ACCELERATION = (0, 1, 2), (6, 7, 8), (9, 10, 11), (12, 13, 14)
 """Where the other states stand."""
@@ -398,8 +399,8 @@ def _rejections(sources: Sequence[Source], gates: Sequence[float], found: Forwar
     return Rejections(stamp_ns[order], role, np.full(role.size, "gate"), nis, np.repeat(gates, count)[order])
 
 
-def _facts(sources: Sequence[Source], found: Forward) -> dict[str, Any]:
-    facts: dict[str, Any] = {"nis_mean": {}, "measurements": {}, "rejected": {}, "recovered": {}}
+def _facts(sources: Sequence[Source], found: Forward) -> StretchFacts:
+    measurements, rejected, recovered, nis_mean = {}, {}, {}, dict[str, float | None]()
     for role in (GNSS, IMU, WHEELS, VISUAL):
         mine = [at for at, source in enumerate(sources) if source.role == role]
         if not mine:
@@ -408,8 +409,8 @@ def _facts(sources: Sequence[Source], found: Forward) -> dict[str, Any]:
         freedom = np.concatenate([np.full(found.nis[at].size, len(sources[at].entries)) for at in mine])
         accepted = outcome == ACCEPTED
         nis = np.concatenate([found.nis[at] for at in mine])
-        facts["measurements"][role] = int((outcome != NOT_RUN).sum())
-        facts["rejected"][role] = int((outcome == REJECTED).sum())
-        facts["recovered"][role] = int((outcome == RECOVERED).sum())
-        facts["nis_mean"][role] = float(nis[accepted].sum() / freedom[accepted].sum()) if accepted.any() else None
-    return facts | {"covariance_repairs": found.repairs}
+        measurements[role] = int((outcome != NOT_RUN).sum())
+        rejected[role] = int((outcome == REJECTED).sum())
+        recovered[role] = int((outcome == RECOVERED).sum())
+        nis_mean[role] = float(nis[accepted].sum() / freedom[accepted].sum()) if accepted.any() else None
+    return StretchFacts(nis_mean, measurements, rejected, found.repairs, recovered=recovered)

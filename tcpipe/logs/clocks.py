@@ -15,6 +15,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.tables.findings import ClockStep
+
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
@@ -75,16 +77,7 @@ class Timeline:
     moved_s: tuple[float, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class Step:
-    """A clock step: at which log time [ns], how far [s], and on which topics."""
-
-    log_time_ns: int
-    step_s: float
-    topics: tuple[str, ...]
-
-
-def settle_clocks(topics: Mapping[str, TopicTimes]) -> tuple[dict[str, Timeline], list[Step]]:
+def settle_clocks(topics: Mapping[str, TopicTimes]) -> tuple[dict[str, Timeline], list[ClockStep]]:
     """Return each topic's timeline, and the clock steps that divide them into epochs.
 
     Parameters
@@ -161,7 +154,7 @@ def _steps(times: TopicTimes) -> list[tuple[int, int]]:
     return found
 
 
-def _common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, list[tuple[int, int]]]) -> list[Step]:
+def _common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, list[tuple[int, int]]]) -> list[ClockStep]:
     """Return steps common to all topics: those of several topics within 5 s of log time are one."""
     every = sorted((int(log_times[name][row]), name, step) for name, steps in steps_of.items() for row, step in steps)
     groups: list[list[tuple[int, str, int]]] = []
@@ -171,7 +164,9 @@ def _common_steps(log_times: Mapping[str, Ints], steps_of: Mapping[str, list[tup
         else:
             groups.append([item])
     return [
-        Step(group[0][0], max((step for _, _, step in group), key=abs) / SECOND_NS, tuple(name for _, name, _ in group))
+        ClockStep(
+            group[0][0], max((step for _, _, step in group), key=abs) / SECOND_NS, tuple(name for _, name, _ in group)
+        )
         for group in groups
     ]
 
@@ -212,7 +207,7 @@ def _expected(times: TopicTimes, offset_ns: Mapping[int, int], epoch: Ints) -> I
     return times.log_time_ns + np.array([offset_ns[int(e)] for e in epoch], np.int64)
 
 
-def _epochs(name: str, times: TopicTimes, steps: Sequence[Step], own: Sequence[tuple[int, int]]) -> Ints:
+def _epochs(name: str, times: TopicTimes, steps: Sequence[ClockStep], own: Sequence[tuple[int, int]]) -> Ints:
     """Return each row's epoch: by its own topic's step where it has one, else by the step's log time."""
     own_rows = {int(times.log_time_ns[row]): row for row, _ in own}
     epoch = np.zeros(len(times.log_time_ns), np.int64)

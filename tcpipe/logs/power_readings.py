@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -43,7 +43,8 @@ class PowerReadings:
     rails: dict[str, tuple[str, ...]] = field(default_factory=dict)
     averaged: bool = False
     warnings: tuple[str, ...] = ()
-    facts: dict[str, Any] = field(default_factory=dict)
+    current_sign: str | None = None
+    """What a drawn current is counted as, and what tells it; None without power."""
 
 
 def columns_of(rail: str) -> tuple[str, str]:
@@ -85,7 +86,7 @@ def read_power(
         return PowerReadings(warnings=tuple(f"power refused: {why}; there will be no energy" for why in refused))
     rails, odd = _believable(rails)
     log_times = {topic: np.asarray(columns[LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
-    sign, warnings, facts = _sign(rails, log_times, sources, current_sign)
+    sign, warnings, told = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
         return PowerReadings(warnings=tuple(warnings))
     warnings += odd
@@ -98,7 +99,7 @@ def read_power(
         {topic: tuple(rail.name for rail in found) for topic, found in rails.items()},
         any(source.averaged for source in sources),
         tuple(dict.fromkeys(warnings)),
-        facts,
+        told,
     )
 
 
@@ -164,35 +165,35 @@ def _believable(rails: Mapping[str, list[Rail]]) -> tuple[dict[str, list[Rail]],
 
 def _sign(
     rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
-) -> tuple[int, list[str], dict[str, Any]]:
-    """Return what makes a drawn current positive (0 where the record contradicts its type), warnings and facts."""
+) -> tuple[int, list[str], str]:
+    """Return what makes a drawn current positive (0 where the record contradicts its type), warnings, and what tells it."""
     if given != "auto":
-        return (1 if given == "drawn_positive" else -1), [], {"current_sign": f"{given} (recipe)"}
+        return (1 if given == "drawn_positive" else -1), [], f"{given} (recipe)"
     time_s, whole = _whole_current(rails, log_times)
     sign, one_sided = sign_by_mean(whole, _weight_s(time_s))
     share = f"{100 * abs(one_sided):.0f} % of the charge moved"
     if all(source.sign for source in sources):
         if sign >= 0 or time_s.size < _FEWEST_ROWS:
-            return 1, [], {"current_sign": "drawn_positive (message type)"}
+            return 1, [], "drawn_positive (message type)"
         why = f"power refused: the current is negative, {share} flows back; there will be no energy"
         cure = (
             'if this robot counts drawn current so, write in the recipe under [read]: current_sign = "drawn_negative"'
         )
-        return 0, [f'{why}; {cure}; if it truly rolled downhill throughout: "drawn_positive"'], {}
+        return 0, [f'{why}; {cure}; if it truly rolled downhill throughout: "drawn_positive"'], ""
     if sign > 0:
         why = f"power: the current counts as positive when drawn, against the ROS convention: {share} is positive"
         return (
             1,
             [f'{why}; settle it with read.current_sign = "drawn_positive"'],
-            {"current_sign": "drawn_positive (mean)"},
+            "drawn_positive (mean)",
         )
     if sign < 0:
-        return -1, [], {"current_sign": "drawn_negative (mean, as ROS has it)"}
+        return -1, [], "drawn_negative (mean, as ROS has it)"
     why = f"power: the current's sign is unclear (net {share}): taken as negative when drawn, as ROS has it"
     return (
         -1,
         [f'{why}; settle it with read.current_sign = "drawn_positive" or "drawn_negative"'],
-        {"current_sign": "drawn_negative (ROS)"},
+        "drawn_negative (ROS)",
     )
 
 

@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from tcpipe import __version__
-from tcpipe.cost.budget import EnergyBudget
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.json_files import digest, plain
@@ -40,6 +39,7 @@ from tcpipe.pipeline.supersession import remember_earlier, superseded_by
 from tcpipe.pipeline.transience import is_transient
 from tcpipe.recipe import IngestSections, Recipe
 from tcpipe.store import RunDirectory, Store, add_by_hash, open_store
+from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GatedTrack, LabelledSegments, Streams, Track
 
 R = TypeVar("R")

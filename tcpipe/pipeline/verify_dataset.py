@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from tcpipe.cost.budget import EnergyBudget, pooled
+from tcpipe.cost.budget import pooled
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.formats.dataset_files import (
     CARD,
@@ -33,6 +33,7 @@ from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measured
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.store import is_named_after
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 

@@ -11,7 +11,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
-from tcpipe.cost.budget import EnergyBudget
 from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_current_card, read_samples, rows_in_files
 from tcpipe.report.balance import balance_sections
 from tcpipe.report.error_budget import budget_sections
@@ -27,6 +26,7 @@ from tcpipe.report.overview import Bounds, joint_bounds_m, read_overview
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.quality import quality_sections
 from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.findings import EnergyBudget
 
 _GALLERY = 10
 

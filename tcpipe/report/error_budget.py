@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from tcpipe.cost.budget import EnergyBudget, in_words
+from tcpipe.cost.budget import in_words
 from tcpipe.report.page import Section
+from tcpipe.tables.findings import EnergyBudget
 
 _ROWS = {
     "position": "position of both ends",

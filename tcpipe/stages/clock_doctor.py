@@ -13,30 +13,27 @@ from tcpipe.power.rails import power_at
 from tcpipe.stages.fuse_inputs import Inputs
 from tcpipe.stages.fuse_sanity import longest_epoch
 from tcpipe.stages.power_rails import rails_of
-from tcpipe.tables.levels import Findings, Streams
+from tcpipe.tables.findings import ClockFacts, ClockOffset, ClockPair, Findings
+from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
 _FINE_S = 0.004
 
 
-def clock_findings(streams: Streams, inputs: Inputs) -> Findings:
+def clock_findings(streams: Streams, inputs: Inputs) -> Findings[ClockFacts]:
     """Return the offsets between the sensors' clocks in the longest clock epoch; nothing is corrected.
 
-    Facts: every pair compared (``pairs``), the ``reference`` clock, and by role ``offset_s`` (how late its stamps are), ``std_s``,
-    ``noted``, ``drift_s_per_h`` (None below half an hour), ``drifts`` and ``recipe`` (the lines that would correct it, the recipe's own
-    offset included).
+    The recipe lines that would correct an offset include what the recipe adds already.
     """
-    if not inputs.measurements:
-        return Findings()
     epoch = longest_epoch(inputs)
     found = find_clock_offsets(inputs.measurements[epoch], _power(streams, epoch))
-    given_s: dict[str, float] = streams.findings.facts.get("time_offset_s", {})
-    roles, warnings = {}, []
+    given_s = streams.findings.facts.time_offset_s
+    offsets, warnings = {}, []
     for role, offset in found.offsets.items():
         entry = f"{role} = {given_s.get(role, 0.0) - offset.offset_s:.{3 if offset.std_s < _FINE_S else 2}f}"
-        roles[role] = {**_told(offset), "recipe": f"[read.time_offset_s]\n{entry}"}
+        recipe = f'[read.time]\n{role} = "log"' if offset.drifts else f"[read.time_offset_s]\n{entry}"
+        offsets[role] = ClockOffset(**_told(offset), recipe=recipe)
         if offset.drifts:
-            roles[role]["recipe"] = f'[read.time]\n{role} = "log"'
             warnings.append(_drift(found, role, offset))
         elif offset.noted:
             warnings.append(
@@ -44,13 +41,8 @@ def clock_findings(streams: Streams, inputs: Inputs) -> Findings:
                 f"{found.reference} (± {2 * offset.std_s:.2f} s, by {_means(found, role)}); nothing is corrected; "
                 f"to correct it, write in the recipe under [read.time_offset_s]: {entry}"
             )
-    facts = {
-        "epoch": epoch,
-        "reference": found.reference,
-        "pairs": [{**_told(pair), "determined": pair.determined} for pair in found.pairs],
-        "offsets": roles,
-    }
-    return Findings(tuple(warnings), facts)
+    pairs = tuple(ClockPair(**_told(pair), determined=pair.determined) for pair in found.pairs)
+    return Findings(tuple(warnings), ClockFacts(epoch, found.reference, pairs, offsets))
 
 
 def _told(each: Offset | Pair) -> dict[str, Any]:

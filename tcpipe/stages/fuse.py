@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tcpipe.errors import FusionError
@@ -11,7 +13,8 @@ from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, rejections_ta
 from tcpipe.stages.fuse_inputs import Inputs, prepare_inputs
 from tcpipe.stages.fuse_sanity import sane_inputs, without_lost_gnss
 from tcpipe.stages.fuse_stretches import fuse_stretches
-from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo, with_findings
+from tcpipe.tables.findings import Findings
+from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
 def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
@@ -43,13 +46,13 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
         raise FusionError(_nothing(streams, inputs), *sanity.warnings)
     table = TRACK.table(**{name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]})
     datum = None if inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
-    info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, streams.findings)
-    summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    info = with_findings(info, "fuse", fuse_warnings(inputs, fused.facts, summary), summary)
     # 4. What was left out, and whether the sensors' clocks agree.
-    info = with_findings(info, "sensor_checks", sanity.warnings, sanity.facts)
+    summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     clocks = clock_findings(streams, inputs)
-    info = with_findings(info, "clock_offsets", clocks.warnings, clocks.facts)
+    warnings = (*fuse_warnings(inputs, summary), *sanity.warnings, *clocks.warnings)
+    facts = replace(streams.findings.facts, fuse=summary, sensor_checks=sanity.facts, clock_offsets=clocks.facts)
+    findings = Findings(streams.findings.warnings + warnings, facts)
+    info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, findings)
     return Track(table, rejections_table(inputs, fused.found), info)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -12,57 +13,54 @@ from tcpipe.fusion.stretches import Stretch
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.tables.findings import FuseFacts, StretchFacts
 from tcpipe.tables.levels import REJECTIONS
 
 _MANY_REFUSED = 0.2
 _LOCAL = "the track lies in a local frame that starts at 0, 0, 0 and cannot be placed on a map"
 
 
-def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> dict[str, Any]:
-    """Return the facts of one stretch."""
+def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> StretchFacts:
+    """Return the facts of one stretch: the filter's, and where it lies and began."""
     m = stretch.measurements
     used = {GNSS: m.gnss, IMU: m.imu, WHEELS: m.wheels, VISUAL: m.visual}
-    return {
-        "epoch": stretch.epoch,
-        "start_ns": stretch.start_ns,
-        "end_ns": stretch.end_ns,
-        "rows": int(found.stamp_ns.size),
-        "sensors": [role for role, source in used.items() if source is not None],
-        "gyro_noise_radps": None if m.imu is None else m.imu.gyro_std_radps,
-        "accelerometer_noise_mps2": None if m.imu is None else m.imu.accelerometer_std_mps2,
-        "initial_yaw_rad": float(rpy_from_quat(initial.quat_xyzw)[2]),
-        "initial_yaw_std_rad": initial.yaw_std_rad,
-        "heading_from": initial.heading_from,
-        **found.facts,
-    }
+    return replace(
+        found.facts,
+        epoch=stretch.epoch,
+        start_ns=stretch.start_ns,
+        end_ns=stretch.end_ns,
+        rows=int(found.stamp_ns.size),
+        sensors=tuple(role for role, source in used.items() if source is not None),
+        gyro_noise_radps=None if m.imu is None else m.imu.gyro_std_radps,
+        accelerometer_noise_mps2=None if m.imu is None else m.imu.accelerometer_std_mps2,
+        initial_yaw_rad=float(rpy_from_quat(initial.quat_xyzw)[2]),
+        initial_yaw_std_rad=initial.yaw_std_rad,
+        heading_from=initial.heading_from,
+    )
 
 
-def fuse_facts(inputs: Inputs, stretches: list[dict[str, Any]], *, rows: int, skipped_s: float) -> dict[str, Any]:
+def fuse_facts(inputs: Inputs, stretches: Sequence[StretchFacts], *, rows: int, skipped_s: float) -> FuseFacts:
     """Return the facts of the run: counts by role over all stretches, what was set aside, and each stretch."""
-    roles = sorted({role for stretch in stretches for role in stretch["measurements"]})
-    counts = {
-        name: {role: sum(stretch[name].get(role, 0) for stretch in stretches) for role in roles}
-        for name in ("measurements", "rejected")
-    }
-    nis: dict[str, float] = {}
+    roles = sorted({role for stretch in stretches for role in stretch.measurements})
+    nis: dict[str, float | None] = {}
     for role in roles:
-        known = [
-            (s["nis_mean"][role], s["measurements"][role]) for s in stretches if s["nis_mean"].get(role) is not None
-        ]
+        means = [(s.nis_mean.get(role), s.measurements[role]) for s in stretches if role in s.measurements]
+        known = [(mean, count) for mean, count in means if mean is not None]
         if known:
             nis[role] = float(np.average([mean for mean, _ in known], weights=[count for _, count in known]))
-    return {
-        "rows": rows,
-        "sensors": sorted({role for stretch in stretches for role in stretch["sensors"]}),
-        **counts,
-        "nis_mean": nis,
-        "set_aside": inputs.counts,
-        "skipped_s": skipped_s,
-        "stretches": stretches,
-    }
+    return FuseFacts(
+        rows=rows,
+        sensors=tuple(sorted({role for stretch in stretches for role in stretch.sensors})),
+        measurements={role: sum(stretch.measurements.get(role, 0) for stretch in stretches) for role in roles},
+        rejected={role: sum(stretch.rejected.get(role, 0) for stretch in stretches) for role in roles},
+        nis_mean=nis,
+        set_aside=inputs.counts,
+        skipped_s=skipped_s,
+        stretches=tuple(stretches),
+    )
 
 
-def fuse_warnings(inputs: Inputs, stretches: list[dict[str, Any]], summary: dict[str, Any]) -> tuple[str, ...]:
+def fuse_warnings(inputs: Inputs, facts: FuseFacts) -> tuple[str, ...]:
     """Return what a person should know before trusting the track."""
     counts = {role: count for role, count in inputs.counts.items() if role not in inputs.refused}
     found = [remark for remark in inputs.remarks if remark.split(":")[0] not in inputs.refused]
@@ -70,30 +68,30 @@ def fuse_warnings(inputs: Inputs, stretches: list[dict[str, Any]], summary: dict
         found.append(f"no GNSS position is used: {_LOCAL}")
     elif inputs.datum_deg_m is not None:
         found += [
-            f"clock epoch {stretch['epoch']}: no 5 m of course over ground, so its initial yaw is from {stretch['heading_from']}"
-            for stretch in stretches
-            if stretch["heading_from"] != "course over ground"
+            f"clock epoch {stretch.epoch}: no 5 m of course over ground, so its initial yaw is from {stretch.heading_from}"
+            for stretch in facts.stretches
+            if stretch.heading_from != "course over ground"
         ]
     found += [
-        f"gnss: many fixes lie beyond their claimed deviation; it is taken {stretch['gnss_variance_factor'] ** 0.5:.0f} times as large: "
+        f"gnss: many fixes lie beyond their claimed deviation; it is taken {factor**0.5:.0f} times as large: "
         "check its clock (read.time_offset_s) and its lever arm (read.placement)"
-        for stretch in stretches
-        if stretch.get("gnss_variance_factor", 1.0) > 1.0
+        for stretch in facts.stretches
+        if (factor := stretch.gnss_variance_factor or 1.0) > 1.0
     ]
-    if IMU not in summary["sensors"]:
+    if IMU not in facts.sensors:
         found.append("no IMU is used: attitude is inferred from the path; roll and pitch are weak")
     found += [
-        f"{role}: {summary['rejected'][role]} of {count} measurements were refused by the gate (rejections.parquet)"
-        for role, count in summary["measurements"].items()
-        if summary["rejected"][role] > _MANY_REFUSED * count
+        f"{role}: {facts.rejected[role]} of {count} measurements were refused by the gate (rejections.parquet)"
+        for role, count in facts.measurements.items()
+        if facts.rejected[role] > _MANY_REFUSED * count
     ]
     for key, text in (
         ("variances_replaced", "rows without a usable variance; the recipe's is used"),
         ("invalid", "rows without a usable value"),
     ):
         found += [f"{role}: {count[key]} {text}" for role, count in counts.items() if count[key]]
-    if summary["skipped_s"]:
-        found.append(f"{summary['skipped_s']:.1f} s between pauses or clock steps hold too little to place a track")
+    if facts.skipped_s:
+        found.append(f"{facts.skipped_s:.1f} s between pauses or clock steps hold too little to place a track")
     return tuple(found)
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -14,17 +13,18 @@ from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import Inputs
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.levels import Findings, Sensor, Streams
+from tcpipe.tables.findings import Findings, SensorChecks, StretchFacts
+from tcpipe.tables.levels import Sensor, Streams
 
 _MOST_REFUSED = 0.5
 
 _STATED = ("recipe", "tf_static", "same frame")
 
 
-def sane_inputs(inputs: Inputs, streams: Streams) -> tuple[Inputs, Findings]:
+def sane_inputs(inputs: Inputs, streams: Streams) -> tuple[Inputs, Findings[SensorChecks]]:
     """Return the inputs without the sensors that are refused, and why, judged over the longest clock epoch."""
     if not inputs.measurements:
-        return inputs, Findings()
+        return inputs, Findings((), SensorChecks())
     epoch = longest_epoch(inputs)
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
     checks = check_sensors(
@@ -34,13 +34,14 @@ def sane_inputs(inputs: Inputs, streams: Streams) -> tuple[Inputs, Findings]:
 
 
 def without_lost_gnss(
-    inputs: Inputs, sanity: Findings, stretches: Sequence[Mapping[str, Any]], streams: Streams
-) -> tuple[Inputs, Findings] | None:
+    inputs: Inputs, sanity: Findings[SensorChecks], stretches: Sequence[StretchFacts], streams: Streams
+) -> tuple[Inputs, Findings[SensorChecks]] | None:
     """Return the inputs without GNSS, and why, where the estimate refused most of its fixes; None where it did not.
 
     A filter that refuses a sensor throughout is led by it all the same, each time that its gate reopens.
     """
-    total, refused = (sum(stretch[name].get(GNSS, 0) for stretch in stretches) for name in ("measurements", "rejected"))
+    total = sum(stretch.measurements.get(GNSS, 0) for stretch in stretches)
+    refused = sum(stretch.rejected.get(GNSS, 0) for stretch in stretches)
     others = any(m.wheels is not None or m.visual is not None for m in inputs.measurements.values())
     if not others or refused <= _MOST_REFUSED * total:
         return None
@@ -49,15 +50,15 @@ def without_lost_gnss(
 
 
 def _left_out(
-    inputs: Inputs, before: Findings, refusals: Sequence[Refusal], streams: Streams
-) -> tuple[Inputs, Findings]:
+    inputs: Inputs, before: Findings[SensorChecks], refusals: Sequence[Refusal], streams: Streams
+) -> tuple[Inputs, Findings[SensorChecks]]:
     refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
-    reasons = {**before.facts.get("refused", {}), **{refusal.role: refusal.why for refusal in refusals}}
+    reasons = {**before.facts.refused, **{refusal.role: refusal.why for refusal in refusals}}
     warnings = (*before.warnings, *(_warning(refusal, streams.sensors[refusal.role]) for refusal in refusals))
     datum = None if GNSS in refused else inputs.datum_deg_m
     inputs = replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused)
-    return inputs, Findings(warnings, {**before.facts, "refused": reasons})
+    return inputs, Findings(warnings, replace(before.facts, refused=reasons))
 
 
 def _without(refused: frozenset[str], m: Measurements) -> Measurements:

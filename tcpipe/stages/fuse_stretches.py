@@ -19,6 +19,7 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_columns import command_columns, pose_columns, power_columns, wheel_column
 from tcpipe.stages.fuse_findings import stretch_facts
 from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.tables.findings import StretchFacts
 from tcpipe.tables.levels import Streams
 
 
@@ -27,7 +28,7 @@ class Fused:
     """Every stretch's trajectory, facts and columns; how long no track could be placed [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
-    facts: list[dict[str, Any]] = field(default_factory=list)
+    facts: list[StretchFacts] = field(default_factory=list)
     columns: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
     skipped_s: float = 0.0
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tcpipe.motion import masks
@@ -10,6 +12,7 @@ from tcpipe.recipe import GateConfig
 from tcpipe.stages.gate_gaps import find_gaps
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import GateFacts
 from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, with_findings
 
 
@@ -37,17 +40,17 @@ def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | No
     if slowest is not None and config.require_full_speed:
         found[DropReason.BELOW_LIMIT] = masks.below_limit(rows, limit_mps=slowest, window_s=config.command_window_s)
     dropped_by = np.bitwise_or.reduce([np.uint32(reason) * mask for reason, mask in found.items()])
-    facts = {
-        "rows": table.num_rows,
-        "rows_kept": int((dropped_by == 0).sum()),
-        "gap_rows": gaps.counts(),
-        "rows_dropped": {name_of(reason): int((dropped_by & reason != 0).sum()) for reason in DropReason},
-        "max_velocity_mps": limit_mps,
-        "full_speed_mps": slowest,
-    }
+    facts = GateFacts(
+        rows=table.num_rows,
+        rows_kept=int((dropped_by == 0).sum()),
+        gap_rows=gaps.counts(),
+        rows_dropped={name_of(reason): int((dropped_by & reason != 0).sum()) for reason in DropReason},
+        max_velocity_mps=limit_mps,
+        full_speed_mps=slowest,
+    )
     gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
     warnings = (*gaps.warnings, *_warnings(rows, dropped_by, limit_mps, config))
-    return GatedTrack(gated, with_findings(track.info, "gate", warnings, facts))
+    return GatedTrack(gated, with_findings(track.info, warnings, replace(track.info.findings.facts, gate=facts)))
 
 
 def _motion(rows: MotionRows, config: GateConfig) -> dict[DropReason, Mask]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
@@ -72,9 +73,9 @@ def label_segments(
             )
         )
     table, physics = with_physics(pa.concat_tables(parts).combine_chunks(), gated.table)
+    ledger_m, velocity = segments.ledger_m, config.velocity
     facts = label_facts(
-        table, rails_by_epoch, joules, segments.ledger_m, variance_j2, rule=rule, velocity=config.velocity
+        table, rails_by_epoch, joules, ledger_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
-    facts["physics"] = physics
-    info = with_findings(segments.info, "label", label_warnings(facts), facts)
+    info = with_findings(segments.info, label_warnings(facts), replace(segments.info.findings.facts, label=facts))
     return LabelledSegments(table, info, segments.ledger_m)

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.budget import EnergyBudget, energy_budget
+from tcpipe.cost.budget import energy_budget
 from tcpipe.power.energy import Rule
 from tcpipe.power.rails import Rail
 from tcpipe.stages.power_rails import rail_facts
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import EnergyBudget, LabelFacts, PhysicsFacts
 
 _MUCH_STANDING = 0.5
 _FEW_WATT = 20.0
@@ -30,8 +30,9 @@ def label_facts(
     *,
     rule: Rule,
     velocity: str,
-) -> dict[str, Any]:
-    """Return the facts of a labelled run for its manifest.
+    physics: PhysicsFacts,
+) -> LabelFacts:
+    """Return the facts of a labelled run.
 
     Parameters
     ----------
@@ -44,23 +45,24 @@ def label_facts(
     powered = any(len(each.stamp_ns) for epoch in rails.values() for each in epoch)
     quality = numbers(table["quality"])
     energy = floats(table, "energy_joule")
-    return {
-        "distance_m": sum(ledger_m.values()),
-        "energy_joule": sum(energy_by_entry_joule.values()) if powered else None,
-        "energy_by_entry_joule": dict(energy_by_entry_joule) if powered else None,
-        "integration": rule,
-        "velocity": velocity,
-        "rails": {str(epoch): [rail_facts(each) for each in rails[epoch]] for epoch in rails if rails[epoch]},
-        "segments": table.num_rows,
-        "segments_without_power": int(np.isnan(energy).sum()),
-        "median_power_watt": _median(floats(table, "power_watt")),
-        "relative_std_median": {
+    return LabelFacts(
+        distance_m=sum(ledger_m.values()),
+        energy_joule=sum(energy_by_entry_joule.values()) if powered else None,
+        energy_by_entry_joule=dict(energy_by_entry_joule) if powered else None,
+        integration=rule,
+        velocity=velocity,
+        rails={str(epoch): tuple(rail_facts(each) for each in rails[epoch]) for epoch in rails if rails[epoch]},
+        segments=table.num_rows,
+        segments_without_power=int(np.isnan(energy).sum()),
+        median_power_watt=_median(floats(table, "power_watt")),
+        relative_std_median={
             name: _median(floats(table, f"{name}_std_{unit}") / floats(table, f"{name}_{unit}"))
             for name, unit in (("duration", "s"), ("velocity", "mps"), ("power", "watt"), ("energy", "joule"))
         },
-        "energy_budget": _budget(energy, energy_variance_j2),
-        "quality": {name_of(bit): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
-    }
+        energy_budget=_budget(energy, energy_variance_j2),
+        quality={name_of(bit): int(((quality & np.uint32(bit)) != 0).sum()) for bit in Quality},
+        physics=physics,
+    )
 
 
 def _budget(
@@ -73,21 +75,19 @@ def _budget(
     )
 
 
-def label_warnings(facts: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what a person should look at; ``facts`` are `label_facts`'s and ``physics`` of `label_physics`."""
+def label_warnings(facts: LabelFacts) -> tuple[str, ...]:
+    """Return what a person should look at."""
     warnings = []
-    if facts["quality"]["low_power_rate"] and facts["segments_without_power"] < facts["segments"]:
-        rates = [
-            rail[s]["rate_hz"] for epoch in facts["rails"].values() for rail in epoch for s in ("voltage", "current")
-        ]
-        rate = min((rate for rate in rates if rate), default=0.0)
+    if facts.quality["low_power_rate"] and facts.segments_without_power < facts.segments:
+        signals = [each for rails in facts.rails.values() for rail in rails for each in (rail.voltage, rail.current)]
+        rate = min((each.rate_hz for each in signals if each.rate_hz), default=0.0)
         warnings.append(
             f"power comes at {rate:.1f} Hz only: see energy_std_joule (instantaneous power wants 10 Hz, averaged 2 Hz)"
         )
-    if facts["energy_joule"] is not None and facts["segments"] and facts["segments_without_power"]:
-        count = f"{facts['segments_without_power']} of {facts['segments']} segments"
+    if facts.energy_joule is not None and facts.segments and facts.segments_without_power:
+        count = f"{facts.segments_without_power} of {facts.segments} segments"
         warnings.append(f"{count} have no label: the power record does not reach over them")
-    standing, driving = facts["physics"].get("standing_watt"), facts["median_power_watt"]
+    standing, driving = facts.physics.standing_watt, facts.median_power_watt
     if standing is not None and driving is not None and standing > max(_MUCH_STANDING * driving, _FEW_WATT):
         warnings.append(
             f"power: {standing:.0f} W are drawn while standing, of {driving:.0f} W while driving: an offset of the current, or more "

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.cost.physics import Physics, fit_physics
+from tcpipe.cost.physics import fit_physics
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import floats
+from tcpipe.tables.findings import PhysicsFacts
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 
 _FEWEST_STANDING = 40
 
 
-def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, dict[str, Any]]:
+def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, PhysicsFacts]:
     """Return the labelled segments with the power that rolling resistance and grade predict, and the fit.
 
     Parameters
@@ -29,13 +28,23 @@ def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, dict[str, A
     standing = _standing_watt(rows)
     found = fit_physics(power_watt=power, velocity_mps=speed, rise=rise, standing_watt=standing or 0.0)
     if found is None:
-        return table, {"fitted": False, "standing_watt": standing}
+        return table, PhysicsFacts(fitted=False, standing_watt=standing)
     predicted = np.where(np.isfinite(power), found.power_watt(velocity_mps=speed, rise=rise), np.nan)
     odd = found.is_outlier(power - predicted)
     quality = numbers(table["quality"]) | np.where(odd, np.uint32(Quality.PHYSICS_OUTLIER), np.uint32(0))
     columns = {"physics_power_watt": predicted, "quality": quality.astype(np.uint32)}
     table = LABELLED_SEGMENTS.table(**{name: columns.get(name, table[name]) for name in table.column_names})
-    return table, {"fitted": True, **_facts(found, standing), "outliers": int(odd.sum())}
+    return table, PhysicsFacts(
+        fitted=True,
+        standing_watt=standing,
+        weight_over_efficiency_newton=found.drive_newton or None,
+        rolling_newton=found.rolling_newton,
+        rolling_resistance=found.rolling_resistance,
+        recovered_downhill=found.recovered,
+        residual_watt=found.residual_watt,
+        segments=found.segments,
+        outliers=int(odd.sum()),
+    )
 
 
 def _standing_watt(rows: pa.Table) -> float | None:
@@ -43,15 +52,3 @@ def _standing_watt(rows: pa.Table) -> float | None:
     standing = (numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
     drawn = power[standing & np.isfinite(power)]
     return float(np.median(drawn)) if drawn.size >= _FEWEST_STANDING else None
-
-
-def _facts(found: Physics, standing: float | None) -> dict[str, Any]:
-    return {
-        "standing_watt": standing,
-        "weight_over_efficiency_newton": found.drive_newton or None,
-        "rolling_newton": found.rolling_newton,
-        "rolling_resistance": found.rolling_resistance,
-        "recovered_downhill": found.recovered,
-        "residual_watt": found.residual_watt,
-        "segments": found.segments,
-    }

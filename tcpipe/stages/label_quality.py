@@ -48,7 +48,8 @@ def motion_flags(
     wheel_mps = mean_between(stamp_ns, floats(rows, "wheel_velocity_mps"), start_ns, end_ns)
     driven_m = np.concatenate(([0.0], np.cumsum(np.hypot(*(np.diff(floats(rows, f"{axis}_m")) for axis in "xy")))))
     start_m, end_m = (interpolate(stamp_ns, driven_m, at_ns) for at_ns in (start_ns, end_ns))
-    commanded_mps, full_speed_mps = floats(cut, "commanded_velocity_mps"), info.findings.facts["gate"]["full_speed_mps"]
+    gate, commanded_mps = info.findings.facts.gate, floats(cut, "commanded_velocity_mps")
+    full_speed_mps = gate.full_speed_mps if gate else None
     return {
         Quality.NEAR_GAP: near(driven_m[_gap_edges(rows, info.rate_hz)], start_m, end_m, within_m=float(chord_m[0])),
         Quality.HIGH_SLIP: slipping(wheel_mps, floats(cut, "fused_velocity_mps")),
@@ -75,6 +76,6 @@ def clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     Commands are left out: they mostly have no stamp of their own, and a label does not depend on theirs.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
-    offsets = info.findings.facts.get("clock_offsets", {}).get("offsets", {})
-    off = any(offset["noted"] or offset["drifts"] for offset in offsets.values())
-    return recorder or off or streams.findings.facts.get("epochs", 1) > 1
+    clocks = info.findings.facts.clock_offsets
+    off = clocks is not None and any(offset.noted or offset.drifts for offset in clocks.offsets.values())
+    return recorder or off or streams.findings.facts.epochs > 1

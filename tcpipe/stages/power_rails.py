@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -13,9 +11,10 @@ from tcpipe.motion.ledger import by_reason, interval_reason
 from tcpipe.motion.pieces import piece_of_rows
 from tcpipe.power.energy import Rule, recorded_energy_joule
 from tcpipe.power.noise import median_period_s, resolution
-from tcpipe.power.rails import Rail, rail, samples
+from tcpipe.power.rails import Rail, Samples, rail, samples
 from tcpipe.tables.arrays import numbers, rows_where
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import RailFacts, SignalFacts
 from tcpipe.tables.levels import Streams
 
 
@@ -36,17 +35,14 @@ def rails_of(streams: Streams, epoch: int) -> list[Rail]:
     return rails
 
 
-def rail_facts(each: Rail) -> dict[str, Any]:
+def rail_facts(each: Rail) -> RailFacts:
     """Return counts, rates and resolutions of a rail's samples."""
-    facts: dict[str, Any] = {"name": each.name}
-    for name, signal in (("voltage", each.voltage), ("current", each.current)):
-        period_s = median_period_s(signal)
-        facts[name] = {
-            "samples": len(signal.value),
-            "rate_hz": 1.0 / period_s if np.isfinite(period_s) else None,
-            "resolution": resolution(signal),
-        }
-    return facts
+    return RailFacts(each.name, *(_signal_facts(signal) for signal in (each.voltage, each.current)))
+
+
+def _signal_facts(signal: Samples) -> SignalFacts:
+    period_s = median_period_s(signal)
+    return SignalFacts(len(signal.value), 1.0 / period_s if np.isfinite(period_s) else None, resolution(signal))
 
 
 def energy_entries(rows: pa.Table, rails: list[Rail], *, rate_hz: float, rule: Rule) -> dict[str, float]:

@@ -55,9 +55,9 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None) -> Stream
         role: _table(role, sources, timelines, power) for role in dict.fromkeys(source.role for source in sources)
     }
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
-    findings = read_findings(assignment, every, timelines, steps, power=power, sensors=sensors)
+    offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
+    findings = read_findings(assignment, every, timelines, steps, power=power, sensors=sensors, offset_s=offset_s)
     findings = replace(findings, warnings=(*findings.warnings, *unread, *unplaced))
-    findings = replace(findings, facts={**findings.facts, "time_offset_s": dict(config.time_offset_s)})
     if not any(role in streams for role in MOTION_ROLES):
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry and gnss have no usable row"
         raise RoleError(what, *findings.warnings)

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict
-from typing import Any
 
 import numpy as np
 
-from tcpipe.logs.clocks import Step, Timeline, about_simulated_time
+from tcpipe.logs.clocks import Timeline, about_simulated_time
 from tcpipe.logs.power_readings import PowerReadings
 from tcpipe.logs.roles import Assignment
 from tcpipe.stages.read_sources import Source
-from tcpipe.tables.levels import Findings, Sensor
+from tcpipe.tables.findings import (
+    ClockStep,
+    Findings,
+    PowerSign,
+    RobotChoice,
+    RoleFacts,
+    RunFacts,
+    TopicClock,
+    TopicFacts,
+)
+from tcpipe.tables.levels import Sensor
 
 _MANY_DROPPED = 0.01
 
@@ -21,12 +29,13 @@ def read_findings(
     assignment: Assignment,
     sources: Sequence[Source],
     timelines: Mapping[str, Timeline],
-    steps: Sequence[Step],
+    steps: Sequence[ClockStep],
     *,
     power: PowerReadings,
     sensors: Mapping[str, Sensor],
-) -> Findings:
-    """Return the warnings and facts of a read log."""
+    offset_s: Mapping[str, float],
+) -> Findings[RunFacts]:
+    """Return the warnings and facts of a read log; ``offset_s`` [s] is what the recipe adds to a role's stamps."""
     warnings = [*assignment.warnings, *power.warnings]
     for source in sources:
         warnings += _warnings(source, timelines.get(source.topic))
@@ -35,15 +44,15 @@ def read_findings(
         "a new epoch begins there, and nothing is integrated across it"
         for step in steps
     ]
-    facts: dict[str, Any] = {
-        "robot": {"name": assignment.robot.name, "why": assignment.robot_why},
-        "roles": {role: _role_facts(role, assignment, sources, timelines, sensors) for role in sensors},
-        "left_out": dict(assignment.left_out),
-        "epochs": len(steps) + 1,
-        "clock_steps": [asdict(step) | {"topics": list(step.topics)} for step in steps],
-    }
-    if power.facts:
-        facts["power"] = {**power.facts, "averaged": power.averaged}
+    facts = RunFacts(
+        robot=RobotChoice(assignment.robot.name, assignment.robot_why),
+        roles={role: _role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
+        left_out=assignment.left_out,
+        epochs=len(steps) + 1,
+        clock_steps=tuple(steps),
+        time_offset_s=offset_s,
+        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged),
+    )
     return Findings(tuple(dict.fromkeys(warnings)), facts)
 
 
@@ -80,35 +89,23 @@ def _role_facts(
     assignment: Assignment,
     sources: Sequence[Source],
     timelines: Mapping[str, Timeline],
-    sensors: Mapping[str, Sensor],
-) -> dict[str, Any]:
-    return {
-        "why": assignment.roles[role].why,
-        "frame": sensors[role].frame_id,
-        "placed_by": sensors[role].placed_by,
-        "topics": {
-            source.topic: _topic_facts(source, timelines[source.topic])
-            for source in sources
-            if source.role == role and source.topic in timelines
-        },
-    }
+    sensor: Sensor,
+) -> RoleFacts:
+    played = [source for source in sources if source.role == role and source.topic in timelines]
+    topics = {source.topic: _topic_facts(source, timelines[source.topic]) for source in played}
+    return RoleFacts(assignment.roles[role].why, sensor.frame_id, sensor.placed_by, topics)
 
 
-def _topic_facts(source: Source, timeline: Timeline) -> dict[str, Any]:
-    return {
-        "type": source.type_name,
-        "messages": len(source.columns["log_time_ns"]),
-        "rows": len(timeline.row),
-        "rate_hz": _rate_hz(timeline),
-        "dropped": source.readings.dropped | timeline.dropped,
-        "notes": {name: count for name, count in source.readings.notes.items() if count} | timeline.notes,
-        "time": {
-            "source": timeline.source,
-            "why": timeline.why,
-            "offset_s": timeline.offset_s,
-            "moved_s": list(timeline.moved_s),
-        },
-    }
+def _topic_facts(source: Source, timeline: Timeline) -> TopicFacts:
+    return TopicFacts(
+        type=source.type_name,
+        messages=len(source.columns["log_time_ns"]),
+        rows=len(timeline.row),
+        rate_hz=_rate_hz(timeline),
+        dropped=source.readings.dropped | timeline.dropped,
+        notes={name: count for name, count in source.readings.notes.items() if count} | timeline.notes,
+        time=TopicClock(timeline.source, timeline.why, timeline.offset_s, timeline.moved_s),
+    )
 
 
 def _rate_hz(timeline: Timeline) -> float | None:

@@ -13,7 +13,7 @@ from pyproj import CRS
 from tcpipe.recipe import SampleConfig
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
-from tcpipe.tables.levels import PLACED_SEGMENTS, Findings
+from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.sampling import Patches, sample_patches
@@ -39,7 +39,7 @@ class Sampled:
     footprint_lonlat_deg: NDArray[np.float64]
     lost_by: NDArray[np.uint32]
     ledger_m: Mapping[str, float]
-    findings: Findings
+    warnings: tuple[str, ...]
 
 
 def sample_segments(
@@ -85,7 +85,7 @@ def sample_segments(
         footprint_lonlat_deg=Projection(CRS.from_epsg(4326), crs, projection.area_deg).inverse(corners[kept]),
         lost_by=lost_by,
         ledger_m=ledger_by_loss(floats(segments, "arc_length_m"), lost_by),
-        findings=Findings(_warnings(source, config, projection), _facts(lost_by)),
+        warnings=_warnings(source, config, projection),
     )
 
 
@@ -106,11 +106,6 @@ def ledger_by_loss(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32
     """Return metres driven, kept and by loss."""
     named = {"kept": 0} | {name_of(loss): loss for loss in _LOSSES}
     return {name: float(arc_length_m[lost_by == loss].sum()) for name, loss in named.items()}
-
-
-def _facts(lost_by: NDArray[np.uint32]) -> dict[str, object]:
-    counts = {name_of(loss): int((lost_by == loss).sum()) for loss in _LOSSES}
-    return {"segments": lost_by.size, "samples": int((lost_by == 0).sum()), "lost": counts}
 
 
 def _warnings(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[str, ...]:

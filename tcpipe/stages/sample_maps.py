@@ -69,7 +69,7 @@ def sample_on_maps(
         rows.append(waiting[found.kept])
         sampled.append(found)
         waiting = waiting[np.isin(found.lost_by, _ELSEWHERE)]
-    warnings = dict.fromkeys(warning for found in sampled for warning in found.findings.warnings)
+    warnings = dict.fromkeys(warning for found in sampled for warning in found.warnings)
     ledger_m = ledger_by_loss(floats(segments, "arc_length_m"), lost_by)
     return SampledOnMaps(tuple(rows), tuple(sampled), lost_by, ledger_m, tuple(warnings))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,7 @@ from tcpipe.recipe import SegmentConfig
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason, Loss, name_of
 from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.findings import SegmentFacts
 from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, with_findings
 
 ENTRIES = ("kept", *(name_of(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
@@ -49,14 +51,9 @@ def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
         if len(cut.start_ns):
             tables.append(_segments(table.slice(first, last + 1 - first), path, cut, info))
     segments = pa.concat_tables(tables).combine_chunks()
-    facts = {
-        "segments": segments.num_rows,
-        "stretches": len(spans),
-        "odometer_m": sum(metres.values()),
-        "ledger_s": seconds,
-    }
+    facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), ledger_s=seconds)
     warnings = () if segments.num_rows else (_why_none(metres),)
-    return Segments(segments, with_findings(info, "segment", warnings, facts), metres)
+    return Segments(segments, with_findings(info, warnings, replace(info.findings.facts, segment=facts)), metres)
 
 
 def _segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.Table:

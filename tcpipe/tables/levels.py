@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import pyarrow as pa
@@ -28,6 +28,7 @@ import pyarrow as pa
 from tcpipe.errors import TableError
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
+from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
 
 DATA_MODEL_VERSION = "1.0"
 """Version of every table and manifest below; its history stands in docs/reference/data-model.md."""
@@ -398,14 +399,6 @@ REJECTIONS = TableSchema(
 
 
 @dataclass(frozen=True, slots=True)
-class Findings:
-    """What a stage noticed: warnings for people, and counts and facts (JSON values) for the manifest."""
-
-    warnings: tuple[str, ...] = ()
-    facts: Mapping[str, Any] = field(default_factory=dict)
-
-
-@dataclass(frozen=True, slots=True)
 class Sensor:
     """Where a stream came from and where its sensor sits.
 
@@ -434,7 +427,7 @@ class Streams:
     gnss_crs: str = "EPSG:4326"
     power_averaged: bool = False
     """The source averages power over its message period (right-endpoint rectangle) rather than sampling it."""
-    findings: Findings = field(default_factory=Findings)
+    findings: Findings[RunFacts] = NOTHING_FOUND
 
     def __post_init__(self) -> None:
         """Check every table against its role's schema."""
@@ -468,7 +461,7 @@ class TrackInfo:
     datum: Datum | None
     rate_hz: float
     estimator: str
-    findings: Findings = field(default_factory=Findings)
+    findings: Findings[RunFacts] = NOTHING_FOUND
 
 
 @dataclass(frozen=True, slots=True)
@@ -523,10 +516,9 @@ class LabelledSegments:
         LABELLED_SEGMENTS.check(self.table)
 
 
-def with_findings(info: TrackInfo, stage: str, warnings: tuple[str, ...], facts: Mapping[str, Any]) -> TrackInfo:
-    """Return ``info`` with one more stage's warnings and facts (under the stage's name)."""
-    found = Findings(info.findings.warnings + warnings, {**info.findings.facts, stage: dict(facts)})
-    return replace(info, findings=found)
+def with_findings(info: TrackInfo, warnings: tuple[str, ...], facts: RunFacts) -> TrackInfo:
+    """Return ``info`` with one more stage's warnings, and the facts with that stage's."""
+    return replace(info, findings=Findings(info.findings.warnings + warnings, facts))
 
 
 def with_metadata(table: pa.Table, metadata: Mapping[str, Any]) -> pa.Table:
@@ -539,21 +531,3 @@ def metadata_of(table: pa.Table) -> dict[str, Any]:
     """Return what `with_metadata` stored, or an empty dict."""
     found: dict[str, Any] = json.loads((table.schema.metadata or {}).get(_METADATA_KEY, b"{}"))
     return found
-
-
-def info_to_json(info: TrackInfo) -> dict[str, Any]:
-    """Return a track's info as JSON values."""
-    return asdict(info)
-
-
-def info_from_json(values: Mapping[str, Any]) -> TrackInfo:
-    """Return the info that `info_to_json` wrote."""
-    datum, findings = values["datum"], values["findings"]
-    return TrackInfo(
-        run_id=values["run_id"],
-        robot=values["robot"],
-        datum=None if datum is None else Datum(**datum),
-        rate_hz=values["rate_hz"],
-        estimator=values["estimator"],
-        findings=Findings(tuple(findings["warnings"]), findings["facts"]),
-    )

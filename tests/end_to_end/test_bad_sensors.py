@@ -88,11 +88,11 @@ def assert_labels_hold(labelled: LabelledSegments, truth: Truth, *, at_least: in
 
 
 def fused(labelled: LabelledSegments) -> set[str]:
-    return set(labelled.info.findings.facts["fuse"]["sensors"])
+    return set(labelled.info.findings.facts.fuse.sensors)
 
 
 def refused(labelled: LabelledSegments) -> set[str]:
-    return set(labelled.info.findings.facts["sensor_checks"]["refused"])
+    return set(labelled.info.findings.facts.sensor_checks.refused)
 
 
 def cure(labelled: LabelledSegments, role: str) -> ReadConfig:
@@ -379,4 +379,4 @@ def test_a_log_that_never_moves_has_no_segments_and_says_why(tmp_path, without):
     labelled = run(make((Pause(40.0),)).without(*without), tmp_path)
     assert labelled.table.num_rows == 0
     assert any(warning.startswith("no segments: ") for warning in labelled.info.findings.warnings)
-    assert labelled.info.findings.facts["segment"]["odometer_m"] < 2.0
+    assert labelled.info.findings.facts.segment.odometer_m < 2.0

@@ -29,7 +29,7 @@ def test_warthog_on_grass_follows_fixes_that_come_late():
     energy_joule = np.trapezoid(floats(table, "power_watt"), integers(table, "stamp_ns") * 1e-9)
     assert energy_joule == pytest.approx(69_365.3, rel=0.005)
     assert any("jittered" in warning for warning in track.info.findings.warnings)
-    assert track.info.findings.facts["fuse"]["rejected"]["gnss"] < 0.1 * streams.tables["gnss"].num_rows
+    assert track.info.findings.facts.fuse.rejected["gnss"] < 0.1 * streams.tables["gnss"].num_rows
     # It ends where it was fixed last, having stood there.
     assert floats(table, "forward_velocity_mps")[-20:] == pytest.approx(np.zeros(20), abs=0.02)
 
@@ -50,7 +50,7 @@ def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
     assert np.abs(floats(table, "pitch_rad")).max() < 0.15
     moving = floats(table, "wheel_velocity_mps") > 0.5
     assert np.median(floats(table, "forward_velocity_mps")[moving]) == pytest.approx(0.98, abs=0.1)
-    assert track.info.findings.facts["fuse"]["stretches"][0]["heading_from"] == "course over ground"
+    assert track.info.findings.facts.fuse.stretches[0].heading_from == "course over ground"
 
 
 @pytest.mark.parametrize("name", ["robot_localization/test2.bag", "robot_localization/test1_2014.bag"])

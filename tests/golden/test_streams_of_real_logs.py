@@ -26,8 +26,8 @@ def test_the_energy_of_a_real_warthog(robot: str | None) -> None:
     reference = json.loads((path.parent / "reference.json").read_text())
     found = read(path, robot)
     assert found.robot == (robot or "generic")
-    assert found.findings.facts["left_out"].keys() == {"/icp_odom"}
-    assert found.findings.facts["power"]["current_sign"] == "drawn_positive (mean)"
+    assert found.findings.facts.left_out.keys() == {"/icp_odom"}
+    assert found.findings.facts.power.current_sign == "drawn_positive (mean)"
     power = found.tables["power"]
     stamps = power["stamp_ns"].to_numpy()
     watt = power["voltage_volt"].to_numpy() * power["current_amp"].to_numpy()
@@ -83,7 +83,7 @@ def test_a_jackal_in_simulated_time() -> None:
     stamps = found.tables["imu"]["stamp_ns"].to_numpy()
     assert 47e9 < stamps[0] < 48e9
     assert found.sensors["wheel_odometry"].time_source == "header"
-    assert found.findings.facts["epochs"] == 1
+    assert found.findings.facts.epochs == 1
 
 
 def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
@@ -94,12 +94,12 @@ def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
         "wheel_odometry": "/wheel_odometry",
         "visual_odometry": "/stereo_odometer/odometry",
     }
-    assert found.findings.facts["epochs"] == 1
+    assert found.findings.facts.epochs == 1
     worse = read(path, topics={"imu": ["/my_odometry2imu/imu_data"]})
-    facts = worse.findings.facts["roles"]["imu"]["topics"]["/my_odometry2imu/imu_data"]
-    assert facts["messages"] == 13333
-    assert sum(facts["dropped"].values()) == 347
-    assert facts["notes"]["sorted"] >= 31
+    facts = worse.findings.facts.roles["imu"].topics["/my_odometry2imu/imu_data"]
+    assert facts.messages == 13333
+    assert sum(facts.dropped.values()) == 347
+    assert facts.notes["sorted"] >= 31
     assert np.all(np.diff(worse.tables["imu"]["stamp_ns"].to_numpy()) > 0)
 
 

@@ -8,8 +8,7 @@ the camera, the course of the fixes. Mountings that somebody stated weigh more t
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +29,7 @@ from tcpipe.fusion.checks.plausibility import (
 from tcpipe.fusion.checks.windows import liveliest_ns
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import hold_last
+from tcpipe.tables.findings import AxisFacts, SensorChecks, vector
 
 _SMOOTH_S = 0.1
 _IN_G = (0.8, 1.25)
@@ -66,7 +66,12 @@ class Checks:
     """What was found: refusals in order, and the figures they rest on."""
 
     refusals: list[Refusal] = field(default_factory=list)
-    facts: dict[str, Any] = field(default_factory=dict)
+    facts: SensorChecks = field(default_factory=SensorChecks)
+
+    @property
+    def yaw_axis(self) -> Mapping[str, AxisFacts]:
+        """About which axis of the IMU the others turn."""
+        return self.facts.yaw_axis or {}
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,11 +131,9 @@ def _with_command(twists: Mapping[str, Floats], command: Command | None, at_ns: 
 
 def _check_distances(checks: Checks, found: Distances) -> None:
     """Check that all sensors go about as far."""
-    axes = checks.facts.get("yaw_axis", {})
-    turning = frozenset(role for role, axis in axes.items() if role != GNSS)
-    checks.facts["distance_m"] = {
-        role: float(np.nanmedian(chord)) for role, chord in found.chord_m.items() if np.isfinite(chord).any()
-    }
+    turning = frozenset(role for role in checks.yaw_axis if role != GNSS)
+    far_m = {role: float(np.nanmedian(chord)) for role, chord in found.chord_m.items() if np.isfinite(chord).any()}
+    checks.facts = replace(checks.facts, distance_m=far_m)
     refused = {refusal.role for refusal in checks.refusals}
     why = contradictions(found, turning=turning)
     checks.refusals += [Refusal(role, text) for role, text in why.items() if role not in refused]
@@ -140,7 +143,7 @@ def _turning_as_felt(
     checks: Checks, twists: Mapping[str, Floats], imu: InertialMeasurements | None, at_ns: NDArray[np.int64]
 ) -> dict[str, Floats]:
     """Return the twists with the yaw rate of the gyroscope where it confirms theirs: wheels that skid turn by too much."""
-    confirmed = {role for role, axis in checks.facts.get("yaw_axis", {}).items() if axis["axis"][2] > -_OTHER_WAY}
+    confirmed = {role for role, axis in checks.yaw_axis.items() if axis.axis[2] > -_OTHER_WAY}
     if imu is None or any(refusal.role == IMU for refusal in checks.refusals):
         return dict(twists)
     felt = on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns)[:, 2]
@@ -159,7 +162,7 @@ def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], a
     against = [role for role, how in told.items() if how in {"mirrored", "unlike"}]
     if GNSS in refused or not against or "alike" in told.values():
         return
-    confirmed = len(against) > 1 or against[0] in checks.facts.get("yaw_axis", {})
+    confirmed = len(against) > 1 or against[0] in checks.yaw_axis
     doubt = "" if confirmed else ", and nothing tells which of the two is right"
     by = " and ".join(against)
     if "unlike" in told.values():
@@ -188,8 +191,8 @@ def _check_imu(
     rate = averaged(on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _SMOOTH_S)
     axes = {role: found for role, yaw in turning.items() if (found := yaw_axis(yaw, rate)) is not None}
     up = up_axis(imu.specific_force_mps2)
-    checks.facts |= {"specific_force_median": felt, "up": up.tolist()}
-    checks.facts["yaw_axis"] = {role: {"axis": a.axis.tolist(), "scale": a.scale} for role, a in axes.items()}
+    told = {role: AxisFacts(vector(axis.axis), axis.scale) for role, axis in axes.items()}
+    checks.facts = replace(checks.facts, specific_force_median=felt, up=vector(up), yaw_axis=told)
     units = _units(rate, axes, felt)
     if units is not None:
         checks.refusals.append(Refusal(IMU, _units_text(units, axes, rate, felt), units=units))
@@ -198,12 +201,11 @@ def _check_imu(
         return {}
     level = levelling(up)
     force = on_grid(imu.stamp_ns, imu.specific_force_mps2 @ level.T, at_ns)
-    looks = {}
-    for role, twist in twists.items():
-        late_s = axes[role].late_s if role in axes else 0.0
-        if (ahead := forward_yaw_rad(twist, force, late_s)) is not None:
-            looks[role] = ahead[0]
-            checks.facts.setdefault("looks_rad", {})[role] = list(ahead)
+    late_s = {role: axis.late_s for role, axis in axes.items()}
+    ahead = {role: forward_yaw_rad(twist, force, late_s.get(role, 0.0)) for role, twist in twists.items()}
+    looks_rad = {role: yaw for role, yaw in ahead.items() if yaw is not None}
+    checks.facts = replace(checks.facts, looks_rad=looks_rad or None)
+    looks = {role: yaw for role, (yaw, _) in looks_rad.items()}
     if up[2] < np.cos(_TILTED_RAD):
         tilt_deg = float(np.degrees(np.arccos(up[2])))
         why = f"gravity lies {tilt_deg:.0f}° off the robot's z axis"

@@ -11,7 +11,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from tcpipe.cost.budget import EnergyBudget, in_words
+from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
@@ -59,6 +59,7 @@ from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.holdouts import Holdout
 from tcpipe.splits.regions import Regions
 from tcpipe.store import open_store
+from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 

@@ -72,20 +72,20 @@ def test_the_error_of_a_displacement_is_as_large_as_it_says(faults):
 
 def test_facts_name_what_the_sensors_were():
     facts = smoothed().facts
-    assert facts["gyro_bias_radps"] == pytest.approx([0.006, -0.004, 0.008], abs=1e-3)
-    assert facts["visual_scale"] == pytest.approx(1.02, abs=0.01)
-    assert set(facts["nis_mean"]) == {GNSS, WHEELS, VISUAL}
-    assert all(0.7 < facts["nis_mean"][role] < 1.3 for role in (GNSS, VISUAL))
-    assert 0.05 < facts["nis_mean"][WHEELS] < 1.0  # beyond noise they claim nothing here; slip is a state
-    assert facts["covariance_repairs"] == 0
+    assert facts.gyro_bias_radps == pytest.approx([0.006, -0.004, 0.008], abs=1e-3)
+    assert facts.visual_scale == pytest.approx(1.02, abs=0.01)
+    assert set(facts.nis_mean) == {GNSS, WHEELS, VISUAL}
+    assert all(0.7 < facts.nis_mean[role] < 1.3 for role in (GNSS, VISUAL))
+    assert 0.05 < facts.nis_mean[WHEELS] < 1.0  # beyond noise they claim nothing here; slip is a state
+    assert facts.covariance_repairs == 0
 
 
 def test_outliers_are_refused_and_listed():
     found = smoothed()
     role = found.rejections.role
-    assert found.facts["rejected"] == {r: int((role == r).sum()) for r in (GNSS, WHEELS, VISUAL)}
+    assert found.facts.rejected == {r: int((role == r).sum()) for r in (GNSS, WHEELS, VISUAL)}
     # 2 % of the fixes were thrown 1.5 m away in each axis; a few of them land near enough to pass.
-    assert 15 <= found.facts["rejected"][GNSS] <= 50
+    assert 15 <= found.facts.rejected[GNSS] <= 50
     assert (np.diff(found.rejections.stamp_ns) >= 0).all()
     assert (found.rejections.normalized_innovation_squared > found.rejections.threshold).all()
     assert found.rejections.threshold[role == GNSS] == pytest.approx(16.266, abs=1e-3)
@@ -127,12 +127,12 @@ def test_an_outage_of_a_minute_shows_in_the_deviations():
 def test_a_multipath_jump_of_ten_seconds_leaves_no_trace():
     jumped = smoothed(gnss_jump=(70.0, 80.0, (3.0, -2.0, 1.0)))
     assert drive.errors(truth(), jumped)["max_xy"] <= 0.05
-    assert jumped.facts["reopened"][GNSS] == 0
+    assert jumped.facts.reopened[GNSS] == 0
 
 
 def test_a_jump_that_stays_is_followed_in_the_end():
     jumped = smoothed(gnss_jump=(70.0, 1e9, (3.0, 0.0, 0.0)))
-    assert jumped.facts["reopened"][GNSS] == 1
+    assert jumped.facts.reopened[GNSS] == 1
     t = (jumped.stamp_ns - drive.ZERO_NS) * 1e-9
     late = t > 100
     shift = jumped.position_enu_m[late] - truth().at(truth().position, t[late])
@@ -182,12 +182,12 @@ def test_a_receiver_whose_clock_is_off_is_trusted_less_rather_than_refused():
     late = drive.measure(truth(), 1)
     shifted = replace(late.gnss, stamp_ns=late.gnss.stamp_ns + 250_000_000)
     found = fuse(replace(late, gnss=shifted))
-    assert found.facts["gnss_variance_factor"] > 1
-    assert found.facts["rejected"][GNSS] < 0.1 * found.facts["measurements"][GNSS]
+    assert found.facts.gnss_variance_factor > 1
+    assert found.facts.rejected[GNSS] < 0.1 * found.facts.measurements[GNSS]
     error = drive.errors(truth(), found, after_s=5.0)
     assert 0.1 < error["xy"] < 0.3  # a quarter of a second of way, but no more
     assert error["forward"] < 0.03
-    assert smoothed().facts["gnss_variance_factor"] == 1
+    assert smoothed().facts.gnss_variance_factor == 1
 
 
 def test_two_fixes_close_together_say_nothing_of_how_long_a_metre_is():
@@ -213,5 +213,5 @@ def test_an_error_of_a_metre_that_lasts_leaves_the_scale_open():
     found = fuse(replace(all_of_it, gnss=fixes))
     true = drive.errors(truth(), found)["forward"]
     moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
-    assert found.facts["gnss_lasting_error_m"] > 1.0
+    assert found.facts.gnss_lasting_error_m > 1.0
     assert np.median(found.forward_velocity_std_mps[moving]) > true

@@ -70,8 +70,8 @@ def test_a_turn_rate_of_an_odometry_has_a_scale_to_be_found():
     assert process_noise(with_imu)[:, kernel.SCALED].max() == 0.0
     assert process_noise(without)[kernel.FLAT_TURN, kernel.SCALED] == 1.0
     found = fuse(without)
-    assert found.facts["turn_scale"] == pytest.approx(0.75, abs=0.03)  # these wheels say 0.8 of a turn: w (1 + 0.25)
-    assert found.facts["gyro_bias_radps"] is None
+    assert found.facts.turn_scale == pytest.approx(0.75, abs=0.03)  # these wheels say 0.8 of a turn: w (1 + 0.25)
+    assert found.facts.gyro_bias_radps is None
     assert drive.errors(truth(), found)["yaw_deg"] < 1.5
 
 
@@ -99,10 +99,10 @@ def test_an_error_of_the_fixes_that_lasts_does_not_average_out(std_m, holds):
     variance = np.full(error.shape, std_m**2)
     fixes = replace(m.gnss, position_enu_m=m.gnss.position_enu_m + error, variance_m2=variance)
     found = fuse(replace(m, gnss=fixes))
-    assert holds[0] < found.facts["gnss_lasting_error_m"] < holds[1]
+    assert holds[0] < found.facts.gnss_lasting_error_m < holds[1]
     figures = drive.errors(truth(), found)
     assert 0.05 < figures["nees_position"] < 3.0
     assert figures["forward"] < 0.015
     assert figures["nees_forward"] < 3.0
     white = fuse(measured())
-    assert white.facts["gnss_lasting_error_m"] == 0.0
+    assert white.facts.gnss_lasting_error_m == 0.0

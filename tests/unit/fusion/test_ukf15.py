@@ -69,7 +69,7 @@ def test_goes_on_without_a_sensor(truth, absent, within_m):
     errors, scaled = _errors(truth, trajectory)
     assert _rms(np.hypot(errors[:, 0], errors[:, 1])) < within_m
     assert (_rms(scaled) < 1.7).all()
-    assert trajectory.facts["covariance_repairs"] == 0
+    assert trajectory.facts.covariance_repairs == 0
 
 
 def test_error_shrinks_with_the_gnss_noise(truth):
@@ -90,7 +90,7 @@ def test_a_jump_of_the_gnss_is_refused_and_listed(truth):
     assert (rejections.reason == "gate").all()
     assert (rejections.normalized_innovation_squared > rejections.threshold).all()
     assert rejections.threshold[rejections.role == GNSS] == pytest.approx(16.27, abs=0.01)
-    assert trajectory.facts["rejected"][GNSS] == refused.size
+    assert trajectory.facts.rejected[GNSS] == refused.size
     assert _rms(_errors(truth, trajectory)[0])[0] < 0.03
 
 
@@ -102,7 +102,7 @@ def test_a_lasting_shift_of_the_gnss_does_not_lock_it_out(truth):
     trajectory = _run(truth, replace(measurements, gnss=shifted))
     east = trajectory.position_enu_m[:, 0] - truth.position[truth.at(trajectory.stamp_ns), 0]
     after = trajectory.stamp_ns > truth.stamp_ns[6000] + 8_000_000_000
-    assert trajectory.facts["recovered"][GNSS] >= 1
+    assert trajectory.facts.recovered[GNSS] >= 1
     assert east[after] == pytest.approx(5.0, abs=0.1)
 
 
@@ -139,14 +139,14 @@ def test_both_engines_agree_on_a_drive():
     np.testing.assert_allclose(ours.position_enu_m, theirs.position_enu_m, rtol=0, atol=1e-9)
     np.testing.assert_allclose(ours.quat_xyzw, theirs.quat_xyzw, rtol=0, atol=1e-9)
     np.testing.assert_allclose(ours.yaw_std_rad, theirs.yaw_std_rad, rtol=0, atol=1e-9)
-    assert ours.facts["nis_mean"] == pytest.approx(theirs.facts["nis_mean"])
+    assert ours.facts.nis_mean == pytest.approx(theirs.facts.nis_mean)
 
 
 def test_the_facts_count_what_was_fused(truth):
     facts = _run(truth, measured(truth, 10)).facts
-    assert set(facts["measurements"]) == {GNSS, IMU, WHEELS, VISUAL}
-    assert 0.7 < facts["nis_mean"][GNSS] < 1.2
-    assert facts["recovered"] == dict.fromkeys((GNSS, IMU, WHEELS, VISUAL), 0)
+    assert set(facts.measurements) == {GNSS, IMU, WHEELS, VISUAL}
+    assert 0.7 < facts.nis_mean[GNSS] < 1.2
+    assert facts.recovered == dict.fromkeys((GNSS, IMU, WHEELS, VISUAL), 0)
 
 
 def test_entries_that_a_camera_does_not_give_are_left_out(truth):
@@ -172,4 +172,4 @@ def test_blocks_change_nothing(truth, monkeypatch):
     np.testing.assert_array_equal(whole.position_enu_m, blocks.position_enu_m)
     np.testing.assert_array_equal(whole.rejections.stamp_ns, blocks.rejections.stamp_ns)
     assert whole.facts == blocks.facts
-    assert whole.facts["recovered"][GNSS] >= 1
+    assert whole.facts.recovered[GNSS] >= 1

@@ -33,15 +33,15 @@ def doctor(log, config=None):
 def test_clean_drives_give_no_warning(tmp_path, index, seed):
     found = doctor(drive_log(tmp_path, index, seed))
     assert found.warnings == ()
-    assert {"imu", "wheel_odometry", "visual_odometry"} <= {found.facts["reference"], *found.facts["offsets"]}
+    assert {"imu", "wheel_odometry", "visual_odometry"} <= {found.facts.reference, *found.facts.offsets}
 
 
 @pytest.mark.parametrize(("role", "index"), [(role, k % 2) for k, role in enumerate(LATE_S)])
 def test_the_sensor_that_is_late_is_found_and_by_how_much(tmp_path, role, index):
     found = doctor(drive_log(tmp_path, index, 41, role))
-    noted = {name: offset for name, offset in found.facts["offsets"].items() if offset["noted"]}
+    noted = {name: offset for name, offset in found.facts.offsets.items() if offset.noted}
     assert set(noted) == {role}
-    assert noted[role]["offset_s"] == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
+    assert noted[role].offset_s == pytest.approx(LATE_S[role], abs=WITHIN_S[role])
     (warning,) = found.warnings
     assert warning.startswith(f"{role}: ")
     assert "[read.time_offset_s]" in warning
@@ -53,11 +53,11 @@ def test_the_recipe_line_corrects_it(tmp_path):
     assert {warning.split(":")[0] for warning in before.warnings} == {"gnss", "power"}
     lines: dict[str, float] = {}
     for role in ("gnss", "power"):
-        lines |= tomllib.loads(before.facts["offsets"][role]["recipe"])["read"]["time_offset_s"]
+        lines |= tomllib.loads(before.facts.offsets[role].recipe)["read"]["time_offset_s"]
     after = doctor(log, ReadConfig(time_offset_s=lines))
     assert after.warnings == ()
     # What is said of a corrected log holds for the log as it is: the offset in the recipe is counted in.
-    again = tomllib.loads(after.facts["offsets"]["gnss"]["recipe"])["read"]["time_offset_s"]["gnss"]
+    again = tomllib.loads(after.facts.offsets["gnss"].recipe)["read"]["time_offset_s"]["gnss"]
     assert again == pytest.approx(lines["gnss"], abs=0.011)
 
 
@@ -68,6 +68,6 @@ def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
     sensors = replace(drive.sensors, gnss=replace(drive.sensors.gnss, std_m=1.0, rate_hz=1.0))
     faults = replace(drive.faults, gnss_noise=True, wheel_noise=True, imu_noise=True)
     found = doctor(log_of(tiny, replace(drive, sensors=sensors, faults=faults), tmp_path))
-    assert "gnss" not in found.facts["offsets"]
+    assert "gnss" not in found.facts.offsets
     assert found.warnings == ()
-    assert not any(pair["determined"] for pair in found.facts["pairs"] if pair["late"] == "gnss")
+    assert not any(pair.determined for pair in found.facts.pairs if pair.late == "gnss")

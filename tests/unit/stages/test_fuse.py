@@ -144,11 +144,11 @@ def test_power_command_and_wheels_stand_at_the_tracks_stamps(track, truth):
 
 
 def test_findings_and_rejections(track):
-    facts = track.info.findings.facts["fuse"]
-    assert facts["sensors"] == ["gnss", "imu", "visual_odometry", "wheel_odometry"]
-    assert facts["rows"] == track.table.num_rows
-    assert facts["stretches"][0]["heading_from"] == "course over ground"
-    assert sum(facts["rejected"].values()) == track.rejections.num_rows > 0
+    facts = track.info.findings.facts.fuse
+    assert facts.sensors == ("gnss", "imu", "visual_odometry", "wheel_odometry")
+    assert facts.rows == track.table.num_rows
+    assert facts.stretches[0].heading_from == "course over ground"
+    assert sum(facts.rejected.values()) == track.rejections.num_rows > 0
     assert set(track.rejections["reason"].to_pylist()) == {"gate"}
     assert track.info.estimator == "smoother"
 

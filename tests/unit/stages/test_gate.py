@@ -102,7 +102,7 @@ def test_a_jump_is_a_gap_and_not_driven():
     velocity = np.tile([0.9, 0.0, 0.0], (len(T), 1))
     gated = gate(make_track(position, velocity))
     assert np.flatnonzero(rows_of(gated, DropReason.GAP)).tolist() == [599, 600]
-    assert gated.info.findings.facts["gate"]["gap_rows"] == {"without_power": 0, "uncertain": 0, "jumps": 2}
+    assert gated.info.findings.facts.gate.gap_rows == {"without_power": 0, "uncertain": 0, "jumps": 2}
     assert "jumps 1 times, the furthest by 1000000.0 m" in gated.info.findings.warnings[0]
     segments = segment_track(gated, SegmentConfig())
     assert sum(segments.ledger_m.values()) == pytest.approx(0.9 * T[-1], rel=1e-6)
@@ -120,11 +120,11 @@ def test_relative_not_absolute_position_error_makes_a_gap():
 
 def test_rows_and_reasons_are_counted():
     gated = gate(straight_track(start_and_stop(), commanded_mps=np.where((T >= 5) & (T < 49.1), 1.0, 0.0)))
-    facts = gated.info.findings.facts["gate"]
+    facts = gated.info.findings.facts.gate
     dropped_by = gated.table["dropped_by"].to_numpy()
-    assert facts["rows"] == len(T)
-    assert facts["rows_kept"] == (dropped_by == 0).sum()
-    assert facts["rows_dropped"]["standing"] == rows_of(gated, DropReason.STANDING).sum()
+    assert facts.rows == len(T)
+    assert facts.rows_kept == (dropped_by == 0).sum()
+    assert facts.rows_dropped["standing"] == rows_of(gated, DropReason.STANDING).sum()
 
 
 def test_an_empty_track_and_one_row():

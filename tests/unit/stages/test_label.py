@@ -13,7 +13,8 @@ from tcpipe.stages.label import label_segments
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.levels import Findings, Sensor, Streams
+from tcpipe.tables.findings import Findings, RunFacts
+from tcpipe.tables.levels import Sensor, Streams
 
 T = np.arange(0, 60, 0.05)
 ZERO = stamps(1)[0]
@@ -60,17 +61,17 @@ def test_constant_power_on_a_straight_line():
 def test_whole_run_energy_and_where_it_went():
     speed = np.clip(np.minimum(T - 5, 50 - T), 0, 0.8)
     labelled = label(straight_track(speed), power_streams({"drive": record()}))
-    facts = labelled.info.findings.facts["label"]
+    facts = labelled.info.findings.facts.label
     stamp_ns, _, _ = record()
-    assert facts["energy_joule"] == pytest.approx(144.0 * (stamp_ns[-1] - stamp_ns[0]) * 1e-9)
-    entries = facts["energy_by_entry_joule"]
-    assert sum(entries.values()) == pytest.approx(facts["energy_joule"])
+    assert facts.energy_joule == pytest.approx(144.0 * (stamp_ns[-1] - stamp_ns[0]) * 1e-9)
+    entries = facts.energy_by_entry_joule
+    assert sum(entries.values()) == pytest.approx(facts.energy_joule)
     assert entries["standing"] == pytest.approx(144 * 15, rel=0.02)
-    seconds = labelled.info.findings.facts["segment"]["ledger_s"]
+    seconds = labelled.info.findings.facts.segment.ledger_s
     for name in ("standing", "accelerating"):
         assert entries[name] == pytest.approx(144 * seconds[name], rel=1e-9)
     assert entries["steady"] == pytest.approx(144 * sum(seconds[n] for n in ("kept", "curved", "leftover")), rel=1e-9)
-    assert facts["distance_m"] == pytest.approx(sum(labelled.ledger_m.values()))
+    assert facts.distance_m == pytest.approx(sum(labelled.ledger_m.values()))
 
 
 def test_two_rails_with_voltage_and_current_from_different_topics():
@@ -116,7 +117,7 @@ def test_averaged_sources_are_right_endpoint_rectangles():
     start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
     wanted = 24 * ((6 * end + end**2) - (6 * start + start**2))
     assert floats(labelled.table, "energy_joule") == pytest.approx(wanted, abs=24 * 2 * 0.5**2 / 4 + 1e-6)
-    assert labelled.info.findings.facts["label"]["integration"] == "averaged"
+    assert labelled.info.findings.facts.label.integration == "averaged"
     assert not flagged(labelled, Quality.LOW_POWER_RATE).any()
 
 
@@ -125,7 +126,7 @@ def test_a_run_without_power_has_null_labels():
     table = labelled.table
     assert table["energy_joule"].null_count == table["power_std_watt"].null_count == table.num_rows > 0
     assert floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
-    assert labelled.info.findings.facts["label"]["energy_joule"] is None
+    assert labelled.info.findings.facts.label.energy_joule is None
 
 
 def test_segments_beyond_the_record_have_null_labels_and_a_warning():
@@ -202,7 +203,7 @@ def test_not_at_the_limit_where_slower_than_full_speed_was_kept():
 def test_error_budget_adds_up_to_the_deviations():
     rough = lambda t: 6 + np.random.default_rng(0).normal(0, 1, len(t))  # noqa: E731
     labelled = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(0.2, amp=rough)}))
-    budget = labelled.info.findings.facts["label"]["energy_budget"]
+    budget = labelled.info.findings.facts.label.energy_budget
     energy, std = floats(labelled.table, "energy_joule"), floats(labelled.table, "energy_std_joule")
     assert budget.total == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
     assert budget.total**2 == pytest.approx(sum(getattr(budget, cause) ** 2 for cause in CAUSES))
@@ -227,7 +228,7 @@ def test_clock_doubtful_when_the_recorder_stamped_what_counts(role, doubtful):
     sensors = {role: Sensor("/t", "x/msg/Y", "f", "why", time_source="log")}
     streams = power_streams({"drive": record()}, sensors=sensors)
     assert flagged(label(straight_track(SPEED), streams), Quality.CLOCK_DOUBTFUL).all() == doubtful
-    stepped = replace(streams, sensors={}, findings=Findings((), {"epochs": 2}))
+    stepped = replace(streams, sensors={}, findings=Findings((), RunFacts(epochs=2)))
     assert flagged(label(straight_track(SPEED), stepped), Quality.CLOCK_DOUBTFUL).all()
 
 

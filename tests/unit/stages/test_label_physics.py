@@ -26,15 +26,13 @@ def stages(tmp_path_factory):
 
 
 def test_the_fit_is_the_robot(stages):
-    robot, facts = Robot(), stages[2].info.findings.facts["label"]["physics"]
-    assert facts["standing_watt"] == pytest.approx(robot.idle_watt, abs=1.0)
+    robot, facts = Robot(), stages[2].info.findings.facts.label.physics
+    assert facts.standing_watt == pytest.approx(robot.idle_watt, abs=1.0)
     # Wheels without the slip fault still run faster than the ground by up to 12 %; the work is the wheels'.
     wheel = robot.mass_kg * GRAVITY_MPS2 / robot.drive_efficiency
-    assert wheel * 0.97 < facts["weight_over_efficiency_newton"] < wheel * 1.12
-    assert 0.115 < facts["rolling_resistance"] < 0.22
-    assert facts["recovered_downhill"] == pytest.approx(
-        robot.drive_efficiency * robot.regeneration_efficiency, abs=0.15
-    )
+    assert wheel * 0.97 < facts.weight_over_efficiency_newton < wheel * 1.12
+    assert 0.115 < facts.rolling_resistance < 0.22
+    assert facts.recovered_downhill == pytest.approx(robot.drive_efficiency * robot.regeneration_efficiency, abs=0.15)
 
 
 def test_the_prediction_stands_beside_the_label(stages):
@@ -54,7 +52,7 @@ def test_an_odd_metre_is_flagged_and_changes_nothing_for_the_others(stages):
     table, facts = with_physics(odd, gated.table)
     flagged = np.flatnonzero(table["quality"].to_numpy() & np.uint32(Quality.PHYSICS_OUTLIER))
     assert 7 in flagged
-    assert facts["outliers"] == flagged.size <= 3
+    assert facts.outliers == flagged.size <= 3
     others = np.delete(np.arange(table.num_rows), 7)
     before = floats(labelled.table, "physics_power_watt")
     assert np.abs(floats(table, "physics_power_watt") - before)[others].max() < 2.0
@@ -67,5 +65,5 @@ def test_without_power_there_is_no_fit(stages):
         labelled.table.schema.get_field_index("power_watt"), field, [np.full(labelled.table.num_rows, np.nan)]
     )
     table, facts = with_physics(dark, gated.table)
-    assert facts["fitted"] is False
+    assert facts.fitted is False
     assert table is dark

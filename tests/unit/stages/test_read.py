@@ -186,10 +186,10 @@ def test_a_whole_husky() -> None:
     assert found.tables["wheel_odometry"]["velocity_var_x_m2ps2"][0].as_py() == 0.01
     assert len(found.findings.warnings) == 1  # the current's sign
     facts = found.findings.facts
-    assert facts["epochs"] == 1
-    assert facts["roles"]["imu"]["topics"]["/imu/data"]["rows"] == 500
-    assert abs(facts["roles"]["imu"]["topics"]["/imu/data"]["rate_hz"] - 50.0) < 1e-6
-    assert facts["roles"]["gnss"]["topics"]["/fix"]["time"]["offset_s"] == -0.002
+    assert facts.epochs == 1
+    assert facts.roles["imu"].topics["/imu/data"].rows == 500
+    assert abs(facts.roles["imu"].topics["/imu/data"].rate_hz - 50.0) < 1e-6
+    assert facts.roles["gnss"].topics["/fix"].time.offset_s == -0.002
 
 
 def test_the_rails_keep_their_names_and_their_sum_is_the_robots_current() -> None:
@@ -272,7 +272,7 @@ def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
     gnss = found.tables["gnss"]
     assert gnss["stamp_ns"].to_pylist() == stamps.tolist()
     assert set(gnss["alt_m"].to_pylist()) == {400.0}
-    assert found.findings.facts["roles"]["gnss"]["topics"]["/nmea_sentence"]["dropped"] == {"not_gga": 20}
+    assert found.findings.facts.roles["gnss"].topics["/nmea_sentence"].dropped == {"not_gga": 20}
     assert not any("not used" in text for text in found.findings.warnings)
 
 
@@ -340,7 +340,7 @@ def with_step(table: pa.Table) -> pa.Table:
 def test_a_step_of_all_clocks_divides_every_table() -> None:
     topics = {name: (kind, with_step(table)) for name, (kind, table) in husky().items()}
     found = read(topics)
-    assert found.findings.facts["epochs"] == 2
+    assert found.findings.facts.epochs == 2
     for role, table in found.tables.items():
         epoch = table["epoch"].to_numpy()
         np.testing.assert_array_equal(epoch == 1, table["log_time_ns"].to_numpy() >= START + 5 * S, err_msg=role)

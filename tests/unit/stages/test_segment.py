@@ -102,8 +102,8 @@ def test_the_ledger_accounts_for_every_metre_once(seed):
     assert ledger["kept"] == pytest.approx(floats(segments.table, "arc_length_m").sum(), rel=1e-12)
     # Independent odometer: a fine polygon through every row's Hermite cubic, straight lines where stamps or epochs break.
     assert sum(ledger.values()) == pytest.approx(odometer_m(track.table), rel=1e-4)
-    assert sum(ledger.values()) == pytest.approx(segments.info.findings.facts["segment"]["odometer_m"], rel=1e-12)
-    seconds = segments.info.findings.facts["segment"]["ledger_s"]
+    assert sum(ledger.values()) == pytest.approx(segments.info.findings.facts.segment.odometer_m, rel=1e-12)
+    seconds = segments.info.findings.facts.segment.ledger_s
     assert sum(seconds.values()) == pytest.approx(2398 * 0.05 + 2.0, rel=1e-9)  # all but the interval of the clock step
 
 

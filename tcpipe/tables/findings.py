@@ -1,0 +1,322 @@
+"""What each stage noticed, as dataclasses: JSON holds them under the same names, in run.json those of reading, in manifest.json all.
+
+Counts and metres are by the names of roles, of reasons or of the ledger's entries. A number that is None is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+F = TypeVar("F")
+
+LEFT_OUT = {"json": "left out"}
+"""Metadata of a field which, while it is None, is no key of the JSON object."""
+
+Vector = tuple[float, float, float]
+
+
+def vector(values: NDArray[np.float64]) -> Vector:
+    """Return the three values of an array."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class Findings(Generic[F]):
+    """What a stage, or all stages so far, noticed: warnings for people, and facts."""
+
+    warnings: tuple[str, ...]
+    facts: F
+
+
+@dataclass(frozen=True, slots=True)
+class RobotChoice:
+    """Which robot profile rules, and why."""
+
+    name: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class TopicClock:
+    """Which stamp of a topic rules and why, the median of header minus log time, and what was added to its stamps by epoch [s]."""
+
+    source: str
+    why: str
+    offset_s: float | None
+    moved_s: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class TopicFacts:
+    """What became of a topic's messages: rows, and by reason what was dropped and what was set aside inside used rows."""
+
+    type: str
+    messages: int
+    rows: int
+    rate_hz: float | None
+    dropped: Mapping[str, int]
+    notes: Mapping[str, int]
+    time: TopicClock
+
+
+@dataclass(frozen=True, slots=True)
+class RoleFacts:
+    """Why a role went to its topics, and the frame of its sensor and what placed that."""
+
+    why: str
+    frame: str
+    placed_by: str
+    topics: Mapping[str, TopicFacts]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStep:
+    """A step of header minus log time: at which log time [ns], how far [s], and on which topics."""
+
+    log_time_ns: int
+    step_s: float
+    topics: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PowerSign:
+    """Which sign a drawn current has and what tells it; whether the source averages over its message period."""
+
+    current_sign: str
+    averaged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class StretchFacts:
+    """One stretch that was fused for itself: what the filter counted and settled on, and then where the stretch lies and began.
+
+    ``nis_mean`` is the normalised innovation squared over degrees of freedom, refused measurements left out; ``reopened`` and all from
+    ``events`` on are the error-state filter's, ``recovered`` is the 15-state filter's.
+    """
+
+    nis_mean: Mapping[str, float | None]
+    measurements: Mapping[str, int]
+    rejected: Mapping[str, int]
+    covariance_repairs: int
+    recovered: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
+    reopened: Mapping[str, int] | None = field(default=None, metadata=LEFT_OUT)
+    events: int | None = field(default=None, metadata=LEFT_OUT)
+    standing_updates: int | None = field(default=None, metadata=LEFT_OUT)
+    gnss_variance_factor: float | None = field(default=None, metadata=LEFT_OUT)
+    gnss_lasting_error_m: float | None = field(default=None, metadata=LEFT_OUT)
+    gyro_bias_radps: Vector | None = None
+    turn_scale: float | None = None
+    accelerometer_bias_mps2: Vector | None = field(default=None, metadata=LEFT_OUT)
+    wheel_scale: float | None = field(default=None, metadata=LEFT_OUT)
+    wheel_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
+    visual_scale: float | None = field(default=None, metadata=LEFT_OUT)
+    visual_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
+    epoch: int = 0
+    start_ns: int = 0
+    end_ns: int = 0
+    rows: int = 0
+    sensors: tuple[str, ...] = ()
+    gyro_noise_radps: float | None = None
+    accelerometer_noise_mps2: float | None = None
+    initial_yaw_rad: float | None = None
+    initial_yaw_std_rad: float | None = None
+    heading_from: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class FuseFacts:
+    """All stretches together, and each; ``set_aside`` counts by role and reason, ``skipped_s`` is time that holds too little to fuse."""
+
+    rows: int
+    sensors: tuple[str, ...]
+    measurements: Mapping[str, int]
+    rejected: Mapping[str, int]
+    nis_mean: Mapping[str, float | None]
+    set_aside: Mapping[str, Mapping[str, int]]
+    skipped_s: float
+    stretches: tuple[StretchFacts, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class AxisFacts:
+    """About which axis of the IMU another sensor turns, and how many times as fast."""
+
+    axis: Vector
+    scale: float
+
+
+@dataclass(frozen=True, slots=True)
+class SensorChecks:
+    """What the sensors were held against, and why those that were refused were.
+
+    ``distance_m`` are median chords over ten seconds, ``up`` is gravity in the robot's axes, ``looks_rad`` the yaw of the IMU by each
+    odometry and how sure it is, ``specific_force_median`` in the unit that the IMU tells.
+    """
+
+    refused: Mapping[str, str] = field(default_factory=dict)
+    distance_m: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
+    specific_force_median: float | None = field(default=None, metadata=LEFT_OUT)
+    up: Vector | None = field(default=None, metadata=LEFT_OUT)
+    yaw_axis: Mapping[str, AxisFacts] | None = field(default=None, metadata=LEFT_OUT)
+    looks_rad: Mapping[str, tuple[float, ...]] | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True, slots=True)
+class ClockPair:
+    """Two sensors' clocks compared (`tcpipe.fusion.checks.clock_offsets.Pair`), and whether that tells their offset."""
+
+    late: str
+    against: str
+    by: str
+    offset_s: float | None
+    std_s: float | None
+    explained: float | None
+    drift_s_per_h: float | None
+    drift_std_s_per_h: float | None
+    windows: tuple[Vector, ...]
+    determined: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ClockOffset:
+    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.Offset`), and the recipe lines that would correct it."""
+
+    offset_s: float | None
+    std_s: float | None
+    noted: bool
+    drift_s_per_h: float | None
+    drift_std_s_per_h: float | None
+    drifts: bool
+    recipe: str
+
+
+@dataclass(frozen=True, slots=True)
+class ClockFacts:
+    """The sensors' clocks in one epoch: all pairs compared, and by role each one's offset from the reference."""
+
+    epoch: int
+    reference: str
+    pairs: tuple[ClockPair, ...]
+    offsets: Mapping[str, ClockOffset]
+
+
+@dataclass(frozen=True, slots=True)
+class GateFacts:
+    """Rows kept, by reason dropped, and by cause in a gap; the speed that is the robot's limit, and from which on it drives at that."""
+
+    rows: int
+    rows_kept: int
+    gap_rows: Mapping[str, int]
+    rows_dropped: Mapping[str, int]
+    max_velocity_mps: float | None
+    full_speed_mps: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentFacts:
+    """How many segments were cut from how many steady stretches; the track's length, and its time by ledger entry."""
+
+    segments: int
+    stretches: int
+    odometer_m: float
+    ledger_s: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class SignalFacts:
+    """Samples of a voltage [V] or a current [A], their rate, and the step in which they are told."""
+
+    samples: int
+    rate_hz: float | None
+    resolution: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class RailFacts:
+    """The record of one rail in one clock epoch."""
+
+    name: str
+    voltage: SignalFacts
+    current: SignalFacts
+
+
+@dataclass(frozen=True, slots=True)
+class EnergyBudget:
+    """The noise floor of E over some segments: shares of the mean energy, root mean square over the segments [1]."""
+
+    segments: int
+    """Segments with an energy."""
+    mean_energy_joule: float
+    """Mean of its absolute value [J]."""
+    total: float
+    """All `CAUSES` together."""
+    position: float
+    rate: float
+    current: float
+    voltage: float
+    at_20_hz: float
+    """What power at 20 Hz would leave of the total."""
+
+
+@dataclass(frozen=True, slots=True)
+class PhysicsFacts:
+    """What rolling resistance and grade explain (`tcpipe.cost.physics`); where they could not be fitted, what is drawn while standing."""
+
+    fitted: bool
+    standing_watt: float | None
+    weight_over_efficiency_newton: float | None = None
+    rolling_resistance: float | None = None
+    rolling_newton: float | None = field(default=None, metadata=LEFT_OUT)
+    recovered_downhill: float | None = field(default=None, metadata=LEFT_OUT)
+    residual_watt: float | None = field(default=None, metadata=LEFT_OUT)
+    segments: int | None = field(default=None, metadata=LEFT_OUT)
+    outliers: int | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True, slots=True)
+class LabelFacts:
+    """The run's whole energy and where it went, the record of its power by epoch, and how sure and how clean its labels are."""
+
+    distance_m: float
+    energy_joule: float | None
+    energy_by_entry_joule: Mapping[str, float] | None
+    integration: str
+    velocity: str
+    rails: Mapping[str, tuple[RailFacts, ...]]
+    segments: int
+    segments_without_power: int
+    median_power_watt: float | None
+    relative_std_median: Mapping[str, float | None]
+    energy_budget: EnergyBudget | None
+    quality: Mapping[str, int]
+    physics: PhysicsFacts
+
+
+@dataclass(frozen=True, slots=True)
+class RunFacts:
+    """The facts of a run: those of reading, and under its name those of each stage that it has come through."""
+
+    robot: RobotChoice | None = None
+    roles: Mapping[str, RoleFacts] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
+    """Why topics that could play a role do not."""
+    epochs: int = 1
+    clock_steps: tuple[ClockStep, ...] = ()
+    time_offset_s: Mapping[str, float] = field(default_factory=dict)
+    """What the recipe adds to a role's stamps."""
+    power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
+    fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
+    sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
+    clock_offsets: ClockFacts | None = field(default=None, metadata=LEFT_OUT)
+    gate: GateFacts | None = field(default=None, metadata=LEFT_OUT)
+    segment: SegmentFacts | None = field(default=None, metadata=LEFT_OUT)
+    label: LabelFacts | None = field(default=None, metadata=LEFT_OUT)
+
+
+NOTHING_FOUND = Findings((), RunFacts())
