@@ -16,27 +16,35 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
 from tcpipe.fusion.ukf15_kernel import (
+    ACCELERATION,
     ACCEPTED,
+    ANGLES,
     ANTENNA,
     GRAVITY_MPS2,
     MAX_OPENED_RAD,
     MAX_STEP_S,
+    PITCH,
+    POSITION,
     RECOVERED,
     REJECTED,
+    ROLL,
     SELECT,
     SENSOR_VELOCITY,
     STATES,
+    TURN,
+    VELOCITY,
     YAW,
     Belief,
     Events,
     Outputs,
     Sources,
+    X,
     locked_out,
     opened_state,
 )
 from tcpipe.geometry.angles import wrap_to_pi
 
-_ANGLES = (3, 4, 5)
+_ANGLE_ENTRIES = (ROLL, PITCH, YAW)
 _Array = NDArray[np.float64]
 
 
@@ -86,7 +94,7 @@ def map_from_body(roll_rad: float, pitch_rad: float, yaw_rad: float) -> _Array:
 
 def process(x: _Array, dt: float) -> _Array:
     """Return the state after ``dt`` [s] of constant body acceleration and angular velocity, shape (15,)."""
-    roll, pitch, yaw = x[3:6]
+    roll, pitch, yaw = x[ANGLES]
     euler_rates = np.array(
         [
             [1.0, math.sin(roll) * math.tan(pitch), math.cos(roll) * math.tan(pitch)],
@@ -95,29 +103,30 @@ def process(x: _Array, dt: float) -> _Array:
         ]
     )
     moved = x.copy()
-    moved[0:3] += map_from_body(roll, pitch, yaw) @ (x[6:9] * dt + 0.5 * x[12:15] * dt**2)
-    moved[3:6] += euler_rates @ x[9:12] * dt
-    moved[6:9] += x[12:15] * dt
+    moved[POSITION] += map_from_body(roll, pitch, yaw) @ (x[VELOCITY] * dt + 0.5 * x[ACCELERATION] * dt**2)
+    moved[ANGLES] += euler_rates @ x[TURN] * dt
+    moved[VELOCITY] += x[ACCELERATION] * dt
     return moved
 
 
 def observe(x: _Array, kind: int, entries: NDArray[np.int64], lever_m: _Array) -> _Array:
     """Return what a source of this kind shows in state ``x``, shape (m,)."""
-    velocity = x[6:9] + np.cross(x[9:12], lever_m)
+    velocity = x[VELOCITY] + np.cross(x[TURN], lever_m)
     if kind == SELECT:
         seen = x
     elif kind == ANTENNA:
-        seen = x[0:3] + map_from_body(*x[3:6]) @ lever_m
+        seen = x[POSITION] + map_from_body(*x[ANGLES]) @ lever_m
     elif kind == SENSOR_VELOCITY:
         seen = velocity
     else:
-        seen = x[12:15] + np.cross(x[9:12], velocity) + map_from_body(*x[3:6]).T @ np.array([0.0, 0.0, GRAVITY_MPS2])
+        up = map_from_body(*x[ANGLES]).T @ np.array([0.0, 0.0, GRAVITY_MPS2])
+        seen = x[ACCELERATION] + np.cross(x[TURN], velocity) + up
     return np.asarray(seen[entries])
 
 
 def _new_filter(belief: Belief) -> UnscentedKalmanFilter:
     points = MerweScaledSigmaPoints(STATES, alpha=1.0, beta=2.0, kappa=0.0)
-    mean, difference = _circular(_ANGLES)
+    mean, difference = _circular(_ANGLE_ENTRIES)
     ukf = UnscentedKalmanFilter(
         dim_x=STATES, dim_z=1, dt=0.0, hx=observe, fx=process, points=points, x_mean_fn=mean, residual_x=difference
     )
@@ -130,21 +139,21 @@ def _advance(ukf: UnscentedKalmanFilter, q: _Array, dt: float) -> None:
     for _ in range(steps):
         ukf.Q = np.diag(q) * (dt / steps)
         ukf.predict(dt=dt / steps)
-        ukf.x[3:6] = wrap_to_pi(ukf.x[3:6])
+        ukf.x[ANGLES] = wrap_to_pi(ukf.x[ANGLES])
 
 
 def _update(ukf: UnscentedKalmanFilter, measured: _Measurement, gate: float) -> float:
     """Fuse one measurement unless its normalised innovation squared, which is returned, exceeds the gate."""
     kind, entries, lever_m, z, variance = measured
     ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
-    angles = tuple(k for k, state in enumerate(entries) if kind == SELECT and state in _ANGLES)
+    angles = tuple(k for k, state in enumerate(entries) if kind == SELECT and state in _ANGLE_ENTRIES)
     ukf.z_mean, ukf.residual_z = _circular(angles)
     before = ukf.x.copy(), ukf.P.copy()
     ukf.update(z, R=np.diag(variance), kind=kind, entries=entries, lever_m=lever_m)
     nis = float(ukf.y @ np.linalg.solve(ukf.S, ukf.y))
     if not nis <= gate:
         ukf.x, ukf.P = before
-    ukf.x[3:6] = wrap_to_pi(ukf.x[3:6])
+    ukf.x[ANGLES] = wrap_to_pi(ukf.x[ANGLES])
     return nis
 
 
@@ -152,10 +161,10 @@ def _open_up(ukf: UnscentedKalmanFilter, measured: _Measurement) -> None:
     innovation = measured.z - observe(ukf.x, measured.kind, measured.entries, measured.lever_m)
     for at, entry in enumerate(measured.entries):
         state = opened_state(measured.kind, entry)
-        if state in _ANGLES:
+        if state in _ANGLE_ENTRIES:
             innovation[at] = min(abs(float(wrap_to_pi(innovation[at]))), MAX_OPENED_RAD)
         ukf.P[state, state] += innovation[at] ** 2
-        if state == 0:
+        if state == X:
             ukf.P[YAW, YAW] += MAX_OPENED_RAD**2
 
 

@@ -29,11 +29,17 @@ from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, InitialState, Measurements
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.fusion.ukf15_kernel import (
+    ACCELERATION,
     ACCEPTED,
+    ANGLES,
     ANTENNA,
+    AX,
+    AY,
+    AZ,
     MAX_OPENED_RAD,
     NOT_RUN,
     PITCH,
+    POSITION,
     RECOVERED,
     REJECTED,
     ROLL,
@@ -42,17 +48,25 @@ from tcpipe.fusion.ukf15_kernel import (
     SENSOR_VELOCITY,
     SPECIFIC_FORCE,
     STATES,
+    TURN,
+    VELOCITY,
+    VX,
+    VY,
+    VZ,
+    WX,
+    WY,
+    WZ,
     YAW,
     Belief,
     Events,
     Outputs,
     Sources,
+    X,
+    Y,
+    Z,
 )
 from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.tables.findings import StretchFacts
-
-POSITION, VELOCITY, TURN, ACCELERATION = (0, 1, 2), (6, 7, 8), (9, 10, 11), (12, 13, 14)
-"""Where the other states stand."""
 
 PROCESS_VARIANCE = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-2] * 3 + [1.0] * 3 + [2.0] * 3)
 """Variance that each state gains in a second, shape (15,): angular velocity changes by 1 rad/s, acceleration by 1.4 m/s², in a second
@@ -154,7 +168,7 @@ def run_ukf15(
     found = filter_forward(
         sources, gates, x=x, P=P, q=PROCESS_VARIANCE, start_ns=start_ns, output_ns=output_ns, engine=engine
     )
-    quat = quat_from_rpy(*found.x[:, ROLL : YAW + 1].T)
+    quat = quat_from_rpy(*found.x[:, ANGLES].T)
     std = np.sqrt(found.variance)
     return Trajectory(
         stamp_ns=output_ns,
@@ -164,7 +178,7 @@ def run_ukf15(
         angular_velocity_radps=found.x[:, TURN],
         position_std_m=std[:, POSITION],
         yaw_std_rad=std[:, YAW],
-        forward_velocity_std_mps=std[:, VELOCITY[0]],
+        forward_velocity_std_mps=std[:, VX],
         rejections=_rejections(sources, gates, found),
         displacement_std_m=np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan),
         facts=_facts(sources, found),
@@ -261,7 +275,7 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
     )
     start_ns = min(int(source.stamp_ns[0]) for source in sensors if source.stamp_ns.size)
     std = measurements.nonholonomic_std_mps
-    ground = _held(_GROUND, {VELOCITY[1]: std, VELOCITY[2]: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
+    ground = _held(_GROUND, {VY: std, VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
     return [*sensors, ground, *_priors(sensors, start_ns, end_ns)]
 
 
@@ -271,7 +285,7 @@ def _imu_sources(measurements: Measurements, initial: InitialState) -> list[Sour
         return []
     shape = imu.angular_velocity_radps.shape
     turn = imu.angular_velocity_radps - initial.gyro_bias_radps
-    sources = [Source(IMU, SELECT, TURN, imu.stamp_ns, turn, np.broadcast_to(imu.gyro_std_radps**2, shape))]
+    sources = [Source(IMU, SELECT, (WX, WY, WZ), imu.stamp_ns, turn, np.broadcast_to(imu.gyro_std_radps**2, shape))]
     if imu.accelerometer_usable:
         variance = np.broadcast_to(imu.accelerometer_std_mps2**2, shape)
         force = imu.specific_force_mps2
@@ -290,7 +304,7 @@ def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_ra
         return []
     lever = odometry.lever_arm_m
     kind = SENSOR_VELOCITY if any(lever) else SELECT
-    first = 0 if any(lever) else VELOCITY[0]
+    first = 0 if any(lever) else VX
     known = np.isfinite(odometry.velocity_mps)
     per_second = 1e9 / float(np.median(np.diff(odometry.stamp_ns))) if odometry.stamp_ns.size > 1 else 1.0
     every_variance = odometry.variance_m2ps2 + per_second * np.square(SCALE_STD * odometry.velocity_mps)
@@ -306,7 +320,7 @@ def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_ra
         z = odometry.yaw_rate_radps[rows, None]
         scale_std = SKID_STD if role == WHEELS else SCALE_STD
         variance = odometry.yaw_rate_var[rows, None] + per_second * np.square(scale_std * z)
-        sources.append(Source(role, SELECT, (TURN[2],), odometry.stamp_ns[rows], z, variance))
+        sources.append(Source(role, SELECT, (WZ,), odometry.stamp_ns[rows], z, variance))
     return sources
 
 
@@ -315,7 +329,7 @@ def _gnss_sources(measurements: Measurements) -> list[Source]:
     if gnss is None:
         return []
     kind = ANTENNA if any(gnss.lever_arm_m) else SELECT
-    return [Source(GNSS, kind, POSITION, gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
+    return [Source(GNSS, kind, (X, Y, Z), gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
 
 
 def _held(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> Source:
@@ -328,8 +342,8 @@ def _held(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, peri
 def _priors(sensors: Sequence[Source], start_ns: int, end_ns: int) -> list[Source]:
     selected = {entry for source in sensors if source.kind == SELECT for entry in source.entries}
     force = any(source.kind == SPECIFIC_FORCE for source in sensors)
-    calm = {state: std for state, std in zip(TURN, _CALM_STD_RADPS, strict=True) if state not in selected}
-    calm |= {} if force else dict.fromkeys(ACCELERATION, _CALM_STD_MPS2)
+    calm = {state: std for state, std in zip((WX, WY, WZ), _CALM_STD_RADPS, strict=True) if state not in selected}
+    calm |= {} if force else dict.fromkeys((AX, AY, AZ), _CALM_STD_MPS2)
     level = {} if force or ROLL in selected else dict.fromkeys((ROLL, PITCH), _LEVEL_STD_RAD)
     return [
         _held(_PRIOR, stds, start_ns, end_ns, period_ns)
@@ -346,12 +360,12 @@ def _gate(source: Source, probability: float) -> float:
 
 def _initial_belief(initial: InitialState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     x, std = np.zeros(STATES), np.empty(STATES)
-    x[list(POSITION)], std[list(POSITION)] = initial.position_enu_m, initial.position_std_m
-    x[ROLL : YAW + 1] = rpy_from_quat(initial.quat_xyzw)
+    x[POSITION], std[POSITION] = initial.position_enu_m, initial.position_std_m
+    x[ANGLES] = rpy_from_quat(initial.quat_xyzw)
     attitude_std = (initial.tilt_std_rad, initial.tilt_std_rad, initial.yaw_std_rad)
-    std[ROLL : YAW + 1] = np.minimum(attitude_std, MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
-    x[list(VELOCITY)] = rotate(inverse(initial.quat_xyzw), initial.velocity_enu_mps)
-    std[list(VELOCITY)], std[list(TURN)], std[list(ACCELERATION)] = initial.velocity_std_mps, 0.1, 0.5
+    std[ANGLES] = np.minimum(attitude_std, MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
+    x[VELOCITY] = rotate(inverse(initial.quat_xyzw), initial.velocity_enu_mps)
+    std[VELOCITY], std[TURN], std[ACCELERATION] = initial.velocity_std_mps, 0.1, 0.5
     return x, np.diag(std**2)
 
 

@@ -8,9 +8,11 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from shared_data import shared_data
 
-from tcpipe.fusion.ukf15 import ACCELERATION, TURN, VELOCITY, Source, filter_forward
-from tcpipe.fusion.ukf15_kernel import GRAVITY_MPS2, PITCH, ROLL, SELECT, YAW
+from tcpipe.fusion.ukf15 import Source, filter_forward
+from tcpipe.fusion.ukf15_kernel import AX, AY, AZ, GRAVITY_MPS2, PITCH, ROLL, SELECT, VX, VY, VZ, WX, WY, WZ, YAW
 from tcpipe.geometry.rotation import inverse, product, quat_from_rpy, rotate, rpy_from_quat
+
+VELOCITY, TURN, ACCELERATION = (VX, VY, VZ), (WX, WY, WZ), (AX, AY, AZ)
 
 
 def _messages(reader, type_name):
