@@ -82,12 +82,12 @@ def ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mp
     halted : shape (N,), rows that stand or turn in place.
     """
     speeding_up = np.sign(rows.velocity_mps) * acceleration_mps2
-    beside = np.concatenate(([0], np.cumsum(dilated(halted, rows.piece, before=1, after=1))))
+    halts = np.concatenate(([0], np.cumsum(halted)))
     found = np.zeros(len(halted), dtype=np.bool_)
     for changes in (speeding_up > above_mps2, speeding_up < -above_mps2):
         going_on = ~lasting(~(changes | halted), rows.piece, min_rows=rows.count(min_s))
         spans = runs(going_on, rows.piece)
-        found |= mask_of(spans[beside[spans[:, 1] + 1] > beside[spans[:, 0]]], len(halted))
+        found |= mask_of(spans[halts[spans[:, 1] + 1] > halts[spans[:, 0]]], len(halted))
     return found & ~halted
 
 

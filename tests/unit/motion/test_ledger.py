@@ -4,7 +4,14 @@ import numpy as np
 import pytest
 from made_tracks import stamps
 
-from tcpipe.motion.ledger import by_reason, interval_duration_s, interval_length_m, interval_reason, stretches
+from tcpipe.motion.ledger import (
+    by_reason,
+    interval_duration_s,
+    interval_length_m,
+    interval_reason,
+    stretches,
+    unexplained_m,
+)
 from tcpipe.tables.bits import DropReason
 
 G, S, A = (int(bit) for bit in (DropReason.GAP, DropReason.STANDING, DropReason.ACCELERATING))
@@ -39,3 +46,40 @@ def test_a_hole_counts_as_its_straight_line_and_no_metre_twice():
 
 def test_a_clock_step_is_no_time():
     assert interval_duration_s(stamps(2) - [0, 10**12], np.array([0, 1])).tolist() == [0.0]
+
+
+def test_seconds_are_those_inside_an_epoch_whichever_way_its_clock_steps():
+    got = interval_duration_s(stamps(4), np.array([0, 0, 1, 0]))
+    assert got == pytest.approx([0.05, 0.0, 0.0])
+
+
+VELOCITY = np.array([[1.0, 2.0, 9.0], [3.0, 4.0, 9.0], [3.0, 4.0, 9.0]])
+
+
+def test_what_the_velocity_does_not_explain_is_horizontal_and_inside_a_piece():
+    position = np.array([[0.0, 0.0, 0.0], [0.2, 0.5, 7.0], [9.0, 9.0, 9.0]])
+    got = unexplained_m(stamps(3), position, VELOCITY, np.array([0, 0, 1]))
+    assert got == pytest.approx([np.hypot(0.2 - 0.1, 0.5 - 0.15), 0.0])
+    assert unexplained_m(stamps(3), position[:, [1, 0, 2]], VELOCITY[:, [1, 0, 2]], np.zeros(3))[0] == pytest.approx(
+        got[0]
+    )
+
+
+def test_a_jump_counts_what_its_speed_makes_of_it():
+    position = np.array([[0.0, 0.0, 0.0], [30.0, 40.0, 0.0], [30.15, 40.2, 0.0]])
+    got = interval_length_m(stamps(3), position, np.tile([3.0, 4.0, 7.0], (3, 1)), np.zeros(3, np.int64))
+    assert got == pytest.approx([5.0 * 0.05, 0.25])
+
+
+@pytest.mark.parametrize(("step_m", "counted_m"), [(1.0, 1.0), (1.01, 0.0)])
+def test_a_step_of_a_metre_is_no_jump_yet(step_m, counted_m):
+    position = np.array([[0.0, 0.0, 0.0], [step_m, 0.0, 0.0]])
+    got = interval_length_m(stamps(2), position, np.zeros((2, 3)), np.zeros(2, np.int64))
+    assert got == pytest.approx([counted_m])
+
+
+def test_a_hole_is_measured_on_the_map_and_every_step_by_itself():
+    position = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0], [0.15, 0.0, 0.0], [3.15, 4.0, 7.0]])
+    piece = np.array([0, 0, 0, 1])
+    got = interval_length_m(stamps(4), position, np.tile([1.5, 0.0, 0.0], (4, 1)), piece)
+    assert got == pytest.approx([0.05, 0.1, 5.0], rel=0.01)

@@ -1,10 +1,12 @@
 """Each kind of unsteady driving, and what must not be taken for it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from tcpipe.motion import masks
-from tcpipe.motion.pieces import MotionRows
+from tcpipe.motion.pieces import MotionRows, slope
 
 PERIOD = 0.05
 
@@ -143,3 +145,102 @@ def test_below_limit_follows_the_command_not_its_jitter():
 def test_reversing_at_full_speed_is_not_below_the_limit():
     assert not masks.below_limit(rows([-1.0] * 20, commanded=-1.0), limit_mps=0.95, window_s=0.5).any()
     assert masks.reversing(rows([-0.06, -0.04, 0.3]), standing_velocity_mps=0.05).tolist() == [True, False, False]
+
+
+STANDING = {"below_velocity_mps": 0.05, "below_yaw_rate_radps": 0.05}
+
+
+def test_a_limit_itself_is_not_below_nor_above_it():
+    assert not masks.stuck(rows([0.05], wheel=0.5), standing_velocity_mps=0.05, wheel_velocity_above_mps=0.2).any()
+    assert not masks.stuck(rows([0.01], wheel=0.2), standing_velocity_mps=0.05, wheel_velocity_above_mps=0.2).any()
+    assert not masks.standing(rows([0.05]), **STANDING).any()
+    assert not masks.standing(rows([0.0], yaw_rate=0.05), **STANDING).any()
+    assert not masks.turning_in_place(rows([0.1] * 9, yaw_rate=0.15), **TURNING).any()
+    assert not masks.turning_in_place(rows([0.06] * 9, yaw_rate=0.1), **TURNING).any()
+    assert not masks.turning_in_place(rows([0.5] * 9, yaw_rate=1.0), **TURNING).any()
+    assert not masks.reversing(rows([-0.05]), standing_velocity_mps=0.05).any()
+    acceleration = np.full(9, 0.25)
+    assert not masks.accelerating(rows([0.5] * 9), acceleration, above_mps2=0.25, min_s=0.2, dilate_s=0.0).any()
+    assert not masks.below_limit(rows([0.0] * 9, commanded=0.5), limit_mps=0.5, window_s=0.1).any()
+    mean_is_the_limit = rows([0.0] * 3, commanded=[0.75, 0.25, 0.5])
+    assert not masks.below_limit(mean_is_the_limit, limit_mps=0.5, window_s=0.1).any()
+
+
+def test_a_fast_turn_of_a_wide_arc_is_driving():
+    assert not masks.turning_in_place(rows([0.9] * 9, yaw_rate=0.15), **TURNING).any()
+
+
+def test_which_row_of_a_change_of_direction_stands():
+    assert masks.standing(rows([0.2, -0.3]), **STANDING).tolist() == [True, False]
+    assert masks.standing(rows([0.05, -0.05]), **STANDING).tolist() == [True, False]  # of two as slow, the first
+    assert not masks.standing(rows([0.04, -0.3], yaw_rate=1.0), **STANDING).any()
+    apart = replace(rows([0.2, -0.3]), piece=np.array([0, 1]))
+    assert not masks.standing(apart, **STANDING).any()
+
+
+@pytest.mark.parametrize(("window_s", "half"), [(0.05, 1), (0.40, 4), (0.45, 4), (0.50, 4)])
+def test_the_slope_is_over_the_window_that_is_asked_for(window_s, half):
+    made = rows(np.random.default_rng(2).normal(0, 1, 40))
+    expected = slope(made.velocity_mps, made.piece, half_window=half, period_s=PERIOD)
+    assert masks.forward_acceleration_mps2(made, window_s=window_s) == pytest.approx(expected)
+
+
+def ramp_rows(acceleration, halted):
+    acceleration = np.array(acceleration, dtype=float)
+    halted = np.isin(np.arange(len(acceleration)), halted)
+    got = masks.ramps(rows([0.5] * len(acceleration)), acceleration, halted, above_mps2=0.25, min_s=0.1)
+    return np.flatnonzero(got).tolist()
+
+
+def test_a_ramp_begins_at_a_halt_of_one_row_on_either_side():
+    assert ramp_rows([0, 0, 0, -1, -1, -1, 0, 0, 0], [6]) == [3, 4, 5]
+    assert ramp_rows([0, 1, 1, 0, 0, 0], [0]) == [1, 2]
+    assert ramp_rows([1, 1, 1, 0, 0, 0], []) == []
+    assert ramp_rows([0.25, 0.25, 0.25, 0, 0], [0]) == []
+    assert ramp_rows([0, 0, 0, -0.25, -0.25], [4]) == []
+
+
+def changed(commanded, *, window_s=0.5, piece=None):
+    made = rows(np.zeros(len(commanded)), commanded=commanded)
+    made = made if piece is None else replace(made, piece=np.array(piece))
+    found = masks.command_changed(made, step_mps=0.1, window_s=window_s, settle_s=0.0)
+    return np.flatnonzero(found).tolist()
+
+
+def test_both_windows_touch_the_row_and_neither_holds_the_other_s():
+    assert changed([0.0] * 20 + [0.105] * 20) == [20]
+    assert changed([0.0] * 20 + [0.105] * 10 + [0.0] * 20)[0] == 20
+    assert changed([0.0] + [1.0] * 20) == [1]
+    assert changed([0.0] * 20 + [1.0]) == [20]
+
+
+def test_a_window_holds_a_row_at_least():
+    for window_s in (0.02, 0.05):
+        assert changed([0.0] * 9 + [0.15] + [0.0] * 9, window_s=window_s) == [9, 10]
+
+
+@pytest.mark.parametrize(("step", "found"), [(0.18, True), (0.15, False)])
+def test_twice_what_jitter_leaves_is_allowed_for(step, found):
+    jitter = np.where(
+        np.arange(60) % 2, 0.05, -0.05
+    )  # leaves 0.05 sqrt(0.4) = 0.032 in the difference of two means of ten
+    assert bool(changed(jitter + np.where(np.arange(60) < 30, 0.0, step))) == found
+
+
+def test_a_command_that_ends_or_steps_across_a_hole_is_no_change():
+    assert changed([1.0] * 20 + [np.nan] * 20) == []
+    assert changed([0.0] * 20 + [1.0] * 20, piece=[0] * 20 + [1] * 20) == []
+
+
+def test_the_moment_of_a_change():
+    moment = lambda command, before, after, step: masks._moment(np.array(command), before, after, step_mps=step)  # noqa: E731
+    assert moment([0.0, 0.0, 1.0, 1.0], 0.0, 1.0, 0.1) == (2, 2)
+    assert moment([0.0, 0.5, 1.0], 0.0, 1.0, 0.1) == (1, 2)
+    assert moment([0.0, 0.5, 1.0], 0.0, 1.0, 0.5) == (2, 2)
+    assert moment([0.05, 0.05], 0.0, 0.05, 0.1) == (0, 0)
+
+
+def test_a_short_dip_does_not_bring_the_mean_below_the_limit():
+    commanded = np.ones(25)
+    commanded[10:15] = 0.5  # over eleven rows the mean is 0.77, over seven 0.64
+    assert not masks.below_limit(rows(0 * commanded, commanded=commanded), limit_mps=0.75, window_s=0.5).any()

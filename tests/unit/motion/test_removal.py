@@ -45,3 +45,29 @@ def test_a_share_stands_out_when_it_is_far_off_and_surely_so(mud, odd):
 
 def test_one_group_alone_has_nothing_to_differ_from():
     assert uneven(groups(grass=(10.0, 400.0))) == []
+
+
+@pytest.mark.parametrize(
+    ("mud", "odd"),
+    [
+        ((0.0, 20.0), ["grass", "mud"]),  # as short as may be spoken of
+        ((0.0, 19.5), []),
+        ((45.0, 100.0), ["grass", "mud"]),  # 0.35 off, 3.2 standard deviations
+        ((51.0, 100.0), ["grass", "mud"]),  # 0.29 off, where 2.5 are 0.273
+        ((54.0, 100.0), []),  # 0.26 off, where 2.5 are 0.271
+    ],
+)
+def test_the_edges_of_what_stands_out(mud, odd):
+    assert [group.name for group in uneven(groups(grass=(320.0, 400.0), mud=mud))] == odd
+
+
+def test_a_sure_but_small_difference_is_none():
+    assert uneven(groups(grass=(32_000.0, 40_000.0), mud=(7_000.0, 10_000.0))) == []
+
+
+def test_half_a_metre_is_a_group_with_a_reason_and_nothing_has_no_share():
+    tally = tally_m(np.array([1, 1]), np.array([0, 2]), np.array([0.25, 0.25]), shape=(2, 3))
+    np.testing.assert_array_equal(tally, [[0, 0, 0], [0.25, 0, 0.25]])
+    (only,) = named_groups(tally, ("grass", "mud"), REASONS)
+    assert only == Group("mud", 0.5, 0.25, {"stuck": 0.25})
+    assert (only.used_share, Group("mud", 0.0, 0.0, {}).used_share) == (0.5, 0.0)

@@ -86,3 +86,13 @@ def test_the_chord_ahead_sees_a_jump_before_it_comes():
     )
     assert np.flatnonzero(got > 0.1).tolist() == [*range(80, 100), 120]
     assert got[120] == pytest.approx(0.4)  # a power of time between what is told of half and of two seconds
+
+
+def test_nothing_unknown_is_nothing_wrong():
+    assert std(0.0, 1.0, 0.0, 0.0, smoothed=True) == 0.0
+
+
+def test_each_duration_lies_between_its_own_neighbours():
+    told = np.array([[0.001, 0.002, 0.032]] * 3)
+    got = between_durations_m(np.sqrt([0.5, 2.0, 1.0]), told_s=(0.5, 1.0, 2.0), told_std_m=told)
+    assert got == pytest.approx([np.sqrt(0.001 * 0.002), np.sqrt(0.002 * 0.032), 0.002])

@@ -73,3 +73,20 @@ def test_a_stretch_shorter_than_a_chord_is_leftover():
     cut = cut_by_chord(path, chord_m=1.0, max_arc_to_chord=1.02)
     assert len(cut.start_ns) == 0
     assert cut.ledger(path)["leftover"][0] == pytest.approx(0.8)
+
+
+def test_a_path_of_whole_chords_leaves_nothing_and_a_straight_one_is_as_long_as_its_chord():
+    t = np.arange(0.0, 5.0)
+    path = polyline((t * 1e9).astype(np.int64), np.outer(0.25 * t, [1, 0, 0]), np.tile([0.25, 0.0, 0.0], (5, 1)))
+    cut = cut_by_chord(path, chord_m=0.5, max_arc_to_chord=1.0)
+    assert (cut.start_ns.tolist(), cut.end_ns.tolist()) == ([0, 2_000_000_000], [2_000_000_000, 4_000_000_000])
+    assert len(cut.leftover_ns) == 0
+    assert cut.ledger(path)["kept"] == pytest.approx((1.0, 4.0))
+
+
+def test_curved_pieces_that_follow_one_another_are_one():
+    t = np.arange(0, 28, 0.001)
+    bends = np.clip((t - 6.0) * 1.6, 0, np.pi / 2) + np.clip((t - 16.0) * 1.6, 0, np.pi)
+    cut = cut_by_chord(drive(bends), chord_m=1.0, max_arc_to_chord=1.02)
+    assert len(cut.curved_ns) > 1
+    assert (cut.curved_ns[1:, 0] > cut.curved_ns[:-1, 1]).all()
