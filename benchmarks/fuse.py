@@ -28,7 +28,7 @@ from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.ukf15 import PROCESS_VARIANCE, Source, filter_forward
-from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT
+from tcpipe.fusion.ukf15_events import ANTENNA, SELECT
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run

@@ -15,14 +15,11 @@ import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
-from tcpipe.fusion.ukf15_kernel import (
+from tcpipe.fusion.ukf15_events import (
     ACCELERATION,
     ACCEPTED,
     ANGLES,
     ANTENNA,
-    GRAVITY_MPS2,
-    MAX_OPENED_RAD,
-    MAX_STEP_S,
     PITCH,
     POSITION,
     RECOVERED,
@@ -39,9 +36,8 @@ from tcpipe.fusion.ukf15_kernel import (
     Outputs,
     Sources,
     X,
-    locked_out,
-    opened_state,
 )
+from tcpipe.fusion.ukf15_kernel import GRAVITY_MPS2, MAX_OPENED_RAD, MAX_STEP_S, locked_out, opened_state
 from tcpipe.geometry.angles import wrap_to_pi
 
 _ANGLE_ENTRIES = (ROLL, PITCH, YAW)

@@ -28,7 +28,7 @@ from tcpipe.fusion import ukf15_kernel
 from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, InitialState, Measurements
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
-from tcpipe.fusion.ukf15_kernel import (
+from tcpipe.fusion.ukf15_events import (
     ACCELERATION,
     ACCEPTED,
     ANGLES,
@@ -36,14 +36,12 @@ from tcpipe.fusion.ukf15_kernel import (
     AX,
     AY,
     AZ,
-    MAX_OPENED_RAD,
     NOT_RUN,
     PITCH,
     POSITION,
     RECOVERED,
     REJECTED,
     ROLL,
-    ROW,
     SELECT,
     SENSOR_VELOCITY,
     SPECIFIC_FORCE,
@@ -65,6 +63,7 @@ from tcpipe.fusion.ukf15_kernel import (
     Y,
     Z,
 )
+from tcpipe.fusion.ukf15_kernel import MAX_OPENED_RAD, ROW
 from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.tables.findings import StretchFacts
 
@@ -97,7 +96,7 @@ class Source:
     Attributes
     ----------
     role : whose measurements these are; constraints have roles of their own and are in no table.
-    kind : `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY` of `tcpipe.fusion.ukf15_kernel`.
+    kind : `SELECT`, `ANTENNA`, `SPECIFIC_FORCE` or `SENSOR_VELOCITY` of `tcpipe.fusion.ukf15_events`.
     entries : which states (`SELECT`), or which of the sensor's three entries, are measured; at most six.
     stamp_ns : [ns], shape (N,), increasing.
     z, variance : shape (N, m), finite.

@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion import filterpy_engine, ukf15_kernel
-from tcpipe.fusion.ukf15_kernel import (
+from tcpipe.fusion.ukf15_events import (
+    ACCEPTED,
     ANTENNA,
+    RECOVERED,
+    REJECTED,
     SELECT,
     SENSOR_VELOCITY,
     SPECIFIC_FORCE,
@@ -114,5 +117,5 @@ def test_gates_refuse_and_recover_alike():
     found = _run_both(belief, events._replace(z=events.z + 40.0 * late), sources, np.linspace(0.1, 12.0, 20))
     _assert_equal(found)
     outcome = found[0][1].outcome
-    assert {ukf15_kernel.ACCEPTED, ukf15_kernel.REJECTED, ukf15_kernel.RECOVERED} == set(outcome.tolist())
+    assert {ACCEPTED, REJECTED, RECOVERED} == set(outcome.tolist())
     assert found[0][1].x[-1, 0] == pytest.approx(40.0, abs=1.2)  # the lever arm, whose direction nothing measures

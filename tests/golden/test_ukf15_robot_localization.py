@@ -9,7 +9,8 @@ from rosbags.highlevel import AnyReader
 from shared_data import shared_data
 
 from tcpipe.fusion.ukf15 import Source, filter_forward
-from tcpipe.fusion.ukf15_kernel import AX, AY, AZ, GRAVITY_MPS2, PITCH, ROLL, SELECT, VX, VY, VZ, WX, WY, WZ, YAW
+from tcpipe.fusion.ukf15_events import AX, AY, AZ, PITCH, ROLL, SELECT, VX, VY, VZ, WX, WY, WZ, YAW
+from tcpipe.fusion.ukf15_kernel import GRAVITY_MPS2
 from tcpipe.geometry.rotation import inverse, product, quat_from_rpy, rotate, rpy_from_quat
 
 VELOCITY, TURN, ACCELERATION = (VX, VY, VZ), (WX, WY, WZ), (AX, AY, AZ)
