@@ -29,6 +29,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.standing import standing_intervals
@@ -84,7 +85,7 @@ def made_drive(
         out, scenario=Scenario("accuracy", small_world(), (drive,), region, RasterSpec(2.0, 2.0, 2.0)), seed=seed
     )
     with open_log(site.logs[0]) as log:
-        return read_run(log, ReadConfig(), robot=None), read_truth(site.truths[0])
+        return read_run(log, ReadConfig(), robot=None, known=shipped_profiles()), read_truth(site.truths[0])
 
 
 @dataclass

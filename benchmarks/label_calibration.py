@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, Truth, read_truth, scenario, simulate, true_cost
 from tcpipe.simulation.messages import Recorder
@@ -52,7 +53,7 @@ def drive(seed: int, sensors: Sensors, recorder: Recorder, length_m: float, out:
     made = replace(scenario("hills12"), drives=(spec,), rasters=RasterSpec(2.0, 2.0, 2.0))
     site = simulate(out, scenario=made, seed=seed)
     with open_log(site.logs[0]) as log:
-        return read_run(log, Recipe().read, robot="husky"), read_truth(site.truths[0])
+        return read_run(log, Recipe().read, robot="husky", known=shipped_profiles()), read_truth(site.truths[0])
 
 
 def labelled(track: Track, motion: Streams, power: Streams, recipe: Recipe) -> LabelledSegments:

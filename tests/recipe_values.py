@@ -9,11 +9,12 @@ from annotated_types import Ge, Le, Lt
 
 from tcpipe.recipe import Recipe
 from tcpipe.recipe.checking import kinds_of
+from tcpipe.robots.profiles import PowerSource
 
 
 def keys() -> list[str]:
     """Return every key of the recipe, by dots."""
-    default, found = Recipe(), ["robot"]
+    default, found = Recipe(), ["robot", "robots", "power_sources"]
     for section in fields(default):
         of = getattr(default, section.name)
         found += [f"{section.name}.{name}" for name in kinds_of(type(of))] if is_dataclass(of) else []
@@ -43,13 +44,17 @@ def _values(kind: Any, bounds: tuple[Any, ...] = ()) -> Iterator[Any]:
     elif origin is Literal:
         yield from of
     elif origin is dict:
-        yield from ({role: value} for role in get_args(of[0]) for value in _values(of[1]))
+        yield from ({role: value} for role in get_args(of[0]) or ("scout",) for value in _values(of[1]))
     elif origin is list:
-        yield ["/another"]
+        yield from ([value] for value in (_values(of[0]) if is_dataclass(of[0]) else ["/another"]))
     elif origin is tuple:
         yield from zip(*(list(_values(each)) for each in of), strict=True)
     elif is_dataclass(kind):
-        yield from (kind(**{name: value}) for name, each in kinds_of(kind).items() for value in _values(each))
+        made = PowerSource("a/msg/B", "v", "i") if kind is PowerSource else kind()
+        others = (replace(made, **{name: value}) for name, each in kinds_of(kind).items() for value in _values(each))
+        yield from (
+            other for other in others if not hasattr(other, "contradictions") or not any(other.contradictions())
+        )
     elif kind is bool:
         yield from (False, True)
     elif kind is str:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 @click.option(
     "--robot",
     metavar="NAME",
-    help="Robot profile: husky, jackal, warthog, dingo, ridgeback, generic (found by message types and topic names otherwise).",
+    help="Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise).",
 )
 @click.option(
     "--tag", "tags", multiple=True, metavar="K=V", callback=tag_values, help="Free tag on the runs; repeatable."

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.json_files import digest
+from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.formats.toml_text import parse_toml
 from tcpipe.recipe import IngestSections, Recipe
 from tcpipe.recipe.checking import as_toml, from_values, kinds_of, range_of
+from tcpipe.robots.profiles import PowerSource, Robot
 
 FILE_NAME = "tcpipe.toml"
 _MOST_BYTES = 1_000_000
+_OWN_TABLES = ("robots", "power_sources")
 
 
 def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
@@ -54,16 +57,22 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     return from_values(Recipe, values, where=where)
 
 
+def plain_recipe(recipe: Recipe | IngestSections) -> Any:
+    """Return a recipe as JSON values; without robots and power sources of its own where it has none, as before there were any."""
+    return {name: values for name, values in plain(recipe).items() if values or name not in _OWN_TABLES}
+
+
 def ingest_key(recipe: Recipe | Mapping[str, Any]) -> str:
     """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
-    if isinstance(recipe, Recipe):
-        return digest(recipe.ingest)
-    return digest({section.name: recipe.get(section.name) for section in fields(IngestSections)})
+    values = plain_recipe(recipe.ingest) if isinstance(recipe, Recipe) else recipe
+    names = [section.name for section in fields(IngestSections)]
+    return digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
 
 
 def read_key(recipe: Recipe, robot: str | None, *, definitions: str) -> str:
     """Return the hash (hex) of what rules the streams beside the log: the read section, the robot asked for, the definitions given."""
-    return digest({"read": recipe.read, "robot": robot, "definitions": definitions})
+    own = {name: values for name in _OWN_TABLES if (values := getattr(recipe, name))}
+    return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
 
 
 def recipe_id(recipe: Recipe | Mapping[str, Any], robot: str) -> str:
@@ -89,18 +98,29 @@ def _toml_lines(recipe: Recipe, schema: Mapping[str, Any]) -> Iterator[str]:
     yield "# The recipe of tcpipe. Every key is here with its default, commented out; remove the # to change one."
     yield "# Units stand in the names. Reasons: docs/explanation/rulings.md"
     default = Recipe()
-    yield from _key_lines(schema["properties"]["robot"], "robot", recipe.robot, default.robot)
+    names = f"one of {', '.join(sorted(shipped_profiles().robots))}, or of [robots]"
+    yield from _key_lines(schema["properties"]["robot"], "robot", recipe.robot, default.robot, names)
     for section in fields(recipe):
         here = getattr(recipe, section.name)
         if not is_dataclass(here):
             continue
-        definition = schema["$defs"][type(here).__name__]
-        yield ""
-        yield f"# {definition['description']}"
-        yield f"[{section.name}]"
-        for name, kind in kinds_of(type(here)).items():
-            value, usual = getattr(here, name), getattr(getattr(default, section.name), name)
-            yield from _key_lines(definition["properties"][name], name, value, usual, range_of(kind))
+        yield from _table_lines(f"[{section.name}]", here, getattr(default, section.name), schema)
+    robots: Mapping[str, Robot | None] = recipe.robots or {"NAME": None}
+    for name, robot in robots.items():
+        yield from _table_lines(f"[robots.{as_toml(name) if robot else name}]", robot, Robot(), schema)
+    sources: Sequence[PowerSource | None] = recipe.power_sources or [None]
+    for source in sources:
+        yield from _table_lines("[[power_sources]]", source, PowerSource(""), schema)
+
+
+def _table_lines(head: str, here: Any, default: Any, schema: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
+    definition = schema["$defs"][type(default).__name__]
+    yield from ("", f"# {definition['description']}", head if here else f"## {head}")
+    for name, kind in kinds_of(type(default)).items():
+        value, usual = getattr(here or default, name), getattr(default, name)
+        for line in _key_lines(definition["properties"][name], name, value, usual, range_of(kind)):
+            yield line if here else f"#{line}"
 
 
 def _key_lines(schema: Mapping[str, Any], name: str, value: Any, usual: Any, bounds: str = "") -> Iterator[str]:

@@ -14,6 +14,7 @@ from tcpipe import __version__
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError
 from tcpipe.formats.json_files import plain
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import (
     ALL,
@@ -29,7 +30,7 @@ from tcpipe.learning.metrics import (
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
-from tcpipe.logs.profiles import GENERIC, ROBOTS
+from tcpipe.robots.profiles import Robot
 from tcpipe.terrain.classes import NODATA_ID
 
 logger = logging.getLogger("tcpipe")
@@ -128,7 +129,7 @@ def evaluate(
         "splits": {name: _split_values(found, said[name], plant) for name, found in sets.items()},
         "ablation": ablation,
         "energy": energy,
-        "time": _time(ours, sets, said),
+        "time": _time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
         "repeatability": _repeatability(data.card),
         "warnings": [*_warnings(ours, data, sets), *_left_out(data, sets, energy)],
         "plots": {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
@@ -238,12 +239,21 @@ def _by_own_network(networks: Mapping[int, Model], found: Measured) -> Errors:
     return combined(parts)
 
 
-def _time(ours: Model, sets: Sets, said: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+def _fastest_mps(robot: str, data: Dataset) -> float | None:
+    """Return a robot's greatest speed [m/s], as the recipe of the dataset or else the package knows it."""
+    own = data.card["recipe"].get("robots", {}).get(robot)
+    return own["max_velocity_mps"] if own else shipped_profiles().robots.get(robot, Robot()).max_velocity_mps
+
+
+def _time(
+    ours: Model, sets: Sets, said: Mapping[str, Mapping[str, Any]], *, max_velocity_mps: float | None
+) -> dict[str, Any]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's greatest speed."""
-    fastest = ROBOTS.get(ours.robot, GENERIC).max_velocity_mps
     found: dict[str, Any] = {OURS: {name: _all_errors(said[name], part)["T"] for name, part in sets.items()}}
-    if fastest is not None:
-        expected = {name: {"T": np.full(len(part.split), ours.chord_m / fastest)} for name, part in sets.items()}
+    if max_velocity_mps is not None:
+        expected = {
+            name: {"T": np.full(len(part.split), ours.chord_m / max_velocity_mps)} for name, part in sets.items()
+        }
         found[EXPECTED] = {name: _all_errors(expected[name], part)["T"] for name, part in sets.items()}
     return found
 

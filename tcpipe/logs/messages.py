@@ -57,7 +57,7 @@ def read_messages(columns: Columns, role: str, type_name: str) -> Readings:
     ----------
     columns : ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances as shape (N, k); frames and sentences as
         arrays of str.
-    role : gnss, imu, wheel_odometry, visual_odometry or command (power is read by `power_sources`).
+    role : gnss, imu, wheel_odometry, visual_odometry or command (power is read by `tcpipe.power.readings`).
     type_name : ``package/msg/Name``.
     """
     return _READERS[role, type_name]({name: _possible(name, values) for name, values in columns.items()})

@@ -10,21 +10,15 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TypeVar
 
 from tcpipe.logs.coverage import coverage, covering_little
-from tcpipe.logs.power_sources import (
-    BATTERY_STATE,
-    FLOAT_TYPES,
-    POWER_TYPES,
-    PROPULSION_TYPES,
-    is_corrected,
-    quantity,
-    rail_of,
-)
-from tcpipe.logs.profiles import Robot, find_robot
+from tcpipe.logs.robots import find_robot
 from tcpipe.logs.several_robots import namespaces_of_robots
 from tcpipe.logs.topics import Topic
+from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
+from tcpipe.robots.profiles import Profiles
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
 NMEA_SENTENCE = "nmea_msgs/msg/Sentence"
@@ -42,10 +36,10 @@ ROLE_TYPES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
     "wheel_odometry": _MEASURED_TWISTS,
     "visual_odometry": _MEASURED_TWISTS,
-    "power": (*POWER_TYPES, *FLOAT_TYPES),
+    "power": FLOAT_TYPES,
     "command": (TWIST_STAMPED, TWIST),
 }
-"""Message types that can play each role, best first."""
+"""Message types that can play each role, best first; power has those of the profiles before these."""
 
 MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss")
 """Roles of which a log needs one."""
@@ -69,7 +63,7 @@ class Assignment:
     ``warnings`` what the run will lack; ``transforms`` are the topics that may place sensors, static ones first.
     """
 
-    robot: Robot
+    robot: str
     robot_why: str
     roles: Mapping[str, Role]
     left_out: Mapping[str, str]
@@ -87,6 +81,10 @@ class Assignment:
 class _Casting:
     """The decisions while they are made."""
 
+    types: Mapping[str, tuple[str, ...]]
+    """Message types that can play each role, best first."""
+    propulsion: Sequence[str]
+    """Those that tell propulsion apart, best first."""
     roles: dict[str, Role] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     passed_over: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -111,6 +109,7 @@ def assign_roles(
     ignored: Sequence[str] = (),
     robot: str | None = None,
     *,
+    known: Profiles,
     namespace: str | None = None,
 ) -> Assignment:
     """Return which topic plays which role, and why.
@@ -122,6 +121,7 @@ def assign_roles(
         empty list means that nothing plays the role.
     ignored : recipe key ``read.ignore_topics``.
     robot : profile name, where the user gave one.
+    known : robots, and message types that carry power.
     namespace : recipe key ``read.namespace``; topics elsewhere play no role unless they are chosen by name.
 
     Raises
@@ -132,8 +132,9 @@ def assign_roles(
     named = {name for names in chosen.values() for name in names}
     listed = {name: topic for name, topic in every.items() if _is_in(namespace, topic) or name in named}
     wanted = {str(role): names for role, names in chosen.items()}
-    profile, robot_why = find_robot(listed.values(), robot)
-    casting = _Casting()
+    name, robot_why = find_robot(listed.values(), robot, known.robots)
+    types = {**ROLE_TYPES, "power": tuple(dict.fromkeys([*known.types(), *FLOAT_TYPES]))}
+    casting = _Casting(types, [of for of in known.types(propulsion=True) if of not in FLOAT_TYPES])
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
         casting.problems.append(
             f"recipe read.namespace: no topic lies below {namespace}; the log holds {_listing(every.values())}"
@@ -155,7 +156,7 @@ def assign_roles(
             _decide(casting, role, candidates)
     problems = casting.problems + (_without_motion(casting, list(listed.values())) or _questions(casting))
     return Assignment(
-        profile,
+        name,
         robot_why,
         {role: casting.roles[role] for role in ROLE_TYPES if role in casting.roles},
         casting.left_out,
@@ -196,12 +197,13 @@ def _take_chosen(casting: _Casting, topics: Mapping[str, Topic], chosen: Mapping
             casting.undecided.add(role)
             casting.problems.append(
                 f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not hold; "
-                f"it holds {_listing(topics.values(), ROLE_TYPES[role])}"
+                f"it holds {_listing(topics.values(), casting.types[role])}"
             )
         for name in wanted:
-            if topics[name].type_name not in ROLE_TYPES[role]:
+            if topics[name].type_name not in casting.types[role]:
+                wanted_types = " or ".join(casting.types[role])
                 casting.problems.append(
-                    f"recipe read.topics.{role}: {name} is {topics[name].type_name}; wanted {' or '.join(ROLE_TYPES[role])}"
+                    f"recipe read.topics.{role}: {name} is {topics[name].type_name}; wanted {wanted_types}"
                 )
             elif topics[name].problem is not None:
                 casting.problems.append(f"recipe read.topics.{role}: {name} cannot be read: {topics[name].problem}")
@@ -210,7 +212,7 @@ def _take_chosen(casting: _Casting, topics: Mapping[str, Topic], chosen: Mapping
 
 
 def _is_usable(casting: _Casting, topic: Topic, ignored: Sequence[str]) -> bool:
-    if not any(topic.type_name in types for types in ROLE_TYPES.values()):
+    if not any(topic.type_name in types for types in casting.types.values()):
         return False
     if topic.type_name in FLOAT_TYPES and quantity(topic.name) is None:
         return False
@@ -265,10 +267,10 @@ def _candidates(
     for topic in topics:
         if topic.type_name in FLOAT_TYPES:
             continue
-        role, rank, why = _SORTERS[topic.type_name](topic)
+        role, rank, why = (_SORTERS.get(topic.type_name) or partial(_sort_power, casting.propulsion))(topic)
         if role is None:
             casting.left_out[topic.name] = why
-            usual = next(role for role, types in ROLE_TYPES.items() if topic.type_name in types)
+            usual = next(role for role, types in casting.types.items() if topic.type_name in types)
             if usual not in chosen:
                 casting.pass_over(usual, topic, why)
         elif role in chosen:
@@ -329,10 +331,10 @@ def _sort_command(topic: Topic) -> Sorted:
 _DRIVES = re.compile(r"drive|motor|wheel|traction")
 
 
-def _sort_power(topic: Topic) -> Sorted:
+def _sort_power(propulsion: Sequence[str], topic: Topic) -> Sorted:
     """Rank: messages that tell propulsion apart, then what hangs on the drives, then whole batteries."""
-    if topic.type_name in PROPULSION_TYPES:
-        return "power", (0, PROPULSION_TYPES.index(topic.type_name)), "its type tells propulsion apart"
+    if topic.type_name in propulsion:
+        return "power", (0, propulsion.index(topic.type_name)), "its type tells propulsion apart"
     if topic.type_name == BATTERY_STATE:
         return "power", (1 if _says(_DRIVES, topic.name) else 4,), ""
     return "power", (3,), ""
@@ -359,7 +361,6 @@ _SORTERS: dict[str, Callable[[Topic], Sorted]] = {
     **dict.fromkeys(ROLE_TYPES["command"], _sort_command),
     **dict.fromkeys(ROLE_TYPES["imu"], _sort_imu),
     **dict.fromkeys(_MEASURED_TWISTS, _sort_odometry),
-    **dict.fromkeys(POWER_TYPES, _sort_power),
 }
 
 

@@ -326,7 +326,7 @@ def _stored(directory: Path, card: Mapping[str, Any], row: int) -> dict[str, NDA
 
 def _changed_keys(recipe: Recipe) -> dict[str, Any]:
     """Return the recipe's keys that are not at their default."""
-    return {key: value for key, value in flat_recipe(asdict(recipe)).items() if value != _DEFAULTS[key]}
+    return {key: value for key, value in flat_recipe(asdict(recipe)).items() if value != _DEFAULTS.get(key)}
 
 
 def flat_recipe(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

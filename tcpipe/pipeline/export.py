@@ -18,8 +18,8 @@ from tcpipe.formats.atomic import clear
 from tcpipe.formats.json_files import read_json, write_json
 from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.parquet import parquet_rows, read_schema, storable
-from tcpipe.logs.power_sources import bare_unit
 from tcpipe.pipeline.log_sources import definitions_key
+from tcpipe.power.sources import bare_unit
 from tcpipe.store import is_store
 from tcpipe.tables.levels import metadata_of, with_metadata
 

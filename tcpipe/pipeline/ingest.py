@@ -21,9 +21,9 @@ from tcpipe.execution import run_all
 from tcpipe.formats.json_files import digest, plain
 from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, read_key, recipe_id
+from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, plain_recipe, read_key, recipe_id
 from tcpipe.formats.record_files import record_name
-from tcpipe.logs.profiles import ROBOTS, Robot
+from tcpipe.formats.robot_files import profiles_of
 from tcpipe.pipeline.known_trouble import Trouble, failure_name, failure_record
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
@@ -180,8 +180,8 @@ def ingest(
     """
     ruling = recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(_as_path(recipe), Path.cwd()))
     robot = robot or ruling.robot
-    if robot is not None and robot not in ROBOTS:
-        raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(ROBOTS))}")
+    if robot is not None and robot not in (robots := profiles_of(ruling).robots):
+        raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
     with _place_for_stand_ins(logs := list(logs)) as staging, _gone_if_empty(Path(store)):
         found = find_sources(logs, as_one=as_one, staging=Path(staging))
         if not found.sources:
@@ -428,7 +428,7 @@ def run_stages(
     from tcpipe.stages.label import label_segments  # noqa: PLC0415
     from tcpipe.stages.segment import segment_track  # noqa: PLC0415
 
-    profile: Robot = ROBOTS[streams.robot]
+    profile = profiles_of(sections).robots[streams.robot]
     logger.info("%s: fusing", name)
     track = fuse_run(streams, sections.fuse, run_id=run_id)
     logger.info("%s: cutting and labelling", name)
@@ -450,7 +450,7 @@ def _streams(store: Store, run_id: str, log: Any, task: IngestTask) -> tuple[Str
     cached = store.read_streams(run_id, key=key) if same and not task.force else None
     if cached is not None and known is not None:
         return cached, list(known["damage"]), list(known.get("remarks", ()))
-    streams = read_run(log, task.recipe.read, robot=task.robot)
+    streams = read_run(log, task.recipe.read, robot=task.robot, known=profiles_of(task.recipe))
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
     store.write_streams(run_id, streams, key=key)
@@ -493,7 +493,7 @@ def _manifest(task: IngestTask, streams: Streams, track: Track, labelled: Labell
         "data_model_version": DATA_MODEL_VERSION,
         "tcpipe_version": __version__,
         "ingest_key": ingest_key(task.recipe),
-        "recipe": plain(task.recipe.ingest),
+        "recipe": plain_recipe(task.recipe.ingest),
         "robot": streams.robot,
         "robot_requested": task.robot,
         "message_definitions": task.definitions,

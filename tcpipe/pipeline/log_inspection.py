@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from tcpipe.formats.logs.log_file import Log
+from tcpipe.formats.robot_files import profiles_of
 from tcpipe.logs.clocks import SIMULATED_NS, is_simulated, settle_clocks
 from tcpipe.logs.roles import assign_roles
 from tcpipe.logs.topics import Topic
@@ -22,7 +23,14 @@ def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> d
         Read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
     """
     config = recipe.read
-    cast = assign_roles(log.topics.values(), config.topics, config.ignore_topics, robot, namespace=config.namespace)
+    cast = assign_roles(
+        log.topics.values(),
+        config.topics,
+        config.ignore_topics,
+        robot,
+        known=profiles_of(recipe),
+        namespace=config.namespace,
+    )
     playing = {topic: (name, role.why) for name, role in cast.roles.items() for topic in role.topics}
     playing |= dict.fromkeys(cast.transforms, ("transforms", "places the sensors"))
     read, clocks = _read(log) if full else ({}, {})
@@ -35,7 +43,7 @@ def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> d
         "size_bytes": log.size_bytes,
         "start_ns": min(starts, default=None),
         "duration_s": (max(ends) - min(starts)) / 1e9 if starts and ends else None,
-        "robot": cast.robot.name,
+        "robot": cast.robot,
         "robot_why": cast.robot_why,
         "topics": [
             {

@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from numbers import Integral, Real
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -126,7 +126,10 @@ def _settled(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
     if hasattr(value, "tolist"):  # numpy scalars and arrays
         value = value.tolist()
     if isinstance(kind, type) and is_dataclass(kind):
-        return value if isinstance(value, kind) else _dataclass(kind, value, key, problems)
+        if isinstance(value, kind) and hasattr(kind, "__post_init__"):  # it has settled itself
+            return value
+        plain = {name: getattr(value, name) for name in kinds_of(kind)} if isinstance(value, kind) else value
+        return _dataclass(kind, plain, key, problems)
     origin = get_origin(kind)
     if origin is Literal:
         wanted = None if isinstance(value, str) and value in get_args(kind) else f"one of {', '.join(get_args(kind))}"
@@ -150,7 +153,14 @@ def _dataclass(cls: Any, values: Any, key: str, problems: list[str]) -> Any:
         for name, value in values.items()
         if _is_known(name, known, key, problems)
     }
-    return cls(**made) if len(problems) == before else None
+    needed = (of.name for of in fields(cls) if of.default is MISSING and of.default_factory is MISSING)
+    problems += [f"{_below(key, name)} is missing" for name in needed if name not in values]
+    if len(problems) > before:
+        return None
+    whole = cls(**made)
+    for name, wanted in whole.contradictions() if hasattr(cls, "contradictions") else ():
+        _refuse(_below(key, name), getattr(whole, name), wanted, problems)
+    return whole
 
 
 def _table(kinds: tuple[Any, ...], value: Any, key: str, problems: list[str]) -> Any:
@@ -159,7 +169,7 @@ def _table(kinds: tuple[Any, ...], value: Any, key: str, problems: list[str]) ->
     return {
         name: _settled(kinds[1], item, _below(key, name), problems)
         for name, item in value.items()
-        if _is_known(name, get_args(kinds[0]), key, problems)
+        if kinds[0] is str or _is_known(name, get_args(kinds[0]), key, problems)
     }
 
 

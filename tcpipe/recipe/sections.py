@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, Le, Lt
 
 from tcpipe.recipe.checking import settle
+from tcpipe.robots.profiles import PowerSource, Robot
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
@@ -278,6 +279,8 @@ class IngestSections:
     gate: GateConfig
     segment: SegmentConfig
     label: LabelConfig
+    robots: dict[str, Robot] = field(default_factory=dict)
+    power_sources: list[PowerSource] = field(default_factory=list)
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,7 +290,7 @@ class Recipe:
     __pydantic_config__ = _STRICT
 
     robot: str | None = None
-    """Robot profile (husky, jackal, warthog, dingo, ridgeback, generic); none finds it by message types and topic names."""
+    """The robot's profile by name; none finds it by message types and topic names."""
     read: ReadConfig = field(default_factory=ReadConfig)
     fuse: FuseConfig = field(default_factory=FuseConfig)
     gate: GateConfig = field(default_factory=GateConfig)
@@ -296,6 +299,10 @@ class Recipe:
     sample: SampleConfig = field(default_factory=SampleConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    robots: dict[str, Robot] = field(default_factory=dict)
+    """Robots of your own by name; one that is called as one of tcpipe's takes its place."""
+    power_sources: list[PowerSource] = field(default_factory=list)
+    """What message types of your own tell of power, a table a rail; those of a type take the place of tcpipe's of that type."""
 
     def __post_init__(self) -> None:
         settle(self, "")
@@ -303,4 +310,6 @@ class Recipe:
     @property
     def ingest(self) -> IngestSections:
         """The sections that rule a run's files."""
-        return IngestSections(self.read, self.fuse, self.gate, self.segment, self.label)
+        return IngestSections(
+            self.read, self.fuse, self.gate, self.segment, self.label, self.robots, self.power_sources
+        )

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
 from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
-from tcpipe.logs.power_readings import PowerReadings, columns_of
 from tcpipe.logs.roles import MOTION_ROLES, assign_roles
+from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig
+from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_findings import read_findings
+from tcpipe.stages.read_power import columns_of
 from tcpipe.stages.read_sensors import place_sensors
 from tcpipe.stages.read_sources import Source, read_sources
 from tcpipe.tables.levels import STREAMS, Streams
 
 
-def read_run(log: LogReader, config: ReadConfig, *, robot: str | None) -> Streams:
+def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Profiles) -> Streams:
     """Return the streams of a log.
 
     Parameters
@@ -30,6 +32,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None) -> Stream
     log : the opened log.
     config : topics, placements, clocks and power, where the log does not say.
     robot : profile name; None finds it by message types and topic names.
+    known : robots, and what message types tell of power.
 
     Raises
     ------
@@ -38,13 +41,13 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None) -> Stream
     """
     # 1. Which topic plays which role, from the topic list alone.
     topics, namespace = log.topics.values(), config.namespace
-    assignment = assign_roles(topics, config.topics, config.ignore_topics, robot, namespace=namespace)
+    assignment = assign_roles(topics, config.topics, config.ignore_topics, robot, known=known, namespace=namespace)
     if assignment.problems:
         raise RoleError(*assignment.problems)
     # 2. Messages to SI columns; what cannot be used is counted.
     played = [topic for role in assignment.roles.values() for topic in role.topics]
     tables = log.tables([*played, *assignment.static_transforms])
-    every, power, unread = read_sources(tables, log.topics, assignment, config)
+    every, power, unread = read_sources(tables, log.topics, assignment, config, known=known)
     # 3. Every stamp on one clock, every epoch common to all.
     timelines, steps = settle_clocks(
         {source.topic: _times(source, config) for source in every if len(source.readings.row)}
@@ -62,7 +65,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None) -> Stream
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry and gnss have no usable row"
         raise RoleError(what, *findings.warnings)
     averaged = {"auto": power.averaged, "yes": True, "no": False}[config.power_averaged]
-    return Streams(streams, sensors, assignment.robot.name, config.gnss_crs, averaged, findings)
+    return Streams(streams, sensors, assignment.robot, config.gnss_crs, averaged, findings)
 
 
 def _times(source: Source, config: ReadConfig) -> TopicTimes:
@@ -101,8 +104,8 @@ def _parts(source: Source, timeline: Timeline, power: PowerReadings) -> list[dic
         return [times | columns]
     parts = []
     for rail in power.rails[source.topic]:
-        voltage, current = (columns[name] for name in columns_of(rail))
+        voltage, current = (columns[name] for name in columns_of(rail.name))
         known = np.isfinite(voltage) | np.isfinite(current)
-        values = {**times, "rail": np.full(len(known), rail), "voltage_volt": voltage, "current_amp": current}
+        values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
         parts.append({name: value[known] for name, value in values.items()})
     return parts

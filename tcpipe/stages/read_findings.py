@@ -7,8 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from tcpipe.logs.clocks import Timeline, about_simulated_time
-from tcpipe.logs.power_readings import PowerReadings
 from tcpipe.logs.roles import Assignment
+from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import Source
 from tcpipe.tables.findings import (
     ClockStep,
@@ -45,7 +45,7 @@ def read_findings(
         for step in steps
     ]
     facts = RunFacts(
-        robot=RobotChoice(assignment.robot.name, assignment.robot_why),
+        robot=RobotChoice(assignment.robot, assignment.robot_why),
         roles={role: _role_facts(role, assignment, sources, timelines, sensors[role]) for role in sensors},
         left_out=assignment.left_out,
         epochs=len(steps) + 1,

@@ -11,11 +11,13 @@ from numpy.typing import NDArray
 
 from tcpipe.logs.imu_units import imu_in_si
 from tcpipe.logs.messages import Readings, needed_fields, read_messages
-from tcpipe.logs.power_readings import PowerReadings, read_power
 from tcpipe.logs.roles import Assignment
 from tcpipe.logs.topics import Topic
+from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig, Role
+from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.message_arrays import message_arrays
+from tcpipe.stages.read_power import power_of_topics, power_rows
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +32,12 @@ class Source:
 
 
 def read_sources(
-    tables: Mapping[str, pa.Table], topics: Mapping[str, Topic], assignment: Assignment, config: ReadConfig
+    tables: Mapping[str, pa.Table],
+    topics: Mapping[str, Topic],
+    assignment: Assignment,
+    config: ReadConfig,
+    *,
+    known: Profiles,
 ) -> tuple[list[Source], PowerReadings, list[str]]:
     """Read the tables of every topic that plays a role.
 
@@ -54,8 +61,11 @@ def read_sources(
         else:
             arrays[topic] = found
     types = {topic: topics[topic].type_name for topic in arrays}
-    power = _power(
-        {topic: (types[topic], arrays[topic]) for topic in arrays if role_of[topic] == "power"}, assignment, config
+    power = power_of_topics(
+        {topic: (types[topic], arrays[topic]) for topic in arrays if role_of[topic] == "power"},
+        assignment,
+        config,
+        known=known,
     )
     sources = []
     for topic, columns in arrays.items():
@@ -65,17 +75,6 @@ def read_sources(
             if role == "imu":
                 readings = imu_in_si(readings, config.imu_units)
             sources.append(Source(topic, role, types[topic], columns, readings))
-        elif topic in power.readings:
-            sources.append(Source(topic, role, types[topic], columns, power.readings[topic]))
+        elif topic in power.rails:
+            sources.append(Source(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))
     return sources, power, warnings
-
-
-def _power(
-    topics: Mapping[str, tuple[str, Mapping[str, NDArray[Any]]]], assignment: Assignment, config: ReadConfig
-) -> PowerReadings:
-    wanted = len(assignment.roles["power"].topics) if "power" in assignment.roles else 0
-    if not topics:
-        return PowerReadings()
-    if len(topics) < wanted:
-        return PowerReadings(warnings=("power refused: not all of its topics can be decoded; there will be no energy",))
-    return read_power(topics, assignment.robot, husky_power=config.husky_power, current_sign=config.current_sign)

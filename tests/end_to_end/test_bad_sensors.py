@@ -11,6 +11,7 @@ import pytest
 from tcpipe.errors import FusionError, RoleError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.pipeline.ingest import run_stages
 from tcpipe.recipe import Placement, ReadConfig, Recipe
 from tcpipe.simulation import Faults, Truth, scenario, simulated_drive, true_cost
@@ -66,7 +67,7 @@ def drive() -> Drive:
 def read(drive: Drive, out: Path, config: ReadConfig | None = None) -> Streams:
     write_mcap(out / "run.mcap", drive.messages)
     with open_log(out / "run.mcap") as log:
-        return read_run(log, config or ReadConfig(), robot=None)
+        return read_run(log, config or ReadConfig(), robot=None, known=shipped_profiles())
 
 
 def run(drive: Drive, out: Path, config: ReadConfig | None = None) -> LabelledSegments:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, ReadConfig
@@ -19,7 +20,7 @@ def drive(request, tmp_path_factory):
     faults = Faults() if request.param == "no faults" else Faults.every()
     site = simulate(tmp_path_factory.mktemp("site"), scenario=tiny(faults, seconds=60.0), seed=5)
     with open_log(site.logs[0]) as log:
-        streams = read_run(log, ReadConfig(), robot=None)
+        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
     return streams, read_truth(site.truths[0])
 
 

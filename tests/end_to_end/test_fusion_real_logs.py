@@ -5,6 +5,7 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.recipe import FuseConfig, Placement, ReadConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.read import read_run
@@ -13,7 +14,7 @@ from tcpipe.tables.columns import floats, integers
 
 def fused(name, config=None):
     with open_log(shared_data(name)) as log:
-        streams = read_run(log, config or ReadConfig(), robot=None)
+        streams = read_run(log, config or ReadConfig(), robot=None, known=shipped_profiles())
     return streams, fuse_run(streams, FuseConfig(), run_id="run")
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.recipe import FuseConfig, GateConfig, LabelConfig, ReadConfig, SegmentConfig
 from tcpipe.simulation import Faults, read_truth, scenario, simulate, tiny, true_cost
 from tcpipe.simulation.messages import Recorder
@@ -20,7 +21,7 @@ from tcpipe.tables.columns import floats, integers
 
 def run(site, *, config=None):
     with open_log(site.logs[0]) as log:
-        streams = read_run(log, ReadConfig(), robot="husky")
+        streams = read_run(log, ReadConfig(), robot="husky", known=shipped_profiles())
     track = fuse_run(streams, FuseConfig(), run_id="run")
     gated = gate_track(track, config or GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
     segments = segment_track(gated, SegmentConfig())

@@ -7,6 +7,7 @@ import pytest
 from shared_data import shared_data
 
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.power.energy import recorded_energy_joule
 from tcpipe.power.rails import rail, samples
 from tcpipe.recipe import ReadConfig
@@ -18,7 +19,7 @@ def test_exact_and_trapezoid_energy_of_the_warthog():
     log_path = shared_data("warthog_grass_a/run.mcap")
     reference = json.loads(shared_data("warthog_grass_a/reference.json").read_text())["E_trapezoid_joule"]
     with open_log(log_path) as log:
-        streams = read_run(log, ReadConfig(), robot=None)
+        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
     rails = rails_of(streams, 0)
     assert len(rails) == 2
     begin, end = (np.array([pick(each.stamp_ns[k] for each in rails)]) for pick, k in ((min, 0), (max, -1)))
@@ -37,7 +38,7 @@ def test_exact_and_trapezoid_energy_of_the_warthog():
 
 def test_reading_half_the_samples_changes_the_run_little():
     with open_log(shared_data("warthog_grass_a/run.mcap")) as log:
-        streams = read_run(log, ReadConfig(), robot=None)
+        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
     whole, half = 0.0, 0.0
     for each in rails_of(streams, 0):
         thinned = rail(

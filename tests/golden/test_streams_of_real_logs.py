@@ -10,6 +10,7 @@ from shared_data import shared_data
 
 from tcpipe.errors import RoleError
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import Streams
@@ -17,7 +18,7 @@ from tcpipe.tables.levels import Streams
 
 def read(path: Path, robot: str | None = None, **config) -> Streams:
     with open_log(path) as log:
-        return read_run(log, ReadConfig(**config), robot=robot)
+        return read_run(log, ReadConfig(**config), robot=robot, known=shipped_profiles())
 
 
 @pytest.mark.parametrize("robot", [None, "warthog"])

@@ -16,6 +16,7 @@ from tcpipe.cost.budget import pooled
 from tcpipe.formats.dataset_files import KIND, FileFormat, Layer
 from tcpipe.formats.maps.class_table import table_to_json
 from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.recipe_toml import plain_recipe
 from tcpipe.recipe import Recipe
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut
@@ -69,7 +70,7 @@ def dataset_card(samples: pa.Table, recipe: Recipe, facts: CardFacts) -> dict[st
         "licence": about.licence,
         "creator": about.creator,
         **measured(samples, has_terrain=has_terrain),
-        "recipe": asdict(recipe),
+        "recipe": plain_recipe(recipe),
         "format": facts.file_format,
         "patch_m": recipe.sample.patch_m,
         "patch_px": recipe.sample.patch_px,

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,8 @@ from tcpipe.formats.dataset_files import (
     read_samples,
     sample_columns,
 )
-from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.json_files import digest
+from tcpipe.formats.recipe_toml import plain_recipe
 from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_sealed
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
@@ -73,7 +74,7 @@ def choose_inputs(
     fingerprint = digest(
         {
             "versions": [__version__, DATA_MODEL_VERSION],
-            "recipe": plain(asdict(recipe)),
+            "recipe": plain_recipe(recipe),
             "runs": sources,
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),

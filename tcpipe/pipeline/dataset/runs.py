@@ -12,9 +12,9 @@ from typing import Any
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.json_files import misfit
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.logs.profiles import GENERIC
 from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
+from tcpipe.robots.profiles import GENERIC
 from tcpipe.store import Ingestions, RunDirectory, Store
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
@@ -52,7 +52,7 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     if not runs:
         raise DatasetError(*lines)
     if robot is None:
-        _refuse_unlike(store, [run.run_id for run in runs if run.robot == GENERIC.name])
+        _refuse_unlike(store, [run.run_id for run in runs if run.robot == GENERIC])
     others = [run for run in (*found.finished, *found.outdated.values()) if run.run_id not in {*known, *damaged}]
     others = [run for run in others if _belongs(run.manifest, robot, tags)]
     left_out = {*damaged, *(run.run_id for run in others)}
@@ -86,7 +86,7 @@ def _refuse_unlike(store: Store, run_ids: Iterable[str]) -> None:
     groups = alike({run_id: _known(store, run_id).get("sensors", {}) for run_id in run_ids})
     if len(groups) > 1:
         raise DatasetError(
-            f"{store.root}: the runs of robot {GENERIC.name} are not all of one robot: their sensors differ; wanted one: tag each "
+            f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; wanted one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
             *(f"{_named(runs)}: {in_words(seen)}" for runs, seen in groups),
         )

@@ -3,7 +3,9 @@
 import pytest
 
 from tcpipe.errors import RecipeError
-from tcpipe.logs.roles import Assignment, assign_roles
+from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.logs import roles
+from tcpipe.logs.roles import Assignment
 from tcpipe.logs.topics import Topic
 
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
@@ -13,6 +15,10 @@ BATTERY, HUSKY, POWER = (
     "husky_msgs/msg/HuskyStatus",
     "clearpath_platform_msgs/msg/Power",
 )
+
+
+def assign_roles(*given, **named):
+    return roles.assign_roles(*given, **named, known=shipped_profiles())
 
 
 def topic(name: str, type_name: str, count: int | None = 101, problem: str | None = None) -> Topic:
@@ -55,7 +61,7 @@ def test_a_ros1_husky_with_everything() -> None:
         "power": ("/status",),
         "command": ("/husky_velocity_controller/cmd_vel",),
     }
-    assert found.robot.name == "husky"
+    assert found.robot == "husky"
     assert found.transforms == ("/tf_static", "/tf")
     assert [line.split(" (")[0] for line in found.warnings] == [
         "wheel_odometry: left out: /odometry/filtered",
@@ -88,7 +94,7 @@ def test_a_ros2_husky_prefers_the_platform_over_the_estimators_and_bare_batterie
         "power": ("/a200_0000/platform/mcu/status/power",),
         "command": ("/a200_0000/platform/cmd_vel",),
     }
-    assert found.robot.name == "husky"
+    assert found.robot == "husky"
 
 
 def test_both_drives_of_a_warthog_are_summed_and_icp_is_no_sensor() -> None:
@@ -103,7 +109,7 @@ def test_both_drives_of_a_warthog_are_summed_and_icp_is_no_sensor() -> None:
     assert played(found)["power"] == ("/left_drive/battery", "/right_drive/battery")
     assert played(found)["wheel_odometry"] == ("/odom",)
     assert "icp" in found.left_out["/icp_odom"]
-    assert found.robot.name == "generic"
+    assert found.robot == "generic"
 
 
 FLOAT = "std_msgs/msg/Float64"
@@ -322,11 +328,11 @@ def test_names(name: str, kind: str, role: str | None) -> None:
     ],
 )
 def test_the_robot_is_found_by_types_then_by_names(topics: list[tuple[str, str]], robot: str) -> None:
-    assert assign(*topics, ("/wheel/odom", ODOMETRY)).robot.name == robot
+    assert assign(*topics, ("/wheel/odom", ODOMETRY)).robot == robot
 
 
 def test_the_robot_given_rules_and_must_exist() -> None:
-    assert assign(("/status", HUSKY), ("/odom", ODOMETRY), robot="warthog").robot.name == "warthog"
+    assert assign(("/status", HUSKY), ("/odom", ODOMETRY), robot="warthog").robot == "warthog"
     with pytest.raises(RecipeError, match="there are dingo, generic, husky, jackal, ridgeback, warthog"):
         assign(("/odom", ODOMETRY), robot="spot")
 

@@ -1,10 +1,15 @@
 """Two robots are told from one robot with a camera that has sensors of its own."""
 
-from tcpipe.logs.roles import assign_roles
+from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.logs import roles
 from tcpipe.logs.several_robots import namespaces_of_robots
 from tcpipe.logs.topics import Topic
 
 KINDS = {"fix": "sensor_msgs/msg/NavSatFix", "imu": "sensor_msgs/msg/Imu", "odom": "nav_msgs/msg/Odometry"}
+
+
+def assign_roles(*given, **named):
+    return roles.assign_roles(*given, **named, known=shipped_profiles())
 
 
 def test_three_roles_in_two_namespaces_are_two_robots():

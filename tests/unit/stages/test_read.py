@@ -10,9 +10,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.errors import RoleError
+from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.logs.topics import Topic
+from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import Placement, ReadConfig
 from tcpipe.stages.read import read_run
+from tcpipe.stages.read_power import power_rows
 from tcpipe.tables.levels import Streams
 
 S = 1_000_000_000
@@ -155,7 +158,7 @@ def husky(**more: tuple[str, pa.Table]) -> dict[str, tuple[str, pa.Table]]:
 
 
 def read(topics: Mapping[str, tuple[str, pa.Table]], robot: str | None = None, **config) -> Streams:
-    return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot)
+    return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot, known=shipped_profiles())
 
 
 def test_a_whole_husky() -> None:
@@ -210,7 +213,7 @@ def test_the_same_log_gives_the_same_bytes() -> None:
 def test_only_the_topics_of_roles_are_read_and_tf_only_where_it_is_needed() -> None:
     moving = transforms(("odom", "base_link", (1.0, 0.0, 0.0), Rotation.identity()))
     log = MemoryLog(husky(**{"/tf": moving, "/image": ("sensor_msgs/msg/Image", message_table(1, 1.0))}))
-    read_run(log, ReadConfig(), robot=None)
+    read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
     assert "/image" not in log.read
     assert "/tf" not in log.read
     assert len(log.read) == len(set(log.read))
@@ -253,7 +256,7 @@ def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell()
     )
     log.topics = {name: replace(topic, message_count=None) for name, topic in log.topics.items()}
     recipe = ReadConfig(topics={"wheel_odometry": ["/odom"]})
-    assert set(read_run(log, recipe, robot=None).tables) == {"wheel_odometry"}
+    assert set(read_run(log, recipe, robot=None, known=shipped_profiles()).tables) == {"wheel_odometry"}
 
 
 def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
@@ -277,7 +280,9 @@ def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
 
 
 def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
-    found = read_run(MemoryLog(husky(), undecodable=["/fix", "/left/battery"]), ReadConfig(), robot=None)
+    found = read_run(
+        MemoryLog(husky(), undecodable=["/fix", "/left/battery"]), ReadConfig(), robot=None, known=shipped_profiles()
+    )
     assert "gnss" not in found.tables
     assert "power" not in found.tables  # one side alone is not the robot's power
     text = "\n".join(found.findings.warnings)
@@ -345,3 +350,11 @@ def test_a_step_of_all_clocks_divides_every_table() -> None:
         epoch = table["epoch"].to_numpy()
         np.testing.assert_array_equal(epoch == 1, table["log_time_ns"].to_numpy() >= START + 5 * S, err_msg=role)
     assert any("steps by +7.000 s" in text for text in found.findings.warnings)
+
+
+def test_rows_of_power_that_carry_nothing_are_counted() -> None:
+    volt, amp = np.full(6, 26.0), np.full(6, 5.0)
+    volt[3] = amp[3] = amp[5] = np.nan
+    found = power_rows({"log_time_ns": np.arange(6)}, [RailReadings("battery", volt, amp)])
+    assert found.dropped == {"not_finite": 1}
+    assert found.row.tolist() == [0, 1, 2, 4, 5]

@@ -3,14 +3,24 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.power_readings import PowerReadings, columns_of, read_power
-from tcpipe.logs.power_sources import BATTERY_STATE, CLEARPATH_POWER, HUSKY_STATUS
-from tcpipe.logs.profiles import ROBOTS
+from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.power import readings
+from tcpipe.power.readings import PowerReadings
+from tcpipe.power.sources import BATTERY_STATE
+from tcpipe.robots.profiles import PowerSource
+
+HUSKY_STATUS = "husky_msgs/msg/HuskyStatus"
+CLEARPATH_POWER = "clearpath_platform_msgs/msg/Power"
 
 N = 40
 TIMES = {"log_time_ns": np.arange(N) * 50_000_000}
 VOLT = 26.0 + np.sin(np.arange(N))
 AMP = 5.0 + np.cos(np.arange(N))
+
+
+def read_power(topics, robot: str, **options) -> PowerReadings:
+    known = shipped_profiles()
+    return readings.read_power(topics, known.power_sources, platform=known.robots[robot].platform, **options)
 
 
 def husky_status() -> dict[str, np.ndarray]:
@@ -29,24 +39,19 @@ def battery(voltage: np.ndarray, current: np.ndarray, percentage: float = np.nan
 
 
 def power_watt(found: PowerReadings) -> np.ndarray:
-    assert found.readings, found.warnings
-    watt = np.zeros(N)
-    for topic, rails in found.rails.items():
-        for rail in rails:
-            voltage, current = (found.readings[topic].columns[name] for name in columns_of(rail))
-            watt += voltage * current
-    return watt
+    assert found.rails, found.warnings
+    return np.sum([rail.voltage_volt * rail.current_amp for rails in found.rails.values() for rail in rails], axis=0)
 
 
 def test_a_huskys_propulsion_is_battery_voltage_times_both_drivers() -> None:
-    found = read_power({"/status": (HUSKY_STATUS, husky_status())}, ROBOTS["husky"])
+    found = read_power({"/status": (HUSKY_STATUS, husky_status())}, "husky")
     np.testing.assert_allclose(power_watt(found), VOLT * (2 * AMP + 1.0), rtol=1e-14)
     assert not found.averaged
     assert found.warnings == ()
 
 
 def test_a_huskys_drivers_can_be_taken_each_by_itself() -> None:
-    found = read_power({"/status": (HUSKY_STATUS, husky_status())}, ROBOTS["husky"], husky_power="drivers")
+    found = read_power({"/status": (HUSKY_STATUS, husky_status())}, "husky", husky_power="drivers")
     expected = (VOLT - 0.5) * AMP + (VOLT - 0.7) * (AMP + 1.0)
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-14)
 
@@ -69,7 +74,7 @@ def clearpath(voltages: tuple, currents: tuple) -> dict[str, np.ndarray]:
 def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarray) -> None:
     columns = clearpath((VOLT, VOLT - 1, VOLT - 2), (np.full(N, 9.0) + 0.0 * AMP, AMP, 2 * AMP))
     columns["measured_currents"][:, 0] += np.where(np.arange(N) == 0, 1e-9, 0)  # a current that moves, if little
-    found = read_power({"/power": (CLEARPATH_POWER, columns)}, ROBOTS[robot], husky_power=option)
+    found = read_power({"/power": (CLEARPATH_POWER, columns)}, robot, husky_power=option)
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
     assert found.averaged
     assert bool(found.warnings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
@@ -77,14 +82,12 @@ def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarr
 
 def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
     two = clearpath((VOLT,), (AMP, AMP))
-    assert "measured_currents holds 2 values" in read_power({"/p": (CLEARPATH_POWER, two)}, ROBOTS["husky"]).warnings[0]
+    assert "measured_currents holds 2 values" in read_power({"/p": (CLEARPATH_POWER, two)}, "husky").warnings[0]
     four = clearpath((VOLT, VOLT, VOLT), (AMP, AMP, AMP, AMP))  # a Jackal's, whose second and third are no drivers'
-    assert (
-        "holds 4 values, this platform's 3" in read_power({"/p": (CLEARPATH_POWER, four)}, ROBOTS["husky"]).warnings[0]
-    )
-    unknown = read_power({"/p": (CLEARPATH_POWER, two)}, ROBOTS["generic"])
+    assert "holds 4 values, this platform's 3" in read_power({"/p": (CLEARPATH_POWER, four)}, "husky").warnings[0]
+    unknown = read_power({"/p": (CLEARPATH_POWER, two)}, "generic")
     assert "names its currents by platform (A200, D100, J100, R100, W200)" in unknown.warnings[0]
-    assert unknown.readings == {}
+    assert unknown.rails == {}
 
 
 @pytest.mark.parametrize(
@@ -95,14 +98,14 @@ def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
     ],
 )
 def test_older_clearpath_status(type_name: str, fields: dict) -> None:
-    found = read_power({"/status": (type_name, TIMES | fields)}, ROBOTS["generic"])
+    found = read_power({"/status": (type_name, TIMES | fields)}, "generic")
     np.testing.assert_allclose(power_watt(found), VOLT * AMP, rtol=1e-14)
     assert found.averaged
 
 
 @pytest.mark.parametrize(("recorded", "said"), [(AMP, "against the ROS convention"), (-AMP, None)])
 def test_the_sign_of_a_battery_is_told_by_its_mean(recorded: np.ndarray, said: str | None) -> None:
-    found = read_power({"/battery": (BATTERY_STATE, battery(VOLT, recorded))}, ROBOTS["generic"])
+    found = read_power({"/battery": (BATTERY_STATE, battery(VOLT, recorded))}, "generic")
     np.testing.assert_allclose(power_watt(found), VOLT * AMP, rtol=1e-14)
     assert [said] == [said for warning in found.warnings if str(said) in warning] or (
         said is None and not found.warnings
@@ -112,15 +115,15 @@ def test_the_sign_of_a_battery_is_told_by_its_mean(recorded: np.ndarray, said: s
 def test_the_sign_is_told_by_all_rails_together() -> None:
     left, right = 3.0 - 0.5 * AMP, 5 * AMP  # one side is driven by the other now and then
     topics = {"/left": (BATTERY_STATE, battery(VOLT, left)), "/right": (BATTERY_STATE, battery(VOLT, right))}
-    np.testing.assert_allclose(power_watt(read_power(topics, ROBOTS["generic"])), VOLT * (left + right), rtol=1e-12)
+    np.testing.assert_allclose(power_watt(read_power(topics, "generic")), VOLT * (left + right), rtol=1e-12)
 
 
 def test_an_unclear_sign_follows_ros_and_says_so_and_the_recipe_settles_it() -> None:
     balanced = battery(VOLT, np.cos(np.pi * np.arange(N)) * 4.0)
-    found = read_power({"/b": (BATTERY_STATE, balanced)}, ROBOTS["generic"])
+    found = read_power({"/b": (BATTERY_STATE, balanced)}, "generic")
     assert "unclear" in found.warnings[0]
     np.testing.assert_allclose(power_watt(found), -VOLT * balanced["current"])
-    settled = read_power({"/b": (BATTERY_STATE, balanced)}, ROBOTS["generic"], current_sign="drawn_positive")
+    settled = read_power({"/b": (BATTERY_STATE, balanced)}, "generic", current_sign="drawn_positive")
     np.testing.assert_allclose(power_watt(settled), VOLT * balanced["current"])
     assert settled.warnings == ()
 
@@ -143,8 +146,8 @@ def test_an_unclear_sign_follows_ros_and_says_so_and_the_recipe_settles_it() -> 
     ],
 )
 def test_numbers_that_cannot_be_power_are_refused_with_evidence(columns: dict, evidence: str) -> None:
-    found = read_power({"/battery": (BATTERY_STATE, columns)}, ROBOTS["generic"])
-    assert found.readings == {}
+    found = read_power({"/battery": (BATTERY_STATE, columns)}, "generic")
+    assert found.rails == {}
     assert evidence in found.warnings[0]
     assert "/battery" in found.warnings[0]
 
@@ -153,12 +156,12 @@ def test_voltage_and_current_on_two_topics_are_one_rail() -> None:
     voltage = {"log_time_ns": np.arange(N) * 50_000_000, "data": VOLT}
     current = {"log_time_ns": np.arange(N) * 50_000_000 + 7, "data": -AMP}
     topics = {"/bus_voltage": ("std_msgs/msg/Float32", voltage), "/motor_current": ("std_msgs/msg/Float64", current)}
-    found = read_power(topics, ROBOTS["generic"])
-    assert found.rails == {"/bus_voltage": ("battery",), "/motor_current": ("battery",)}
-    volt, amp = columns_of("battery")
-    np.testing.assert_array_equal(found.readings["/bus_voltage"].columns[volt], VOLT)
-    assert np.isnan(found.readings["/bus_voltage"].columns[amp]).all()
-    np.testing.assert_array_equal(found.readings["/motor_current"].columns[amp], AMP)
+    found = read_power(topics, "generic")
+    (bus,), (motor,) = found.rails["/bus_voltage"], found.rails["/motor_current"]
+    assert (bus.name, motor.name) == ("battery", "battery")
+    np.testing.assert_array_equal(bus.voltage_volt, VOLT)
+    assert np.isnan(bus.current_amp).all()
+    np.testing.assert_array_equal(motor.current_amp, AMP)
 
 
 @pytest.mark.parametrize("robot", ["warthog", "generic"])
@@ -168,10 +171,10 @@ def test_a_warthogs_negative_currents_come_as_unsigned(robot: str) -> None:
         "/left_drive/status/battery_voltage": ("std_msgs/msg/Float64", TIMES | {"data": VOLT}),
         "/left_drive/status/battery_current": ("std_msgs/msg/Float64", TIMES | {"data": current % 4096}),
     }
-    found = read_power(topics, ROBOTS[robot])
-    name = columns_of("/left_drive/status/battery")[1]
-    recorded = found.readings["/left_drive/status/battery_current"].columns[name]
-    np.testing.assert_array_equal(recorded, current if robot == "warthog" else current[current > 0])
+    found = read_power(topics, robot)
+    (rail,) = found.rails["/left_drive/status/battery_current"]
+    assert rail.name == "/left_drive/status/battery"
+    np.testing.assert_array_equal(rail.current_amp, np.where((current > 0) | (robot == "warthog"), current, np.nan))
     assert any("currents above 1000 A are set aside" in line for line in found.warnings) == (robot == "generic")
 
 
@@ -187,8 +190,8 @@ def test_power_that_comes_too_seldom_is_refused(log_time_s, why: str) -> None:
     count = len(log_time_s)
     columns = {"log_time_ns": np.asarray(log_time_s) * 1e9, "voltage": VOLT[:count], "current": AMP[:count]}
     columns["percentage"] = np.full(count, np.nan)
-    found = read_power({"/b": (BATTERY_STATE, columns)}, ROBOTS["generic"])
-    assert found.readings == {}
+    found = read_power({"/b": (BATTERY_STATE, columns)}, "generic")
+    assert found.rails == {}
     assert any(why in line for line in found.warnings)
 
 
@@ -197,10 +200,10 @@ def test_single_values_that_no_battery_has_are_set_aside() -> None:
     columns["voltage"][[4, 9]] = 65.535e3, 0.0
     columns["current"][7] = -32768.0
     columns["voltage"][12] = columns["current"][12] = 0.0  # switched off: nothing is drawn
-    found = read_power({"/b": (BATTERY_STATE, columns)}, ROBOTS["generic"])
-    volt, amp = (found.readings["/b"].columns[name] for name in columns_of("/b"))
-    assert np.flatnonzero(np.isnan(volt)).tolist() == [4, 9]
-    assert np.flatnonzero(np.isnan(amp)).tolist() == [7]
+    found = read_power({"/b": (BATTERY_STATE, columns)}, "generic")
+    (rail,) = found.rails["/b"]
+    assert np.flatnonzero(np.isnan(rail.voltage_volt)).tolist() == [4, 9]
+    assert np.flatnonzero(np.isnan(rail.current_amp)).tolist() == [7]
     assert "2 voltages outside 5 to 78 V and 1 currents above 1000 A are set aside" in found.warnings[-1]
 
 
@@ -211,7 +214,7 @@ def test_a_row_beside_a_hole_does_not_tell_the_sign(topic: tuple[str, str]) -> N
     hole = {"log_time_ns": TIMES["log_time_ns"] + np.where(np.arange(N) > 20, 43_200_000_000_000, 0)}
     currents = [name for name in columns if name.endswith("driver_current") or name == "current"]
     braking = {name: np.where(np.arange(N) == 20, -1.0, columns[name]) for name in currents}
-    found = read_power({topic[0]: (topic[1], {**columns, **hole, **braking})}, ROBOTS["husky"])
+    found = read_power({topic[0]: (topic[1], {**columns, **hole, **braking})}, "husky")
     watt = power_watt(found)
     assert np.sum(watt > 0) == N - 1
     assert not any("refused" in line for line in found.warnings)
@@ -221,17 +224,34 @@ def test_a_current_against_its_type_is_refused_until_the_recipe_says_how_it_coun
     columns = husky_status()
     columns = {**columns, **{name: -value for name, value in columns.items() if name.endswith("driver_current")}}
     topics = {"/status": (HUSKY_STATUS, columns)}
-    found = read_power(topics, ROBOTS["husky"])
-    assert found.readings == {}
+    found = read_power(topics, "husky")
+    assert found.rails == {}
     assert 'current_sign = "drawn_negative"' in found.warnings[0]
-    told = read_power(topics, ROBOTS["husky"], current_sign="drawn_negative")
+    told = read_power(topics, "husky", current_sign="drawn_negative")
     np.testing.assert_allclose(power_watt(told), VOLT * (2 * AMP + 1.0))
 
 
-def test_rows_that_carry_nothing_are_counted() -> None:
-    columns = battery(VOLT.copy(), AMP.copy())
-    columns["voltage"][3] = columns["current"][3] = np.nan
-    columns["current"][5] = np.nan
-    found = read_power({"/b": (BATTERY_STATE, columns)}, ROBOTS["generic"])
-    assert found.readings["/b"].dropped == {"not_finite": 1}
-    assert len(found.readings["/b"].row) == N - 1
+def source(**said) -> PowerSource:
+    return PowerSource("my_msgs/msg/Battery", **{"voltage": "v", "current": "i", **said})
+
+
+def test_of_several_tables_the_most_particular_that_fit_count() -> None:
+    columns = TIMES | {"v": VOLT, "i": AMP, "j": 2 * AMP}
+    known = [source(), source(platform="P", current="j"), source(topic="/rear", current="i + j")]
+    for topic, platform, factor in (("/a", None, 1), ("/a", "P", 2), ("/rear", None, 3), ("/rear", "Q", 3)):
+        found = readings.read_power({topic: (known[0].type, columns)}, known, platform=platform)
+        np.testing.assert_allclose(power_watt(found), factor * VOLT * AMP)
+
+
+def test_a_type_whose_drawn_current_is_negative_needs_no_recipe_line() -> None:
+    columns = TIMES | {"v": VOLT, "i": -AMP}
+    topics, known = {"/b": ("my_msgs/msg/Battery", columns)}, [source(sign="drawn_negative")]
+    found = readings.read_power(topics, known)
+    np.testing.assert_allclose(power_watt(found), VOLT * AMP)
+    assert found.current_sign == "drawn_negative (message type)"
+    against = readings.read_power({"/b": ("my_msgs/msg/Battery", columns | {"i": AMP})}, known)
+    assert 'current_sign = "drawn_positive"' in against.warnings[0]
+    told = readings.read_power(
+        {"/b": ("my_msgs/msg/Battery", columns | {"i": AMP})}, known, current_sign="drawn_positive"
+    )
+    np.testing.assert_allclose(power_watt(told), VOLT * AMP)

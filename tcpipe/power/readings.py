@@ -2,25 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 
-from tcpipe.logs.messages import LOG_TIME, Columns, Floats, Readings, header_ns
-from tcpipe.logs.power_sources import (
+from tcpipe.power.sources import (
     LARGEST_AMP,
-    PowerSource,
-    Rail,
-    power_source,
+    Columns,
+    Floats,
+    HuskyPower,
+    RailReadings,
     read_rails,
     sign_by_mean,
+    sources_of,
     why_refused,
     with_sign,
 )
-from tcpipe.logs.profiles import Robot
+from tcpipe.robots.profiles import CurrentSign, PowerSource
 
+_LOG_TIME = "log_time_ns"
 _OF_USUAL_VOLTAGE = (0.2, 3.0)
 """A battery's voltage stays within these shares of its median."""
 _FEWEST_MESSAGES = 3
@@ -28,82 +29,72 @@ _SLOWEST_S = 10.0
 _FEWEST_ROWS = 20
 """Fewer rows say nothing against the sign of their type."""
 
-CurrentSign = Literal["auto", "drawn_positive", "drawn_negative"]
+Rails = Mapping[str, list[RailReadings]]
+"""By topic."""
 
 
 @dataclass(frozen=True, slots=True)
 class PowerReadings:
-    """What the power topics hold.
+    """What the power topics hold: ``rails`` row by row as the messages; none where the power was refused, and ``warnings`` says why."""
 
-    ``readings`` has, by topic, one voltage and one current column for each of its ``rails`` (see `columns_of`); it is empty where the power
-    was refused, and ``warnings`` says why.
-    """
-
-    readings: dict[str, Readings] = field(default_factory=dict)
-    rails: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    rails: Rails = field(default_factory=dict)
     averaged: bool = False
     warnings: tuple[str, ...] = ()
     current_sign: str | None = None
     """What a drawn current is counted as, and what tells it; None without power."""
 
 
-def columns_of(rail: str) -> tuple[str, str]:
-    """Return the names of a rail's voltage and current columns in its topic's readings."""
-    return f"{rail}: voltage_volt", f"{rail}: current_amp"
-
-
 def read_power(
     topics: Mapping[str, tuple[str, Columns]],
-    robot: Robot,
+    known: Sequence[PowerSource],
     *,
-    husky_power: Literal["battery", "drivers"] = "battery",
+    platform: str | None = None,
+    husky_power: HuskyPower = "battery",
     current_sign: CurrentSign = "auto",
 ) -> PowerReadings:
-    """Return the rails of all power topics.
+    """Return the rails of all power topics, with every current positive when drawn.
 
     Parameters
     ----------
     topics : message type and columns by topic.
-    robot : the profile; it names the platform of clearpath_platform_msgs/Power.
+    known : what message types tell of power.
+    platform : of the robot.
     husky_power, current_sign : recipe keys.
     """
-    rails: dict[str, list[Rail]] = {}
+    rails: dict[str, list[RailReadings]] = {}
     sources: list[PowerSource] = []
     refused: list[str] = []
     for topic, (type_name, columns) in topics.items():
-        source = power_source(type_name, topic, robot, husky_power=husky_power)
-        found = source if isinstance(source, str) else read_rails(columns, source, topic)
-        if isinstance(found, str) or isinstance(source, str):
+        told = sources_of(type_name, topic, known, platform=platform, husky_power=husky_power)
+        found = told if isinstance(told, str) else read_rails(columns, told, topic)
+        if isinstance(found, str) or isinstance(told, str):
             refused.append(str(found))
             continue
         refused += [why for rail in found if (why := why_refused(rail, columns)) is not None]
-        refused += _too_seldom(topic, np.asarray(columns[LOG_TIME], np.float64))
-        sources.append(source)
+        refused += _too_seldom(topic, np.asarray(columns[_LOG_TIME], np.float64))
+        sources += told
+        if current_sign == "auto":
+            found = [
+                with_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in zip(found, told, strict=True)
+            ]
         rails[topic] = found
     rails = _paired(rails)
     refused = refused or _incomplete([rail for found in rails.values() for rail in found])
     if refused:
         return PowerReadings(warnings=tuple(f"power refused: {why}; there will be no energy" for why in refused))
     rails, odd = _believable(rails)
-    log_times = {topic: np.asarray(columns[LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
-    sign, warnings, told = _sign(rails, log_times, sources, current_sign)
+    log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
+    sign, warnings, told_by = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
         return PowerReadings(warnings=tuple(warnings))
     warnings += odd
     warnings += [f"power: {source.includes} are part of it" for source in sources if source.includes]
-    return PowerReadings(
-        {
-            topic: _readings(topics[topic][1], [with_sign(rail, sign) for rail in found])
-            for topic, found in rails.items()
-        },
-        {topic: tuple(rail.name for rail in found) for topic, found in rails.items()},
-        any(source.averaged for source in sources),
-        tuple(dict.fromkeys(warnings)),
-        told,
-    )
+    signed = {topic: [with_sign(rail, sign) for rail in found] for topic, found in rails.items()}
+    averaged = any(source.averaged for source in sources)
+    return PowerReadings(signed, averaged, tuple(dict.fromkeys(warnings)), told_by)
 
 
-def _paired(rails: dict[str, list[Rail]]) -> dict[str, list[Rail]]:
+def _paired(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
     """Give the one rail without current and the one without voltage a common name: they are one rail on two topics."""
     flat = [rail for found in rails.values() for rail in found]
     without_voltage = [rail.name for rail in flat if not np.isfinite(rail.voltage_volt).any()]
@@ -117,7 +108,7 @@ def _paired(rails: dict[str, list[Rail]]) -> dict[str, list[Rail]]:
     }
 
 
-def _incomplete(rails: list[Rail]) -> list[str]:
+def _incomplete(rails: list[RailReadings]) -> list[str]:
     missing = []
     for name in dict.fromkeys(rail.name for rail in rails):
         parts = [rail for rail in rails if rail.name == name]
@@ -138,12 +129,12 @@ def _too_seldom(topic: str, log_time_ns: Floats) -> list[str]:
     return [f"{topic}: it comes every {period_s:.0f} s only"] if period_s > _SLOWEST_S else []
 
 
-def _believable(rails: Mapping[str, list[Rail]]) -> tuple[dict[str, list[Rail]], list[str]]:
+def _believable(rails: Rails) -> tuple[dict[str, list[RailReadings]], list[str]]:
     """Return the rails with NaN for single values that no battery and no drive has (saturated, lost), and a line on each rail.
 
     Without current a low voltage may be true: a drive that is not switched on yet tells zeros.
     """
-    kept: dict[str, list[Rail]] = {}
+    kept: dict[str, list[RailReadings]] = {}
     lines = []
     for topic, found in rails.items():
         kept[topic] = []
@@ -164,7 +155,7 @@ def _believable(rails: Mapping[str, list[Rail]]) -> tuple[dict[str, list[Rail]],
 
 
 def _sign(
-    rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
+    rails: Rails, log_times: Mapping[str, Floats], sources: list[PowerSource], given: CurrentSign
 ) -> tuple[int, list[str], str]:
     """Return what makes a drawn current positive (0 where the record contradicts its type), warnings, and what tells it."""
     if given != "auto":
@@ -172,14 +163,17 @@ def _sign(
     time_s, whole = _whole_current(rails, log_times)
     sign, one_sided = sign_by_mean(whole, _weight_s(time_s))
     share = f"{100 * abs(one_sided):.0f} % of the charge moved"
-    if all(source.sign for source in sources):
+    signs = {source.sign for source in sources}
+    if "auto" not in signs:
+        told, other = "drawn_positive", "drawn_negative"
+        if signs == {other}:
+            told, other = other, told
         if sign >= 0 or time_s.size < _FEWEST_ROWS:
-            return 1, [], "drawn_positive (message type)"
-        why = f"power refused: the current is negative, {share} flows back; there will be no energy"
-        cure = (
-            'if this robot counts drawn current so, write in the recipe under [read]: current_sign = "drawn_negative"'
-        )
-        return 0, [f'{why}; {cure}; if it truly rolled downhill throughout: "drawn_positive"'], ""
+            return 1, [], f"{told} (message type)"
+        negative = "negative" if told == "drawn_positive" else "positive"
+        why = f"power refused: the current is {negative}, {share} flows back; there will be no energy"
+        cure = f'if this robot counts drawn current so, write in the recipe under [read]: current_sign = "{other}"'
+        return 0, [f'{why}; {cure}; if it truly rolled downhill throughout: "{told}"'], ""
     if sign > 0:
         why = f"power: the current counts as positive when drawn, against the ROS convention: {share} is positive"
         return (
@@ -206,7 +200,7 @@ def _weight_s(time_s: Floats) -> Floats:
     return weight
 
 
-def _whole_current(rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:
+def _whole_current(rails: Rails, log_times: Mapping[str, Floats]) -> tuple[Floats, Floats]:
     """Return the sum of all rails' currents [A] at the log times of the first topic that carries one, and these times [s]."""
     parts = [
         (log_times[topic][known] / 1e9, rail.current_amp[known])
@@ -216,22 +210,3 @@ def _whole_current(rails: Mapping[str, list[Rail]], log_times: Mapping[str, Floa
     ]
     time_s = parts[0][0]
     return time_s, np.sum([np.interp(time_s, at, current) for at, current in parts], axis=0)
-
-
-def _readings(columns: Columns, rails: list[Rail]) -> Readings:
-    """Return the rows on which at least one rail carries a voltage or a current."""
-    values = {
-        name: v
-        for rail in rails
-        for name, v in zip(columns_of(rail.name), (rail.voltage_volt, rail.current_amp), strict=True)
-    }
-    row = np.flatnonzero(np.any([np.isfinite(value) for value in values.values()], axis=0))
-    stamps = header_ns(columns)
-    lost = len(columns[LOG_TIME]) - len(row)
-    return Readings(
-        row,
-        columns[LOG_TIME][row].astype(np.int64),
-        None if stamps is None else stamps[row],
-        {name: value[row] for name, value in values.items()},
-        {"not_finite": lost} if lost else {},
-    )

@@ -2,8 +2,8 @@
 
 import pytest
 
-from tcpipe.logs.power_sources import CLEARPATH_POWER
-from tcpipe.logs.profiles import find_robot
+from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.logs.robots import find_robot
 from tcpipe.logs.topics import Topic
 
 
@@ -21,7 +21,7 @@ from tcpipe.logs.topics import Topic
     ],
 )
 def test_a_clearpath_robot_is_known_by_its_namespace(namespace, name, why):
-    topic = Topic(f"{namespace}/platform/mcu/status/power", CLEARPATH_POWER, 1, 0, 0, "cdr", "")
-    robot, said = find_robot([topic], None)
-    assert robot.name == name
+    topic = Topic(f"{namespace}/platform/mcu/status/power", "clearpath_platform_msgs/msg/Power", 1, 0, 0, "cdr", "")
+    robot, said = find_robot([topic], None, shipped_profiles().robots)
+    assert robot == name
     assert why in said

@@ -1,0 +1,57 @@
+"""Which robot a log is of: told by the user, by message types that only one robot publishes, or by its name in a topic."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+
+from tcpipe.errors import RecipeError
+from tcpipe.logs.topics import Topic
+from tcpipe.robots.profiles import GENERIC, Robot
+
+_POWER_OF_ANY_CLEARPATH = "clearpath_platform_msgs/msg/Power"
+_FIRST_TO_PUBLISH_IT = "A200"
+_SERIAL_NUMBER = re.compile(r"(?<![a-z0-9])([a-z]{1,2}\d{3})[_-]\d{4}(?!\d)")
+"""How Clearpath names a robot in its topics: by platform and number."""
+
+
+def find_robot(topics: Iterable[Topic], name: str | None, robots: Mapping[str, Robot]) -> tuple[str, str]:
+    """Return the robot's name and why it was taken.
+
+    Parameters
+    ----------
+    topics : the log's topics.
+    name : the profile's name where the user gave one.
+    robots : profiles by name.
+
+    Raises
+    ------
+    RecipeError : no profile has that name.
+    """
+    if name is not None:
+        if name not in robots:
+            raise RecipeError(f"robot: no profile is called {name!r}; there are {', '.join(sorted(robots))}")
+        return name, "given"
+    listed = sorted(topics, key=lambda topic: topic.name)
+    if by_type := _only_one((n, t) for t in listed for n, of in robots.items() if t.type_name in of.status_types):
+        return by_type[0], f"topic {by_type[1].name} is {by_type[1].type_name}"
+    if by_name := _only_one((n, t) for t in listed for n, of in robots.items() if _is_called(of, t)):
+        return by_name[0], f"topic {by_name[1].name} is called so"
+    for topic in listed:
+        if topic.type_name == _POWER_OF_ANY_CLEARPATH:
+            if other := next((found for of in listed if (found := _SERIAL_NUMBER.search(of.name.lower()))), None):
+                return GENERIC, f"topics are named after the platform {other[1].upper()}, which no profile knows"
+            first = next((n for n, of in robots.items() if of.platform == _FIRST_TO_PUBLISH_IT), GENERIC)
+            return first, f"topic {topic.name} is {topic.type_name}, and nothing names another platform"
+    return GENERIC, "no topic tells the robot"
+
+
+def _is_called(robot: Robot, topic: Topic) -> bool:
+    words = "|".join(map(re.escape, robot.called))
+    return bool(words) and re.search(rf"(?<![a-z])({words})(?![a-z])", topic.name.lower()) is not None
+
+
+def _only_one(found: Iterable[tuple[str, Topic]]) -> tuple[str, Topic] | None:
+    """Return the first pair if all of them agree on the robot."""
+    pairs = list(found)
+    return pairs[0] if pairs and len({name for name, _ in pairs}) == 1 else None

@@ -1,0 +1,62 @@
+"""The topics that play power: their messages as rails, and a topic's usable rows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.logs.messages import LOG_TIME, Readings, header_ns
+from tcpipe.logs.roles import Assignment
+from tcpipe.power.readings import PowerReadings, read_power
+from tcpipe.power.sources import RailReadings
+from tcpipe.recipe import ReadConfig
+from tcpipe.robots.profiles import Profiles
+
+
+def power_of_topics(
+    topics: Mapping[str, tuple[str, Mapping[str, NDArray[Any]]]],
+    assignment: Assignment,
+    config: ReadConfig,
+    *,
+    known: Profiles,
+) -> PowerReadings:
+    """Return what the topics that play power hold, by topic their message type and columns; nothing unless all of them can be decoded."""
+    wanted = len(assignment.roles["power"].topics) if "power" in assignment.roles else 0
+    if not topics:
+        return PowerReadings()
+    if len(topics) < wanted:
+        return PowerReadings(warnings=("power refused: not all of its topics can be decoded; there will be no energy",))
+    return read_power(
+        topics,
+        known.power_sources,
+        platform=known.robots[assignment.robot].platform,
+        husky_power=config.husky_power,
+        current_sign=config.current_sign,
+    )
+
+
+def columns_of(rail: str) -> tuple[str, str]:
+    """Return the names of a rail's voltage and current columns in its topic's readings."""
+    return f"{rail}: voltage_volt", f"{rail}: current_amp"
+
+
+def power_rows(columns: Mapping[str, NDArray[Any]], rails: Sequence[RailReadings]) -> Readings:
+    """Return the rows of a power topic on which at least one rail carries a voltage or a current."""
+    values = {
+        name: values
+        for rail in rails
+        for name, values in zip(columns_of(rail.name), (rail.voltage_volt, rail.current_amp), strict=True)
+    }
+    row = np.flatnonzero(np.any([np.isfinite(value) for value in values.values()], axis=0))
+    stamps = header_ns(columns)
+    lost = len(columns[LOG_TIME]) - len(row)
+    return Readings(
+        row,
+        columns[LOG_TIME][row].astype(np.int64),
+        None if stamps is None else stamps[row],
+        {name: value[row] for name, value in values.items()},
+        {"not_finite": lost} if lost else {},
+    )

@@ -1,0 +1,120 @@
+"""A robot that no profile knows, with a power message of its own, described in a recipe alone."""
+
+import json
+import struct
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from mcap.writer import Writer
+from simulated_streams import log_of, streams_of
+
+from tcpipe.errors import DatasetError, UsageError
+from tcpipe.formats.recipe_toml import load_recipe
+from tcpipe.pipeline.dataset.runs import choose_runs
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.recipe import Recipe
+from tcpipe.simulation import tiny
+from tcpipe.store import Store
+from tcpipe.tables.bits import Quality
+from tcpipe.tables.columns import floats, integers
+
+RECIPE = """
+robot = "scout"
+
+[read]
+ignore_topics = ["{theirs}"]
+
+[robots.scout]
+width_m = 0.6
+length_m = 0.9
+max_velocity_mps = 1.0
+voltage_range_volt = [20.0, 30.0]
+
+[[power_sources]]
+type = "my_msgs/msg/Battery"
+voltage = "bus.v"
+current = "amps[0] + amps[1]"
+averaged = {averaged}
+sign = "drawn_negative"
+"""
+DEFINITION = f"Bus bus\nfloat64[2] amps\n{'=' * 80}\nMSG: my_msgs/Bus\nfloat64 v\n"
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory):
+    """A simulated drive's log, the same power as messages of a type of our own, and the recipe that says what they mean."""
+    directory, scenario = tmp_path_factory.mktemp("own"), tiny()
+    log = log_of(scenario, scenario.drives[0], directory / "site")
+    streams = streams_of(log)
+    table = streams.tables["power"]
+    columns = (integers(table, "stamp_ns"), floats(table, "voltage_volt"), floats(table, "current_amp"))
+    with (directory / "battery.mcap").open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        schema = writer.register_schema("my_msgs/msg/Battery", "ros2msg", DEFINITION.encode())
+        channel = writer.register_channel("/battery", "cdr", schema)
+        for stamp_ns, volt, amp in zip(*(values.tolist() for values in columns), strict=True):
+            payload = b"\0\1\0\0" + struct.pack("<ddd", volt, -0.25 * amp, -0.75 * amp)
+            writer.add_message(channel, stamp_ns, payload, stamp_ns)
+        writer.finish()
+    recipe = directory / "tcpipe.toml"
+    theirs, averaged = streams.sensors["power"].topic, str(streams.power_averaged).lower()
+    recipe.write_text(RECIPE.format(theirs=theirs, averaged=averaged))
+    return log, directory / "battery.mcap", recipe
+
+
+def segments(store, result):
+    return pq.read_table(store / "runs" / result.run_id / result.recipe_id / "segments.parquet")
+
+
+def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path):
+    log, battery, recipe = drive
+    (known,) = ingest([log], store=tmp_path / "store", recipe=Recipe(), robot="husky").results
+    (ours,) = ingest([log, battery], store=tmp_path / "store", recipe=recipe, as_one=True).results
+    assert (ours.status, ours.robot) == ("done", "scout")
+    assert not [line for line in ours.warnings if "power" in line]
+    one, other = (segments(tmp_path / "store", result) for result in (known, ours))
+    assert one.num_rows == other.num_rows > 5
+    assert set(other["robot"].to_pylist()) == {"scout"}
+    np.testing.assert_allclose(floats(other, "energy_joule"), floats(one, "energy_joule"), rtol=1e-12)
+    again = ingest([log, battery], store=tmp_path / "store", recipe=recipe, as_one=True).results[0]
+    assert again.status == "unchanged"
+    path = tmp_path / "store" / "runs" / ours.run_id / ours.recipe_id / "manifest.json"
+    assert json.loads(path.read_text())["recipe"]["robots"]["scout"]["width_m"] == 0.6
+    with pytest.raises(DatasetError, match="no run of robot 'scout'"):  # the default recipe's runs know no scout
+        choose_runs(Store(tmp_path / "store"), Recipe(), robot="scout", tags={})
+
+
+def test_another_voltage_range_is_another_run(drive, tmp_path):
+    log, battery, recipe = drive
+    narrow = tmp_path / "narrow.toml"
+    narrow.write_text(recipe.read_text().replace("[20.0, 30.0]", "[29.0, 30.0]"))
+    both = [
+        ingest([log, battery], store=tmp_path / "store", recipe=of, as_one=True).results[0] for of in (recipe, narrow)
+    ]
+    assert both[0].recipe_id != both[1].recipe_id
+    flagged = [
+        segments(tmp_path / "store", result)["quality"].to_numpy() & np.uint32(Quality.VOLTAGE_OUT_OF_RANGE)
+        for result in both
+    ]
+    assert not flagged[0].any()
+    assert flagged[1].any()
+
+
+def test_two_robots_of_a_recipe_are_not_pooled_unasked(drive, tmp_path):
+    log, battery, recipe = drive
+    two = tmp_path / "two.toml"
+    two.write_text(recipe.read_text() + "\n[robots.rover]\nmax_velocity_mps = 1.0\n")
+    for robot in ("scout", "rover"):
+        ingest([log, battery], store=tmp_path / "store", recipe=two, robot=robot, as_one=True)
+    store = Store(tmp_path / "store")
+    with pytest.raises(DatasetError, match="runs of 2 robots \\(rover, scout\\)"):
+        choose_runs(store, load_recipe(two), robot=None, tags={})
+    assert {run.robot for run in choose_runs(store, load_recipe(two), robot="rover", tags={}).runs} == {"rover"}
+
+
+def test_a_name_that_neither_the_recipe_nor_the_package_has(drive, tmp_path):
+    log, _, recipe = drive
+    with pytest.raises(UsageError, match="known: dingo, generic, husky, jackal, ridgeback, scout, warthog"):
+        ingest([log], store=tmp_path / "store", recipe=recipe, robot="scuot")

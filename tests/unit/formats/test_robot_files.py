@@ -1,0 +1,97 @@
+"""The robots and power sources that come with the package, and those of a recipe before them."""
+
+from importlib.resources import files
+
+import pytest
+
+from tcpipe.errors import RecipeError
+from tcpipe.formats.recipe_toml import commented_toml, parse_recipe, plain_recipe
+from tcpipe.formats.robot_files import profiles_of, shipped_profiles
+from tcpipe.recipe import Recipe
+from tcpipe.robots.profiles import GENERIC, PowerSource, Robot, fields_of
+
+
+def test_a_robot_has_a_file_of_its_name_and_stands_in_the_recipe_that_init_writes():
+    stems = {file.name.removesuffix(".toml") for file in files("tcpipe.robots").iterdir() if file.name.endswith("toml")}
+    robots = shipped_profiles().robots
+    assert set(robots) == stems - {"power_sources"} | {GENERIC}
+    assert f"one of {', '.join(sorted(robots))}" in commented_toml()
+
+
+def test_what_is_shipped_can_be_told_apart_and_is_of_a_robots_size():
+    robots = shipped_profiles().robots.values()
+    for key in ("platform", "status_types", "called"):
+        said = [value for of in robots for value in ([getattr(of, key)] if key == "platform" else getattr(of, key))]
+        assert len(said) == len(set(said)), key
+    for of in robots:
+        assert of.width_m is None or 0.3 < of.width_m < of.length_m < 2.0
+        assert of.max_velocity_mps is None or 0.5 <= of.max_velocity_mps <= 5.0
+    platforms = {of.platform for of in shipped_profiles().power_sources}
+    assert platforms <= {of.platform for of in robots}
+
+
+def test_a_recipes_own_come_before_the_packages():
+    source = PowerSource("sensor_msgs/msg/BatteryState", "v", "i")
+    known = profiles_of(Recipe(robots={"husky": Robot(max_velocity_mps=0.5), "scout": Robot()}, power_sources=[source]))
+    assert known.robots["husky"] == Robot(max_velocity_mps=0.5)
+    assert {"scout", "warthog", GENERIC} <= set(known.robots)
+    assert known.types()[0] == source.type
+    assert [of for of in known.power_sources if of.type == source.type] == [source]
+    assert len(known.types()) == len(shipped_profiles().types())
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("", []),
+        ("current", [("current", None)]),
+        ("a.b[0]+a.b[12] + c", [("a.b", 0), ("a.b", 12), ("c", None)]),
+    ],
+)
+def test_fields_are_joined_by_plus(text, wanted):
+    assert fields_of(text) == wanted
+
+
+def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
+    with pytest.raises(RecipeError) as caught:
+        parse_recipe(
+            {
+                "robots": {
+                    "mine": {"width_m": -1, "speed_mps": 3.0},
+                    "yours": {"voltage_range_volt": [30, 20]},
+                    "theirs": 4,
+                },
+                "power_sources": [
+                    {"voltage": "v"},
+                    {"type": "Foo", "current": "i["},
+                    {"type": "a/msg/B"},
+                    {"type": "a/msg/B", "voltage": "v", "sign": "plus"},
+                ],
+            },
+            where="tcpipe.toml",
+        )
+    said = [line.removeprefix("tcpipe.toml: ") for line in caught.value.problems]
+    keys = [
+        "robots.mine.width_m is -1; wanted from 0.05",
+        "unknown key robots.mine.speed_mps",
+        "robots.yours.voltage_range_volt is [30.0, 20.0]; wanted the lower",
+        "robots.theirs is 4; wanted a table of keys",
+        "power_sources.0.type is missing",
+        'power_sources.1.type is "Foo"; wanted package/msg/Name',
+        'power_sources.1.current is "i["; wanted fields joined by +',
+        "power_sources.2.current",
+        'power_sources.3.sign is "plus"; wanted one of drawn_positive',
+    ]
+    assert len(said) == len(keys)
+    assert all(line.startswith(key) for line, key in zip(said, keys, strict=True)), said
+
+
+def test_a_robot_made_in_python_is_checked_where_a_recipe_takes_it():
+    with pytest.raises(RecipeError, match=r"robots\.mine\.width_m"):
+        Recipe(robots={"mine": Robot(width_m=-1.0)})
+    assert Recipe(robots={"mine": Robot(width_m=1)}).robots["mine"].width_m == 1.0
+
+
+def test_a_recipe_without_tables_of_its_own_is_written_as_before_there_were_any():
+    assert not {"robots", "power_sources"} & set(plain_recipe(Recipe()))
+    assert plain_recipe(Recipe(robots={"mine": Robot()}))["robots"]["mine"]["width_m"] is None
