@@ -29,7 +29,7 @@ from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measu
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD, process_noise, turn_scale_std, turn_sources
 from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.standing import standing_intervals
-from tcpipe.fusion.timeline import Timeline, build_timeline
+from tcpipe.fusion.timeline import EventTimeline, build_timeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix
 from tcpipe.tables.findings import StretchFacts, vector
@@ -203,7 +203,7 @@ class _Run:
 
     def __init__(
         self,
-        timeline: Timeline,
+        timeline: EventTimeline,
         measurements: Measurements,
         gate_probability: float,
         *,
@@ -396,7 +396,7 @@ def _start(initial: InitialState, turn_scale_std: float = 0.0) -> _Memory:
 
 
 def _trajectory(
-    timeline: Timeline, outputs: NDArray[np.float64], run: _Run, output_ns: NDArray[np.int64]
+    timeline: EventTimeline, outputs: NDArray[np.float64], run: _Run, output_ns: NDArray[np.int64]
 ) -> Trajectory:
     rotation = outputs[:, 0:9].reshape(-1, 3, 3)
     scale_std, speed_mps = run.unseen_scale_std, np.linalg.norm(outputs[:, 15:18], axis=1)
@@ -457,7 +457,7 @@ def _displacement_std_m(run: _Run, output_ns: NDArray[np.int64]) -> NDArray[np.f
     return std
 
 
-def _rejections(timeline: Timeline, run: _Run) -> Rejections:
+def _rejections(timeline: EventTimeline, run: _Run) -> Rejections:
     refused = np.flatnonzero((run.verdict == kernel.REFUSED) & np.isin(timeline.kind, list(_ROLES)))
     kind = timeline.kind[refused]
     return Rejections(
@@ -469,7 +469,7 @@ def _rejections(timeline: Timeline, run: _Run) -> Rejections:
     )
 
 
-def _facts(timeline: Timeline, run: _Run) -> StretchFacts:
+def _facts(timeline: EventTimeline, run: _Run) -> StretchFacts:
     kinds = {role: timeline.kind == kind for kind, role in _ROLES.items() if (timeline.kind == kind).any()}
     taken = {role: of_kind & (run.verdict == kernel.ACCEPTED) for role, of_kind in kinds.items()}
     dof = {role: _DOF[kind] for kind, role in _ROLES.items()}

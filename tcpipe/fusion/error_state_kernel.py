@@ -222,22 +222,22 @@ def _factor(P: Matrix, U: Matrix, tally: Vector) -> None:
 
 
 @kernel
-def _stray(P: Matrix, x: Vector, centre: Vector, q: Vector, shake: float, dt: float, w: Vector, mode: int) -> None:
+def _stray(P: Matrix, x: Vector, centre: Vector, q: Vector, q_v: float, dt: float, w: Vector, mode: int) -> None:
     """Add the noise of attitude and velocity over dt to P; see `predict`. A velocity that is kept in the body turns with its noise."""
     speed = sqrt(x[15] * x[15] + x[16] * x[16] + x[17] * x[17])
     for k in range(3):
         turned = dt * (q[k] + q[TURNING] * w[k] * w[k] + (q[GROUND] * speed if k < 2 else 0.0))
         P[k, k] += turned
-        P[9 + k, 9 + k] += shake * dt
+        P[9 + k, 9 + k] += q_v * dt
         if mode == INERTIAL:
             continue
         b = (k + 1) % 3
         c = (k + 2) % 3
         ub = x[b] * x[15] + x[3 + b] * x[16] + x[6 + b] * x[17]
         uc = x[c] * x[15] + x[3 + c] * x[16] + x[6 + c] * x[17]
-        more = 0.0  # of the noise along body axis k beyond ``shake``
+        more = 0.0  # of the noise along body axis k beyond ``q_v``
         if k > 0:
-            more = dt * (q[9 + k] + (q[SLIDING] - 1.0) * shake)
+            more = dt * (q[9 + k] + (q[SLIDING] - 1.0) * q_v)
         for i in range(3):
             vi = centre[3 * i + c] * ub - centre[3 * i + b] * uc  # R⁺ (e_k x u)
             P[k, 9 + i] += turned * vi
@@ -249,12 +249,12 @@ def _stray(P: Matrix, x: Vector, centre: Vector, q: Vector, shake: float, dt: fl
 
 @kernel
 def predict(
-    x: Vector, P: Matrix, q: Vector, shake: float, dt: float, w: Vector, a: Vector, mode: int, F: Matrix, work: Any
+    x: Vector, P: Matrix, q: Vector, q_v: float, dt: float, w: Vector, a: Vector, mode: int, F: Matrix, work: Any
 ) -> None:
     """Advance x and P by dt.
 
-    q holds 17 noise densities [unit²/s], of which that of v is left out: it is ``shake`` in all directions, or where the body velocity is
-    kept ``shake`` forward, and sideways and upward what stands there and SLIDING times ``shake``. Then come the rate at which
+    q holds 17 noise densities [unit²/s], of which that of v is left out: it is ``q_v`` in all directions, or where the body velocity is
+    kept ``q_v`` forward, and sideways and upward what stands there and SLIDING times ``q_v``. Then come the rate at which
     s_w decays (DECAY), how much the noise of the turn grows with its square (TURNING), whether b_g are scale errors (SCALED, 0 or 1),
     and by how much roll and pitch stray on a metre of ground [rad²/m] (GROUND).
     F, shape (12, 9), becomes what the first 12 errors turn into of those in `_MOVED`; a F of no rows is left alone.
@@ -317,7 +317,7 @@ def predict(
             P[i, j] += (_WC0 - 1.0) * mean[i] * mean[j]
         if i >= 3 and not 9 <= i < 12:
             P[i, i] += q[i] * dt
-    _stray(P, x, centre, q, shake, dt, w, mode)
+    _stray(P, x, centre, q, q_v, dt, w, mode)
     if F.shape[0] > 0:
         _transition(x, middle, centre, dt, mode, U, F)
     _displaced(centre, mean, 1.0, True, x, turn)
@@ -600,7 +600,7 @@ def filter_block(
     dt: Vector,
     kind: NDArray[np.int8],
     mode: NDArray[np.int8],
-    shake: Vector,
+    q_v: Vector,
     z: Matrix,
     r: Matrix,
     turn_rate: Matrix,
@@ -625,7 +625,7 @@ def filter_block(
 
     Parameters
     ----------
-    dt : [s], time since the event before. kind, mode : see above. shake : noise of v since then, see `predict`.
+    dt : [s], time since the event before. kind, mode : see above. q_v : noise of v since then, see `predict`.
     z, r : measurement and variances, shape (E, 3); unused entries are 0 and 1.
     turn_rate, force : mean angular velocity and specific force since the event before, shape (E, 3).
     turn_rate_now : angular velocity at the event, shape (E, 3).
@@ -646,7 +646,7 @@ def filter_block(
     wanted = 0
     for e in range(first, last):
         if dt[e] > 0.0:
-            predict(x, P, densities[mode[e]], shake[e], dt[e], turn_rate[e], force[e], mode[e], F, work)
+            predict(x, P, densities[mode[e]], q_v[e], dt[e], turn_rate[e], force[e], mode[e], F, work)
             for k in range(silent.size):
                 silent[k] += dt[e]
         k = kind[e]

@@ -1,8 +1,9 @@
 """How far the robot strays from what the process holds: noise densities, most of them read from the sensors themselves.
 
-White noise of standard deviation s at f Hz has the density s²/f. What of it changes along the drive is one number an event, the *shake*:
-with an accelerometer its noise, which vibration multiplies while the robot moves; without one, where the body velocity is held, how
-fast the forward velocity changes there, since a robot that is taken to brake all the time is one of which nothing is known.
+White noise of standard deviation s at f Hz has the density s²/f. What of it changes along the drive is one number an event, the density
+of the velocity's noise: with an accelerometer that of its noise, which vibration multiplies while the robot moves; without one, where the
+body velocity is held, how fast the forward velocity changes there, since a robot that is taken to brake all the time is one of which
+nothing is known.
 """
 
 from __future__ import annotations
@@ -104,13 +105,13 @@ def shake_density(
 ) -> NDArray[np.float64]:
     """Return the noise density of the velocity at each event [m²/s³], shape (E,), for its process mode."""
     imu = measurements.imu
-    shake = np.full(stamp_ns.size, np.nan)
+    q_v = np.full(stamp_ns.size, np.nan)
     inertial = mode == kernel.INERTIAL
     if imu is not None and inertial.any():
-        shake[inertial] = _accelerometer_density(imu)(stamp_ns[inertial])
+        q_v[inertial] = _accelerometer_density(imu)(stamp_ns[inertial])
     if not inertial.all():
-        shake[~inertial] = _held_density(measurements)(stamp_ns[~inertial])
-    return shake
+        q_v[~inertial] = _held_density(measurements)(stamp_ns[~inertial])
+    return q_v
 
 
 _Density = Callable[[NDArray[np.int64]], NDArray[np.float64]]

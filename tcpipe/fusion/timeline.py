@@ -41,7 +41,7 @@ _PIECE = 1 << 15
 
 
 @dataclass(frozen=True, slots=True)
-class Timeline:
+class EventTimeline:
     """Events in order of time, as `tcpipe.fusion.error_state_kernel.filter_block` takes them.
 
     Attributes
@@ -72,7 +72,7 @@ class Timeline:
 
 def build_timeline(
     measurements: Measurements, standing_ns: NDArray[np.int64], output_ns: NDArray[np.int64]
-) -> Timeline:
+) -> EventTimeline:
     """Merge measurements, constraints and wanted stamps.
 
     Parameters
@@ -100,7 +100,7 @@ def build_timeline(
     rate_now, _ = _turn_rates(measurements, stamp, stamp, start)
     half = (median_period_ns(output_ns) if output_ns.size > 1 else _MAX_STEP_NS) // 2
     around, around_mode = _turn_rates(measurements, output_ns - half, output_ns + half, start)
-    return Timeline(
+    return EventTimeline(
         stamp,
         np.asarray(stamp - before, np.float64) * 1e-9,
         kind,

@@ -90,7 +90,7 @@ _CALM_STD_RADPS, _CALM_STD_MPS2, _LEVEL_STD_RAD = (0.05, 0.05, 1.0), 1.0, 0.15
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class SensorRows:
     """A sensor, or a constraint, as the filter takes it.
 
     Attributes
@@ -185,7 +185,7 @@ def run_ukf15(
 
 
 def filter_forward(
-    sources: Sequence[Source],
+    sources: Sequence[SensorRows],
     gates: Sequence[float],
     *,
     x: NDArray[np.float64],
@@ -251,7 +251,7 @@ def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., int]:
     return filterpy_engine.run
 
 
-def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[Source]:
+def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int) -> list[SensorRows]:
     """Return what the filter fuses of a stretch: its sensors, the ground, and priors for what no sensor shows.
 
     Parameters
@@ -263,7 +263,7 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
 
     Returns
     -------
-    list of Source
+    list of SensorRows
         In the order in which measurements of one stamp are fused.
     """
     sensors = (
@@ -278,26 +278,26 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
     return [*sensors, ground, *_priors(sensors, start_ns, end_ns)]
 
 
-def _imu_sources(measurements: Measurements, initial: InitialState) -> list[Source]:
+def _imu_sources(measurements: Measurements, initial: InitialState) -> list[SensorRows]:
     imu = measurements.imu
     if imu is None:
         return []
     shape = imu.angular_velocity_radps.shape
     turn = imu.angular_velocity_radps - initial.gyro_bias_radps
-    sources = [Source(IMU, SELECT, (WX, WY, WZ), imu.stamp_ns, turn, np.broadcast_to(imu.gyro_std_radps**2, shape))]
+    sources = [SensorRows(IMU, SELECT, (WX, WY, WZ), imu.stamp_ns, turn, np.broadcast_to(imu.gyro_std_radps**2, shape))]
     if imu.accelerometer_usable:
         variance = np.broadcast_to(imu.accelerometer_std_mps2**2, shape)
         force = imu.specific_force_mps2
-        sources.append(Source(IMU, SPECIFIC_FORCE, (0, 1, 2), imu.stamp_ns, force, variance, imu.lever_arm_m))
+        sources.append(SensorRows(IMU, SPECIFIC_FORCE, (0, 1, 2), imu.stamp_ns, force, variance, imu.lever_arm_m))
     known = np.isfinite(imu.quat_xyzw).all(axis=1)
     if known.any():
         tilt = rpy_from_quat(imu.quat_xyzw[known])[:, :2]
         variance = np.broadcast_to(TILT_STD_RAD**2, tilt.shape)
-        sources.append(Source(IMU, SELECT, (ROLL, PITCH), imu.stamp_ns[known], tilt, variance))
+        sources.append(SensorRows(IMU, SELECT, (ROLL, PITCH), imu.stamp_ns[known], tilt, variance))
     return sources
 
 
-def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_rate: bool) -> list[Source]:
+def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_rate: bool) -> list[SensorRows]:
     """One source for each combination of entries that the odometry gives."""
     if odometry is None:
         return []
@@ -313,32 +313,32 @@ def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_ra
         if columns.size:
             z, variance = odometry.velocity_mps[rows][:, columns], every_variance[rows][:, columns]
             entries = tuple(int(first + column) for column in columns)
-            sources.append(Source(role, kind, entries, odometry.stamp_ns[rows], z, variance, lever))
+            sources.append(SensorRows(role, kind, entries, odometry.stamp_ns[rows], z, variance, lever))
     rows = np.isfinite(odometry.yaw_rate_radps)
     if with_yaw_rate and rows.any():
         z = odometry.yaw_rate_radps[rows, None]
         scale_std = SKID_STD if role == WHEELS else SCALE_STD
         variance = odometry.yaw_rate_var[rows, None] + per_second * np.square(scale_std * z)
-        sources.append(Source(role, SELECT, (WZ,), odometry.stamp_ns[rows], z, variance))
+        sources.append(SensorRows(role, SELECT, (WZ,), odometry.stamp_ns[rows], z, variance))
     return sources
 
 
-def _gnss_sources(measurements: Measurements) -> list[Source]:
+def _gnss_sources(measurements: Measurements) -> list[SensorRows]:
     gnss = measurements.gnss
     if gnss is None:
         return []
     kind = ANTENNA if any(gnss.lever_arm_m) else SELECT
-    return [Source(GNSS, kind, (X, Y, Z), gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
+    return [SensorRows(GNSS, kind, (X, Y, Z), gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
 
 
-def _held(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> Source:
+def _held(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> SensorRows:
     """Return states that are zero to within their standard deviations, said again and again."""
     stamps = np.arange(start_ns + period_ns, end_ns + 1, period_ns, dtype=np.int64)
     z = np.zeros((stamps.size, len(stds)))
-    return Source(role, SELECT, tuple(stds), stamps, z, z + np.square(list(stds.values())))
+    return SensorRows(role, SELECT, tuple(stds), stamps, z, z + np.square(list(stds.values())))
 
 
-def _priors(sensors: Sequence[Source], start_ns: int, end_ns: int) -> list[Source]:
+def _priors(sensors: Sequence[SensorRows], start_ns: int, end_ns: int) -> list[SensorRows]:
     selected = {entry for source in sensors if source.kind == SELECT for entry in source.entries}
     force = any(source.kind == SPECIFIC_FORCE for source in sensors)
     calm = {state: std for state, std in zip((WX, WY, WZ), _CALM_STD_RADPS, strict=True) if state not in selected}
@@ -351,7 +351,7 @@ def _priors(sensors: Sequence[Source], start_ns: int, end_ns: int) -> list[Sourc
     ]
 
 
-def _gate(source: Source, probability: float) -> float:
+def _gate(source: SensorRows, probability: float) -> float:
     if source.role in {_GROUND, _PRIOR}:
         return math.inf
     return chi_square_gate(len(source.entries), probability)
@@ -368,7 +368,7 @@ def _initial_belief(initial: InitialState) -> tuple[NDArray[np.float64], NDArray
     return x, np.diag(std**2)
 
 
-def _events(sources: Sequence[Source], rows: Sequence[slice], start_ns: int) -> tuple[Events, NDArray[np.int64]]:
+def _events(sources: Sequence[SensorRows], rows: Sequence[slice], start_ns: int) -> tuple[Events, NDArray[np.int64]]:
     """Return these rows in order of time, and for each which one it was of those of the sources end to end."""
     stamp_ns = np.concatenate([source.stamp_ns[of] for source, of in zip(sources, rows, strict=True)])
     which = np.repeat(np.arange(len(sources), dtype=np.int8), [of.stop - of.start for of in rows])
@@ -389,7 +389,7 @@ def _unsorted(values: NDArray[Any], order: NDArray[np.int64]) -> NDArray[Any]:
     return found
 
 
-def _packed(sources: Sequence[Source], gates: Sequence[float]) -> Sources:
+def _packed(sources: Sequence[SensorRows], gates: Sequence[float]) -> Sources:
     entries = np.zeros((len(sources), 6), np.int64)
     for row, source in zip(entries, sources, strict=True):
         row[: len(source.entries)] = source.entries
@@ -402,7 +402,7 @@ def _packed(sources: Sequence[Source], gates: Sequence[float]) -> Sources:
     )
 
 
-def _rejections(sources: Sequence[Source], gates: Sequence[float], found: Forward) -> Rejections:
+def _rejections(sources: Sequence[SensorRows], gates: Sequence[float], found: Forward) -> Rejections:
     refused = [outcome == REJECTED for outcome in found.outcome]
     count = [int(rows.sum()) for rows in refused]
     stamp_ns = np.concatenate([source.stamp_ns[rows] for source, rows in zip(sources, refused, strict=True)])
@@ -412,7 +412,7 @@ def _rejections(sources: Sequence[Source], gates: Sequence[float], found: Forwar
     return Rejections(stamp_ns[order], role, np.full(role.size, "gate"), nis, np.repeat(gates, count)[order])
 
 
-def _facts(sources: Sequence[Source], found: Forward) -> StretchFacts:
+def _facts(sources: Sequence[SensorRows], found: Forward) -> StretchFacts:
     measurements, rejected, recovered, nis_mean = {}, {}, {}, dict[str, float | None]()
     for role in (GNSS, IMU, WHEELS, VISUAL):
         mine = [at for at, source in enumerate(sources) if source.role == role]

@@ -10,13 +10,13 @@ import numpy as np
 
 from tcpipe.dataset import Split
 from tcpipe.learning.metrics import Array, costs
-from tcpipe.simulation.robot import Robot
+from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.world import World
 
 _STEP_M = 0.05
 
 
-def plant_costs(world: World, robot: Robot, split: Split) -> dict[str, Array]:
+def plant_costs(world: World, robot: SimulatedRobot, split: Split) -> dict[str, Array]:
     """Return w, v, T, E of every sample as the plant has it on the flat truth, shape (N,) each.
 
     Parameters

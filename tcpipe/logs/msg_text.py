@@ -59,10 +59,10 @@ class FieldType:
     fixed: bool = False
 
 
-Fields = tuple[tuple[str, FieldType], ...]
+FieldTypes = tuple[tuple[str, FieldType], ...]
 
 
-def parse_msg(text: str, type_name: str) -> dict[str, Fields]:
+def parse_msg(text: str, type_name: str) -> dict[str, FieldTypes]:
     """Return the fields of each message in a definition text, by full name.
 
     Parameters
@@ -82,7 +82,7 @@ def parse_msg(text: str, type_name: str) -> dict[str, Fields]:
     return {name: _fields(lines, name) for name, lines in zip(reversed(names), reversed(pieces[0::2]), strict=True)}
 
 
-def _fields(lines: str, owner: str) -> Fields:
+def _fields(lines: str, owner: str) -> FieldTypes:
     fields = []
     for line in lines.splitlines():
         line = line.strip()  # noqa: PLW2901

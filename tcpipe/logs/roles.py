@@ -46,7 +46,7 @@ MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss")
 
 
 @dataclass(frozen=True, slots=True)
-class Role:
+class PlayedRole:
     """A role, the topics that play it (several only for power: they are summed), their type, and why."""
 
     name: str
@@ -56,7 +56,7 @@ class Role:
 
 
 @dataclass(frozen=True, slots=True)
-class Assignment:
+class RoleAssignment:
     """Who plays what.
 
     ``left_out`` says why a topic plays no role though its type could; ``problems`` are the plain lines of what the user has to decide;
@@ -65,7 +65,7 @@ class Assignment:
 
     robot: str
     robot_why: str
-    roles: Mapping[str, Role]
+    roles: Mapping[str, PlayedRole]
     left_out: Mapping[str, str]
     transforms: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
@@ -78,14 +78,14 @@ class Assignment:
 
 
 @dataclass(slots=True)
-class _Casting:
+class _Decisions:
     """The decisions while they are made."""
 
     types: Mapping[str, tuple[str, ...]]
     """Message types that can play each role, best first."""
     propulsion: Sequence[str]
     """Those that tell propulsion apart, best first."""
-    roles: dict[str, Role] = field(default_factory=dict)
+    roles: dict[str, PlayedRole] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     passed_over: dict[str, dict[str, str]] = field(default_factory=dict)
     """By role, why topics that hold data were not taken, though nobody asked for that."""
@@ -111,7 +111,7 @@ def assign_roles(
     *,
     known: Profiles,
     namespace: str | None = None,
-) -> Assignment:
+) -> RoleAssignment:
     """Return which topic plays which role, and why.
 
     Parameters
@@ -134,35 +134,35 @@ def assign_roles(
     wanted = {str(role): names for role, names in chosen.items()}
     name, robot_why = find_robot(listed.values(), robot, known.robots)
     types = {**ROLE_TYPES, "power": tuple(dict.fromkeys([*known.types(), *FLOAT_TYPES]))}
-    casting = _Casting(types, [of for of in known.types(propulsion=True) if of not in FLOAT_TYPES])
+    decided = _Decisions(types, [of for of in known.types(propulsion=True) if of not in FLOAT_TYPES])
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
-        casting.problems.append(
+        decided.problems.append(
             f"recipe read.namespace: no topic lies below {namespace}; the log holds {_listing(every.values())}"
         )
-    _take_chosen(casting, listed, wanted)
-    taken = {name for role in casting.roles.values() for name in role.topics}
-    free = [topic for topic in listed.values() if topic.name not in taken and _is_usable(casting, topic, ignored)]
+    _take_chosen(decided, listed, wanted)
+    taken = {name for role in decided.roles.values() for name in role.topics}
+    free = [topic for topic in listed.values() if topic.name not in taken and _is_usable(decided, topic, ignored)]
     found = {
         role: candidates
-        for role, candidates in _candidates(casting, free, wanted)
-        if role not in casting.roles and role not in wanted
+        for role, candidates in _candidates(decided, free, wanted)
+        if role not in decided.roles and role not in wanted
     }
     robots = namespaces_of_robots({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
     if robots:
-        casting.problems += _which_robot(robots)
-        casting.undecided |= set(found)
+        decided.problems += _which_robot(robots)
+        decided.undecided |= set(found)
     else:
         for role, candidates in found.items():
-            _decide(casting, role, candidates)
-    problems = casting.problems + (_without_motion(casting, list(listed.values())) or _questions(casting))
-    return Assignment(
+            _decide(decided, role, candidates)
+    problems = decided.problems + (_without_motion(decided, list(listed.values())) or _questions(decided))
+    return RoleAssignment(
         name,
         robot_why,
-        {role: casting.roles[role] for role in ROLE_TYPES if role in casting.roles},
-        casting.left_out,
+        {role: decided.roles[role] for role in ROLE_TYPES if role in decided.roles},
+        decided.left_out,
         _transform_topics(listed.values(), ignored),
         tuple(problems),
-        tuple(line for line in _warnings(casting, listed.values()) if line not in problems),
+        tuple(line for line in _warnings(decided, listed.values()) if line not in problems),
     )
 
 
@@ -185,34 +185,34 @@ def _which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     ]
 
 
-def _take_chosen(casting: _Casting, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]]) -> None:
+def _take_chosen(decided: _Decisions, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]]) -> None:
     for role, names in chosen.items():
         if role not in ROLE_TYPES:
-            casting.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
+            decided.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
             continue
         present = [name for name in names if name in topics]
         wanted = present if role == "power" else present[:1]
         missing = [name for name in names if name not in topics]
         if missing and (role == "power" or not present):
-            casting.undecided.add(role)
-            casting.problems.append(
+            decided.undecided.add(role)
+            decided.problems.append(
                 f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not hold; "
-                f"it holds {_listing(topics.values(), casting.types[role])}"
+                f"it holds {_listing(topics.values(), decided.types[role])}"
             )
         for name in wanted:
-            if topics[name].type_name not in casting.types[role]:
-                wanted_types = " or ".join(casting.types[role])
-                casting.problems.append(
+            if topics[name].type_name not in decided.types[role]:
+                wanted_types = " or ".join(decided.types[role])
+                decided.problems.append(
                     f"recipe read.topics.{role}: {name} is {topics[name].type_name}; wanted {wanted_types}"
                 )
             elif topics[name].problem is not None:
-                casting.problems.append(f"recipe read.topics.{role}: {name} cannot be read: {topics[name].problem}")
+                decided.problems.append(f"recipe read.topics.{role}: {name} cannot be read: {topics[name].problem}")
         if wanted:
-            casting.roles[role] = Role(role, tuple(wanted), topics[wanted[0]].type_name, "the recipe says so")
+            decided.roles[role] = PlayedRole(role, tuple(wanted), topics[wanted[0]].type_name, "the recipe says so")
 
 
-def _is_usable(casting: _Casting, topic: Topic, ignored: Sequence[str]) -> bool:
-    if not any(topic.type_name in types for types in casting.types.values()):
+def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> bool:
+    if not any(topic.type_name in types for types in decided.types.values()):
         return False
     if topic.type_name in FLOAT_TYPES and quantity(topic.name) is None:
         return False
@@ -224,7 +224,7 @@ def _is_usable(casting: _Casting, topic: Topic, ignored: Sequence[str]) -> bool:
     elif topic.message_count == 0:
         why = "it has no messages"
     if why is not None:
-        casting.left_out[topic.name] = why
+        decided.left_out[topic.name] = why
     return why is None
 
 
@@ -259,7 +259,7 @@ Ranked = list[tuple[tuple[int, ...], str, Topic]]
 
 
 def _candidates(
-    casting: _Casting, topics: Sequence[Topic], chosen: Mapping[str, Sequence[str]]
+    decided: _Decisions, topics: Sequence[Topic], chosen: Mapping[str, Sequence[str]]
 ) -> Iterable[tuple[str, Ranked]]:
     """Yield each role with its ranked candidates; what can be no candidate is left out with its reason."""
     found: dict[str, Ranked] = {role: [] for role in ROLE_TYPES}
@@ -267,18 +267,18 @@ def _candidates(
     for topic in topics:
         if topic.type_name in FLOAT_TYPES:
             continue
-        role, rank, why = (_SORTERS.get(topic.type_name) or partial(_sort_power, casting.propulsion))(topic)
+        role, rank, why = (_SORTERS.get(topic.type_name) or partial(_sort_power, decided.propulsion))(topic)
         if role is None:
-            casting.left_out[topic.name] = why
-            usual = next(role for role, types in casting.types.items() if topic.type_name in types)
+            decided.left_out[topic.name] = why
+            usual = next(role for role, types in decided.types.items() if topic.type_name in types)
             if usual not in chosen:
-                casting.pass_over(usual, topic, why)
+                decided.pass_over(usual, topic, why)
         elif role in chosen:
-            casting.left_out[topic.name] = f"the recipe chooses what plays {role}"
+            decided.left_out[topic.name] = f"the recipe chooses what plays {role}"
         else:
             found[role].append((rank, why, topic))
     if "power" not in chosen:
-        found["power"] += _bare_power(casting, bare)
+        found["power"] += _bare_power(decided, bare)
     return found.items()
 
 
@@ -340,7 +340,7 @@ def _sort_power(propulsion: Sequence[str], topic: Topic) -> Sorted:
     return "power", (3,), ""
 
 
-def _bare_power(casting: _Casting, topics: Iterable[Topic]) -> Ranked:
+def _bare_power(decided: _Decisions, topics: Iterable[Topic]) -> Ranked:
     """Return bare numbers that make whole rails: one voltage and one current that are called alike, on drives or batteries."""
     rails: dict[str, list[Topic]] = {}
     for topic in topics:
@@ -352,7 +352,7 @@ def _bare_power(casting: _Casting, topics: Iterable[Topic]) -> Ranked:
         used = [topic for topic in parts if is_corrected(topic.name) or quantity(topic.name) not in corrected]
         if sorted(str(quantity(topic.name)) for topic in used) == ["current", "voltage"]:
             found += [((2,), "", topic) for topic in used]
-            casting.left_out |= {topic.name: "its corrected form is taken" for topic in parts if topic not in used}
+            decided.left_out |= {topic.name: "its corrected form is taken" for topic in parts if topic not in used}
     return found
 
 
@@ -364,7 +364,7 @@ _SORTERS: dict[str, Callable[[Topic], Sorted]] = {
 }
 
 
-def _decide(casting: _Casting, role: str, candidates: Ranked) -> None:
+def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     if not candidates:
         return
     first = _best(role, candidates)
@@ -380,15 +380,15 @@ def _decide(casting: _Casting, role: str, candidates: Ranked) -> None:
     elif role == "power" and _are_sides(rails := _rails(topics)):
         why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
     else:
-        casting.ambiguous.append(f"role {role} is ambiguous, {len(first)} topics could play it: {_listing(topics)}")
-        casting.recipe_lines.append(_recipe_line(role, names))
-        casting.undecided.add(role)
+        decided.ambiguous.append(f"role {role} is ambiguous, {len(first)} topics could play it: {_listing(topics)}")
+        decided.recipe_lines.append(_recipe_line(role, names))
+        decided.undecided.add(role)
         return
-    casting.roles[role] = Role(role, names, topics[0].type_name, why)
+    decided.roles[role] = PlayedRole(role, names, topics[0].type_name, why)
     winner = " + ".join(names)
     little = f"it covers little of what {winner} covers ({coverage(topics[0])})"
     for topic in others:
-        casting.pass_over(role, topic, little if topic.name in thin else f"{winner} fits {role} better")
+        decided.pass_over(role, topic, little if topic.name in thin else f"{winner} fits {role} better")
 
 
 def _best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
@@ -424,20 +424,20 @@ def _recipe_line(role: str, names: Sequence[str]) -> str:
     return f'{role} = ["{names[0]}"]  #{others}{summed if role == "power" else ""}'
 
 
-def _questions(casting: _Casting) -> list[str]:
+def _questions(decided: _Decisions) -> list[str]:
     """Return what is ambiguous, and the recipe lines that would settle it."""
-    if not casting.ambiguous:
+    if not decided.ambiguous:
         return []
     how = ["settle it in the recipe (tcpipe.toml), for example:", "[read.topics]"]
-    return [*casting.ambiguous, *how, *casting.recipe_lines]
+    return [*decided.ambiguous, *how, *decided.recipe_lines]
 
 
-def _without_motion(casting: _Casting, topics: Sequence[Topic]) -> list[str]:
-    if any(role in casting.roles or role in casting.undecided for role in MOTION_ROLES):
+def _without_motion(decided: _Decisions, topics: Sequence[Topic]) -> list[str]:
+    if any(role in decided.roles or role in decided.undecided for role in MOTION_ROLES):
         return []
     lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
     types = {topic.name: topic.type_name for topic in topics}
-    could = {name: why for name, why in casting.left_out.items() if _is_motion(types[name])}
+    could = {name: why for name, why in decided.left_out.items() if _is_motion(types[name])}
     if could:
         name = next(iter(could))
         role = "gnss" if types[name] in ROLE_TYPES["gnss"] else "wheel_odometry"
@@ -467,13 +467,13 @@ def _is_motion(type_name: str) -> bool:
     return any(type_name in ROLE_TYPES[role] for role in MOTION_ROLES)
 
 
-def _warnings(casting: _Casting, topics: Iterable[Topic]) -> Iterable[str]:
-    there = casting.roles.keys() | casting.undecided
+def _warnings(decided: _Decisions, topics: Iterable[Topic]) -> Iterable[str]:
+    there = decided.roles.keys() | decided.undecided
     if "gnss" not in there:
         yield "no topic plays gnss: the track lies in a local frame and cannot be placed on a map"
     if "power" not in there:
         yield "no topic plays power: there will be a track but no energy"
-    for role, passed in casting.passed_over.items():
+    for role, passed in decided.passed_over.items():
         shown = ", ".join(f"{name} ({why})" for name, why in list(passed.items())[:_LISTED])
         yield f"{role}: left out: {shown}" + (f" and {len(passed) - _LISTED} more" if len(passed) > _LISTED else "")
     yield from _undecodable(topics)

@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.geometry.polyline import polyline
-from tcpipe.motion.pieces import piece_spans, runs
+from tcpipe.motion.pieces import piece_spans, spans_where
 from tcpipe.tables.bits import DropReason, name_of
 
 
 def stretches(dropped_by: NDArray[np.uint32], piece: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return first and last row of every maximal run of kept rows inside one piece, shape (S, 2), two rows at least."""
-    kept = runs(dropped_by == 0, piece)
+    kept = spans_where(dropped_by == 0, piece)
     return kept[kept[:, 1] > kept[:, 0]]
 
 

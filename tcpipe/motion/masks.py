@@ -17,8 +17,8 @@ from tcpipe.motion.pieces import (
     lasting,
     mask_of,
     piece_bounds,
-    runs,
     slope,
+    spans_where,
     window_mean,
 )
 
@@ -86,7 +86,7 @@ def ramps(rows: MotionRows, acceleration_mps2: Floats, halted: Mask, *, above_mp
     found = np.zeros(len(halted), dtype=np.bool_)
     for changes in (speeding_up > above_mps2, speeding_up < -above_mps2):
         going_on = ~lasting(~(changes | halted), rows.piece, min_rows=rows.count(min_s))
-        spans = runs(going_on, rows.piece)
+        spans = spans_where(going_on, rows.piece)
         found |= mask_of(spans[halts[spans[:, 1] + 1] > halts[spans[:, 0]]], len(halted))
     return found & ~halted
 
@@ -109,7 +109,7 @@ def command_changed(rows: MotionRows, *, step_mps: float, window_s: float, settl
     _, high = piece_bounds(rows.piece)
     spans = [
         (first + begin, min(first + end + rows.count(settle_s), high[first]))
-        for first, last in runs(changing, part)
+        for first, last in spans_where(changing, part)
         for begin, end in [_moment(command[first : last + 1], before[first], after[last], step_mps=step_mps)]
     ]
     return mask_of(np.array(spans, dtype=np.int64).reshape(-1, 2), len(command))

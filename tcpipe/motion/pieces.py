@@ -56,7 +56,7 @@ def piece_of_rows(
     return np.concatenate((np.zeros(min(len(stamp_ns), 1), dtype=np.int64), np.cumsum(broken)))
 
 
-def runs(mask: Mask, piece: NDArray[np.int64]) -> NDArray[np.int64]:
+def spans_where(mask: Mask, piece: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return first and last row of every maximal run of true rows inside one piece, shape (R, 2)."""
     joined = mask[:-1] & mask[1:] & (piece[:-1] == piece[1:])
     edge = np.zeros(min(len(mask), 1), dtype=np.bool_)
@@ -76,7 +76,7 @@ def mask_of(spans: NDArray[np.int64], size: int) -> Mask:
 
 def piece_spans(piece: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return first and last row of every piece, shape (P, 2)."""
-    return runs(np.ones(len(piece), dtype=np.bool_), piece)
+    return spans_where(np.ones(len(piece), dtype=np.bool_), piece)
 
 
 def piece_bounds(piece: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -87,13 +87,13 @@ def piece_bounds(piece: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[n
 
 def lasting(mask: Mask, piece: NDArray[np.int64], *, min_rows: int) -> Mask:
     """Return the mask without runs of fewer than ``min_rows`` rows."""
-    spans = runs(mask, piece)
+    spans = spans_where(mask, piece)
     return mask_of(spans[spans[:, 1] - spans[:, 0] + 1 >= min_rows], len(mask))
 
 
 def dilated(mask: Mask, piece: NDArray[np.int64], *, before: int, after: int) -> Mask:
     """Return the mask with every run widened by ``before`` and ``after`` rows, inside its piece."""
-    spans = runs(mask, piece)
+    spans = spans_where(mask, piece)
     low, high = piece_bounds(piece)
     spans[:, 0] = np.maximum(spans[:, 0] - before, low[spans[:, 0]])
     spans[:, 1] = np.minimum(spans[:, 1] + after, high[spans[:, 1]])

@@ -86,14 +86,14 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
         There is no such dataset, sample or store, the dataset is of another data model, or the store no longer holds the sample's run.
 
     """
-    directory, house = Path(dataset), open_store(store)
+    directory, opened = Path(dataset), open_store(store)
     card, sample = read_current_card(directory), _sample(directory, sample_id)
     recipe = parse_recipe(card["recipe"], where=str(directory / "dataset.json"))
-    run = _run(house, directory, card, sample)
+    run = _run(opened, directory, card, sample)
     told = run.manifest
     read_with = read_key(recipe, told["robot_requested"], definitions=told.get("message_definitions", ""))
-    streams = house.read_streams(run.run_id, key=f"{read_with}-{told['tcpipe_version']}")
-    source = open_map(house.map_path(sample["map"]))
+    streams = opened.read_streams(run.run_id, key=f"{read_with}-{told['tcpipe_version']}")
+    source = open_map(opened.map_path(sample["map"]))
     window = sample["start_ns"], sample["end_ns"]
     made = _made_again(sample, run, streams, source, recipe)
     differences = tuple(_differences(directory, card, sample, made))
@@ -103,7 +103,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
         "sample": sample,
         "labels": {name: sample[name] for name in _LABELS},
         "quality": [name_of(bit) for bit in Quality if sample["quality"] & bit],
-        "log": _log(house, run),
+        "log": _log(opened, run),
         "messages": {} if streams is None else dict(_messages(streams, *window)),
         "gates": list(_gates(run, *window)),
         "refused": list(_refused(run, *window)),

@@ -186,23 +186,23 @@ def ingest(
         found = find_sources(logs, as_one=as_one, staging=Path(staging))
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
-        house = open_store(store, create=True)
-        remember_earlier(house)
+        opened = open_store(store, create=True)
+        remember_earlier(opened)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
-        common = (house.root, ruling, robot, dict(tags or {}), force, message_definitions)
+        common = (opened.root, ruling, robot, dict(tags or {}), force, message_definitions)
         how = (definitions_key(message_definitions), retry_failed, min_age_s)
-        sources = with_hashes(mine, (lambda _: []) if force else house.records)
+        sources = with_hashes(mine, (lambda _: []) if force else opened.records)
         tasks = [IngestTask(source, *common, *how) for source in sources]
         if on_found:
             on_found(len(tasks) + len(found.problems))
         results = {}
-        for index, source, result in _results(house, tasks, found, jobs):
+        for index, source, result in _results(opened, tasks, found, jobs):
             results[index] = result
             if on_result:
                 on_result(result)
             if source is not None:
-                _remember(house, tasks[index], source, result)
-        return IngestSummary(house.root, tuple(results[index] for index in sorted(results)))
+                _remember(opened, tasks[index], source, result)
+        return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
 
 def _results(

@@ -100,19 +100,19 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
         A name is none of a run or log with known trouble, or of several logs; nothing was accepted then.
 
     """
-    house = open_store(store)
-    known = _known(house)
+    opened = open_store(store)
+    known = _known(opened)
     chosen: list[Trouble] = []
     problems: list[str] = []
     for name in dict.fromkeys(names):
-        found = _named(name, known, house)
+        found = _named(name, known, opened)
         if len({trouble.called for trouble in found}) == 1:
             chosen += found
         else:
-            problems.append(_not_one(name, found, [of for of in known if not of.is_accepted(house)], house))
+            problems.append(_not_one(name, found, [of for of in known if not of.is_accepted(opened)], opened))
     if problems:
         raise UsageError(*problems)
-    now = [trouble for trouble in chosen if trouble.accept(house)]
+    now = [trouble for trouble in chosen if trouble.accept(opened)]
     return Accepted(tuple(now), tuple(trouble for trouble in chosen if trouble not in now))
 
 

@@ -87,8 +87,8 @@ def add_map(
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, "classes": classes}
     files = _found({role: value for role, value in given.items() if value})
-    house = open_store(store, create=True)
-    path = house.map_path(name)
+    opened = open_store(store, create=True)
+    path = opened.map_path(name)
     inputs = _inputs(files, crs)
     before = place_state(path)
     if path.exists() and not force:
@@ -103,7 +103,7 @@ def add_map(
             ortho=files.get("ortho", ()),
             terrain=files.get("terrain", ()),
             classes=files["classes"][0] if "classes" in files else None,
-            agreed=_agreed(house, name),
+            agreed=_agreed(opened, name),
             crs=crs,
             inputs=inputs,
             instead_of=before,
@@ -207,13 +207,13 @@ def _change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str
     return f"{role} has another content ({', '.join(names or before)})"
 
 
-def _agreed(house: Store, name: str) -> ClassScheme | None:
+def _agreed(opened: Store, name: str) -> ClassScheme | None:
     """Return the classes that the store's other maps share; None while none of them has any."""
-    for other in house.maps():
+    for other in opened.maps():
         if other == name:
             continue
         try:
-            found = open_map(house.map_path(other))
+            found = open_map(opened.map_path(other))
         except MapError:
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue

@@ -20,12 +20,12 @@ def chosen_map(store: str | Path, name: str | None) -> MapFile:
         There are several, and none is named.
 
     """
-    house = open_store(store)
-    maps = house.maps()
+    opened = open_store(store)
+    maps = opened.maps()
     if not maps:
-        raise MapError(f"{house.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
+        raise MapError(f"{opened.root}: no map in the store; add one: tcpipe add-map NAME --height FILE")
     if name is None and len(maps) > 1:
-        raise UsageError(f"{house.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map")
+        raise UsageError(f"{opened.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map")
     if name is not None and name not in maps:
-        raise MapError(f"{house.root}: no map {name!r} in the store; there are {', '.join(maps)}")
-    return open_map(house.map_path(name or maps[0]))
+        raise MapError(f"{opened.root}: no map {name!r} in the store; there are {', '.join(maps)}")
+    return open_map(opened.map_path(name or maps[0]))

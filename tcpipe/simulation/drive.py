@@ -13,7 +13,7 @@ import numpy as np
 
 from tcpipe.errors import UsageError
 from tcpipe.geometry.rotation import inverse, product, quat_from_matrix, rotation_vector_from_quat
-from tcpipe.simulation.robot import Robot, correlated_noise, drive_along
+from tcpipe.simulation.robot import SimulatedRobot, correlated_noise, drive_along
 from tcpipe.simulation.route import (
     PATH_GRID_M,
     Leg,
@@ -58,7 +58,7 @@ def drive(
     start_m: tuple[float, float],
     start_yaw_rad: float = 0.0,
     start_ns: int = 0,
-    robot: Robot,
+    robot: SimulatedRobot,
     weave_m: float = 0.04,
     rng: np.random.Generator,
 ) -> Truth:
@@ -86,7 +86,7 @@ def _stretches(
     place: Float,
     yaw: float,
     *,
-    robot: Robot,
+    robot: SimulatedRobot,
     weave_m: float,
     rng: np.random.Generator,
 ) -> list[_Stretch]:
@@ -125,7 +125,7 @@ def _still(
     return _Stretch(np.tile(place, (count, 1)), np.full(count, yaw), wheel, slip, np.full(count, command_mps), zero)
 
 
-def _turn(place: Float, yaw: float, angle_rad: float, robot: Robot) -> _Stretch:
+def _turn(place: Float, yaw: float, angle_rad: float, robot: SimulatedRobot) -> _Stretch:
     """Turn with a trapezoid of yaw rate that ends exactly at the angle."""
     rate, rise_s = robot.max_yaw_rate_radps, 0.35
     size = abs(angle_rad)
@@ -138,7 +138,7 @@ def _turn(place: Float, yaw: float, angle_rad: float, robot: Robot) -> _Stretch:
     return _Stretch(np.tile(place, (t.size, 1)), yaw + angle_rad * swept / swept[-1], zero, zero, zero, command)
 
 
-def _along(world: World, path: Path, command: float, robot: Robot, *, backwards: bool) -> _Stretch:
+def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, backwards: bool) -> _Stretch:
     """Drive a path from rest to rest."""
     grid = np.arange(0.0, path.length_m, PATH_GRID_M)
     uv, direction = path.at(grid)
@@ -170,7 +170,7 @@ def _along(world: World, path: Path, command: float, robot: Robot, *, backwards:
     return _Stretch(uv, yaw, sign * wheel, np.interp(s, grid, slip), commanded, commanded_rate)
 
 
-def _truth(world: World, driven: _Stretch, robot: Robot, start_ns: int, rng: np.random.Generator) -> Truth:
+def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator) -> Truth:
     site = world.site
     x, y = driven.uv_m[:, 0] + site.west_m, driven.uv_m[:, 1] + site.south_m
     alt = world.height_m(x, y) + site.geoid_m
@@ -202,7 +202,7 @@ def _truth(world: World, driven: _Stretch, robot: Robot, start_ns: int, rng: np.
     )  # fmt: skip
 
 
-def _rolling_resistance(world: World, robot: Robot, x: Float, y: Float, yaw_map_rad: Float) -> Float:
+def _rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y: Float, yaw_map_rad: Float) -> Float:
     """Return the mean over the wheelbase."""
     by_class = robot.ground_table()[:, 2]
     along = np.linspace(-0.5, 0.5, 5) * robot.wheelbase_m
@@ -232,7 +232,7 @@ def _angular_velocity(quat_xyzw: Float) -> Float:
 
 
 def _power(
-    robot: Robot, driven: _Stretch, slope: Float, rolling: Float, rng: np.random.Generator
+    robot: SimulatedRobot, driven: _Stretch, slope: Float, rolling: Float, rng: np.random.Generator
 ) -> tuple[Float, Float, Float]:
     """Return voltage, propulsion current, and the right driver's share of it."""
     rolling = np.where(driven.slip == 1.0, _DIGGING_RESISTANCE, rolling)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.simulation.robot import Ground, Robot
+from tcpipe.simulation.robot import GroundModel, SimulatedRobot
 from tcpipe.simulation.route import AlongRoad, Wander
 from tcpipe.simulation.sensors import Gnss, Power, Sensors
 from tcpipe.simulation.site import Site
@@ -37,7 +37,7 @@ class PaperSite:
     """World, robot, sensors, and where it is driven."""
 
     world: World
-    robot: Robot
+    robot: SimulatedRobot
     sensors: Sensors
     tours: tuple[Wander | AlongRoad, ...]
 
@@ -50,8 +50,8 @@ def paper_parameters() -> dict[str, Any]:
 def paper_site() -> PaperSite:
     """Return a site as large, as high and as steep as the paper's (section IV-A), its robot, and drives with its class shares."""
     told = paper_parameters()
-    ground = {_GROUNDS[name]: Ground(**_numbers(table)) for name, table in told["ground"].items()}
-    robot = Robot(**_of(Robot, told["robot"]), ground=ground)
+    ground = {_GROUNDS[name]: GroundModel(**_numbers(table)) for name, table in told["ground"].items()}
+    robot = SimulatedRobot(**_of(SimulatedRobot, told["robot"]), ground=ground)
     sensors = Sensors(gnss=Gnss(**_of(Gnss, told["gnss"])), power=Power(**_of(Power, told["power"])))
     return PaperSite(paper_world(), robot, sensors, tuple(_tours(told["drives"])))
 

@@ -20,7 +20,7 @@ _STEEPEST_SIN = float(np.sin(np.radians(22.5)))
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class GroundModel:
     """How one terrain class treats the robot on the flat."""
 
     speed: float
@@ -32,15 +32,15 @@ class Ground:
 
 
 _GROUND = {
-    GRASS: Ground(speed=0.90, slip=0.03, rolling_resistance=0.170),
-    MUD: Ground(speed=0.84, slip=0.07, rolling_resistance=0.220),
-    UNPAVED: Ground(speed=0.94, slip=0.02, rolling_resistance=0.135),
-    PAVED: Ground(speed=0.97, slip=0.01, rolling_resistance=0.115),
+    GRASS: GroundModel(speed=0.90, slip=0.03, rolling_resistance=0.170),
+    MUD: GroundModel(speed=0.84, slip=0.07, rolling_resistance=0.220),
+    UNPAVED: GroundModel(speed=0.94, slip=0.02, rolling_resistance=0.135),
+    PAVED: GroundModel(speed=0.97, slip=0.01, rolling_resistance=0.115),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Robot:
+class SimulatedRobot:
     """A Husky with some payload."""
 
     mass_kg: float = 70.0
@@ -74,7 +74,7 @@ class Robot:
     """Fluctuation of the rolling resistance in time, relative, standard deviation."""
     resistance_noise_s: float = 0.15
     """Its correlation time."""
-    ground: dict[int, Ground] = field(default_factory=lambda: dict(_GROUND))
+    ground: dict[int, GroundModel] = field(default_factory=lambda: dict(_GROUND))
     """By class id; a class that is not named is grass."""
 
     def ground_table(self) -> Float:

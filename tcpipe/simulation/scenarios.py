@@ -12,7 +12,7 @@ from tcpipe.errors import UsageError
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.messages import Recorder
 from tcpipe.simulation.paper_site import paper_site
-from tcpipe.simulation.robot import Robot
+from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import AlongRoad, Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
 from tcpipe.simulation.sensors import Imu, Sensors, Visual
 from tcpipe.simulation.site import Site
@@ -42,7 +42,7 @@ class DriveSpec:
     recorder: Recorder = HUSKY_ROS2
     sensors: Sensors = field(default_factory=Sensors)
     faults: Faults = field(default_factory=Faults)
-    robot: Robot = field(default_factory=Robot)
+    robot: SimulatedRobot = field(default_factory=SimulatedRobot)
     start_yaw_rad: float = 0.0
     """From the map's x axis."""
     weave_m: float = 0.04

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Offset, Pair, PowerSignal, find_clock_offsets
+from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Pair, PowerSignal, RoleOffset, find_clock_offsets
 from tcpipe.power.rails import power_at
-from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_sanity import longest_epoch
 from tcpipe.stages.power_rails import rails_of
 from tcpipe.tables.findings import ClockFacts, ClockOffset, ClockPair, Findings
@@ -20,7 +20,7 @@ _MAX_GAP_NS = 300_000_000
 _FINE_S = 0.004
 
 
-def clock_findings(streams: Streams, inputs: Inputs) -> Findings[ClockFacts]:
+def clock_findings(streams: Streams, inputs: FusionInputs) -> Findings[ClockFacts]:
     """Return the offsets between the sensors' clocks in the longest clock epoch; nothing is corrected.
 
     The recipe lines that would correct an offset include what the recipe adds already.
@@ -45,12 +45,12 @@ def clock_findings(streams: Streams, inputs: Inputs) -> Findings[ClockFacts]:
     return Findings(tuple(warnings), ClockFacts(epoch, found.reference, pairs, offsets))
 
 
-def _told(each: Offset | Pair) -> dict[str, Any]:
+def _told(each: RoleOffset | Pair) -> dict[str, Any]:
     """Return the fields by name, None for what is not known."""
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in asdict(each).items()}
 
 
-def _drift(found: ClockOffsets, role: str, offset: Offset) -> str:
+def _drift(found: ClockOffsets, role: str, offset: RoleOffset) -> str:
     change_s = offset.drift_s_per_h * found.span_s / 3600
     return (
         f"{role}: its stamps drift against {found.reference} by {change_s:+.2f} s over the run "

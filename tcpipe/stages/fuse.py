@@ -10,7 +10,7 @@ from tcpipe.errors import FusionError
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_doctor import clock_findings
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, rejections_table
-from tcpipe.stages.fuse_inputs import Inputs, prepare_inputs
+from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.stages.fuse_sanity import sane_inputs, without_lost_gnss
 from tcpipe.stages.fuse_stretches import fuse_stretches
 from tcpipe.tables.findings import Findings
@@ -56,7 +56,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     return Track(table, rejections_table(inputs, fused.found), info)
 
 
-def _nothing(streams: Streams, inputs: Inputs) -> str:
+def _nothing(streams: Streams, inputs: FusionInputs) -> str:
     rows = {role: table.num_rows for role, table in streams.tables.items()}
     unusable = {role: count["invalid"] for role, count in inputs.counts.items() if count["invalid"]}
     return (

@@ -12,7 +12,7 @@ from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InitialState
 from tcpipe.fusion.stretches import Stretch
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
-from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.tables.findings import FuseFacts, StretchFacts
 from tcpipe.tables.levels import REJECTIONS
 
@@ -39,7 +39,7 @@ def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) ->
     )
 
 
-def fuse_facts(inputs: Inputs, stretches: Sequence[StretchFacts], *, rows: int, skipped_s: float) -> FuseFacts:
+def fuse_facts(inputs: FusionInputs, stretches: Sequence[StretchFacts], *, rows: int, skipped_s: float) -> FuseFacts:
     """Return the facts of the run: counts by role over all stretches, what was set aside, and each stretch."""
     roles = sorted({role for stretch in stretches for role in stretch.measurements})
     nis: dict[str, float | None] = {}
@@ -60,7 +60,7 @@ def fuse_facts(inputs: Inputs, stretches: Sequence[StretchFacts], *, rows: int, 
     )
 
 
-def fuse_warnings(inputs: Inputs, facts: FuseFacts) -> tuple[str, ...]:
+def fuse_warnings(inputs: FusionInputs, facts: FuseFacts) -> tuple[str, ...]:
     """Return what a person should know before trusting the track."""
     counts = {role: count for role, count in inputs.counts.items() if role not in inputs.refused}
     found = [remark for remark in inputs.remarks if remark.split(":")[0] not in inputs.refused]
@@ -95,7 +95,7 @@ def fuse_warnings(inputs: Inputs, facts: FuseFacts) -> tuple[str, ...]:
     return tuple(found)
 
 
-def rejections_table(inputs: Inputs, found: list[Trajectory]) -> pa.Table:
+def rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:
     """Return every refused measurement in order of time: by the gate, and those without a usable value."""
     parts = [trajectory.rejections for trajectory in found]
     invalid = [(role, np.concatenate(stamps)) for role, stamps in sorted(inputs.invalid_ns.items())]

@@ -22,7 +22,7 @@ from tcpipe.tables.levels import Sensor, Streams
 
 
 @dataclass(slots=True)
-class Inputs:
+class FusionInputs:
     """Measurements by epoch; datum (longitude, latitude, height) or None; by role, unusable stamps, counts and remarks; refused roles."""
 
     datum_deg_m: tuple[float, float, float] | None
@@ -42,14 +42,14 @@ class Inputs:
         self.remarks += [f"{role}: {remark}" for remark in prepared.remarks if f"{role}: {remark}" not in self.remarks]
 
 
-def prepare_inputs(streams: Streams, config: FuseConfig) -> Inputs:
+def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     """Turn the motion streams into measurements, one set a clock epoch."""
     tables = {role: streams.tables[role] for role in (GNSS, IMU, WHEELS, VISUAL) if role in streams.tables}
     datum = None
     if GNSS in tables:
         fixes = FloatColumns(tables[GNSS])
         datum = preparation.find_datum(fixes["lon_deg"], fixes["lat_deg"], fixes["alt_m"])
-    inputs = Inputs(datum)
+    inputs = FusionInputs(datum)
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
         parts = {role: rows_where(table, "epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}
@@ -65,7 +65,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> Inputs:
     return inputs
 
 
-def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: Inputs) -> Any:
+def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inputs: FusionInputs) -> Any:
     stamp_ns, columns = integers(table, "stamp_ns"), FloatColumns(table)
     place: Mapping[str, Any] = {"xyz_m": sensor.xyz_m, "quat_xyzw": sensor.quat_xyzw}
     made: Any

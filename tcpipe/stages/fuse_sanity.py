@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from tcpipe.fusion.checks.sensors import Command, Refusal, check_sensors
+from tcpipe.fusion.checks.sensors import CommandedSpeed, Refusal, check_sensors
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
-from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.findings import Findings, SensorChecks, StretchFacts
@@ -21,7 +21,7 @@ _MOST_REFUSED = 0.5
 _STATED = ("recipe", "tf_static", "same frame")
 
 
-def sane_inputs(inputs: Inputs, streams: Streams) -> tuple[Inputs, Findings[SensorChecks]]:
+def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, Findings[SensorChecks]]:
     """Return the inputs without the sensors that are refused, and why, judged over the longest clock epoch."""
     if not inputs.measurements:
         return inputs, Findings((), SensorChecks())
@@ -34,8 +34,8 @@ def sane_inputs(inputs: Inputs, streams: Streams) -> tuple[Inputs, Findings[Sens
 
 
 def without_lost_gnss(
-    inputs: Inputs, sanity: Findings[SensorChecks], stretches: Sequence[StretchFacts], streams: Streams
-) -> tuple[Inputs, Findings[SensorChecks]] | None:
+    inputs: FusionInputs, sanity: Findings[SensorChecks], stretches: Sequence[StretchFacts], streams: Streams
+) -> tuple[FusionInputs, Findings[SensorChecks]] | None:
     """Return the inputs without GNSS, and why, where the estimate refused most of its fixes; None where it did not.
 
     A filter that refuses a sensor throughout is led by it all the same, each time that its gate reopens.
@@ -50,8 +50,8 @@ def without_lost_gnss(
 
 
 def _left_out(
-    inputs: Inputs, before: Findings[SensorChecks], refusals: Sequence[Refusal], streams: Streams
-) -> tuple[Inputs, Findings[SensorChecks]]:
+    inputs: FusionInputs, before: Findings[SensorChecks], refusals: Sequence[Refusal], streams: Streams
+) -> tuple[FusionInputs, Findings[SensorChecks]]:
     refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
     reasons = {**before.facts.refused, **{refusal.role: refusal.why for refusal in refusals}}
@@ -71,7 +71,7 @@ def _without(refused: frozenset[str], m: Measurements) -> Measurements:
     )
 
 
-def longest_epoch(inputs: Inputs) -> int:
+def longest_epoch(inputs: FusionInputs) -> int:
     """Return the clock epoch with most measurements."""
     return max(inputs.measurements, key=lambda epoch: _rows(inputs.measurements[epoch]))
 
@@ -81,13 +81,13 @@ def _rows(measurements: Measurements) -> int:
     return sum(source.stamp_ns.size for source in sources if source is not None)
 
 
-def _command(streams: Streams, epoch: int) -> Command | None:
+def _command(streams: Streams, epoch: int) -> CommandedSpeed | None:
     if "command" not in streams.tables:
         return None
     table = streams.tables["command"]
     table = rows_where(table, "epoch", epoch)
     order = np.argsort(integers(table, "stamp_ns"), kind="stable")
-    return Command(integers(table, "stamp_ns")[order], floats(table, "forward_velocity_mps")[order])
+    return CommandedSpeed(integers(table, "stamp_ns")[order], floats(table, "forward_velocity_mps")[order])
 
 
 def _felt(streams: Streams) -> float:

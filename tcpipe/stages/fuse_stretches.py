@@ -18,7 +18,7 @@ from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_columns import command_columns, pose_columns, power_columns, wheel_column
 from tcpipe.stages.fuse_findings import stretch_facts
-from tcpipe.stages.fuse_inputs import Inputs
+from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.tables.findings import StretchFacts
 from tcpipe.tables.levels import Streams
 
@@ -33,7 +33,7 @@ class Fused:
     skipped_s: float = 0.0
 
 
-def fuse_stretches(inputs: Inputs, streams: Streams, config: FuseConfig) -> Fused:
+def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> Fused:
     """Fuse each stretch for itself, in order of epoch and stamp."""
     fused = Fused()
     period_ns, max_gap_ns = round(1e9 / config.rate_hz), int(config.max_gap_s * 1e9)
@@ -73,7 +73,7 @@ def _estimate(stretch: Stretch, initial: InitialState, output_ns: NDArray[np.int
 
 
 def _columns(
-    stretch: Stretch, trajectory: Trajectory, inputs: Inputs, streams: Streams, config: FuseConfig
+    stretch: Stretch, trajectory: Trajectory, inputs: FusionInputs, streams: Streams, config: FuseConfig
 ) -> dict[str, NDArray[Any]]:
     stamp_ns = trajectory.stamp_ns
     gap_ns, power_gap_ns = int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tcpipe.cost.labels import Labels, labels
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
-from tcpipe.motion.pieces import piece_of_rows, runs
+from tcpipe.motion.pieces import piece_of_rows, spans_where
 from tcpipe.motion.uncertainty import along_std_m, between_durations_m, displacement_std_m
 from tcpipe.power.energy import Rule, energy_joule
 from tcpipe.power.noise import energy_noise
@@ -81,4 +81,4 @@ def _still_ns(rows: pa.Table, rate_hz: float) -> NDArray[np.int64]:
     stamp_ns = integers(rows, "stamp_ns")
     piece = piece_of_rows(stamp_ns, integers(rows, "epoch"), period_ns=1e9 / rate_hz)
     standing = (numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
-    return stamp_ns[runs(standing, piece)]
+    return stamp_ns[spans_where(standing, piece)]

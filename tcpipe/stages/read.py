@@ -20,7 +20,7 @@ from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_findings import read_findings
 from tcpipe.stages.read_power import columns_of
 from tcpipe.stages.read_sensors import place_sensors
-from tcpipe.stages.read_sources import Source, read_sources
+from tcpipe.stages.read_sources import TopicReadings, read_sources
 from tcpipe.tables.levels import STREAMS, Streams
 
 
@@ -68,7 +68,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     return Streams(streams, sensors, assignment.robot, config.gnss_crs, averaged, findings)
 
 
-def _times(source: Source, config: ReadConfig) -> TopicTimes:
+def _times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
     readings = source.readings
     prefer = config.time.get(source.role, "auto")
     stamps = readings.header_ns if readings.own_time_ns is None or prefer == "header" else readings.own_time_ns
@@ -81,7 +81,9 @@ def _times(source: Source, config: ReadConfig) -> TopicTimes:
     )
 
 
-def _table(role: str, sources: Sequence[Source], timelines: Mapping[str, Timeline], power: PowerReadings) -> pa.Table:
+def _table(
+    role: str, sources: Sequence[TopicReadings], timelines: Mapping[str, Timeline], power: PowerReadings
+) -> pa.Table:
     """Return a role's table, sorted by epoch and stamp."""
     parts = []
     for source in sources:
@@ -92,7 +94,7 @@ def _table(role: str, sources: Sequence[Source], timelines: Mapping[str, Timelin
     return STREAMS[role].table(**{name: values[order] for name, values in columns.items()})
 
 
-def _parts(source: Source, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
+def _parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
     """Return a topic's columns; one part a rail where it plays power."""
     columns = {name: values[timeline.row] for name, values in source.readings.columns.items()}
     times: dict[str, NDArray[Any]] = {

@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from tcpipe.logs.clocks import Timeline, about_simulated_time
-from tcpipe.logs.roles import Assignment
+from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings
-from tcpipe.stages.read_sources import Source
+from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.findings import (
     ClockStep,
     Findings,
@@ -26,8 +26,8 @@ _MANY_DROPPED = 0.01
 
 
 def read_findings(
-    assignment: Assignment,
-    sources: Sequence[Source],
+    assignment: RoleAssignment,
+    sources: Sequence[TopicReadings],
     timelines: Mapping[str, Timeline],
     steps: Sequence[ClockStep],
     *,
@@ -56,7 +56,7 @@ def read_findings(
     return Findings(tuple(dict.fromkeys(warnings)), facts)
 
 
-def _warnings(source: Source, timeline: Timeline | None) -> Iterable[str]:
+def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]:
     name = f"{source.role}: {source.topic}"
     rows = len(source.columns["log_time_ns"])
     yield from (f"{name}: {text}" for text in source.readings.warnings)
@@ -86,8 +86,8 @@ def _warnings(source: Source, timeline: Timeline | None) -> Iterable[str]:
 
 def _role_facts(
     role: str,
-    assignment: Assignment,
-    sources: Sequence[Source],
+    assignment: RoleAssignment,
+    sources: Sequence[TopicReadings],
     timelines: Mapping[str, Timeline],
     sensor: Sensor,
 ) -> RoleFacts:
@@ -96,7 +96,7 @@ def _role_facts(
     return RoleFacts(assignment.roles[role].why, sensor.frame_id, sensor.placed_by, topics)
 
 
-def _topic_facts(source: Source, timeline: Timeline) -> TopicFacts:
+def _topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
     return TopicFacts(
         type=source.type_name,
         messages=len(source.columns["log_time_ns"]),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs.messages import LOG_TIME, Readings, header_ns
-from tcpipe.logs.roles import Assignment
+from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.sources import RailReadings
 from tcpipe.recipe import ReadConfig
@@ -18,7 +18,7 @@ from tcpipe.robots.profiles import Profiles
 
 def power_of_topics(
     topics: Mapping[str, tuple[str, Mapping[str, NDArray[Any]]]],
-    assignment: Assignment,
+    assignment: RoleAssignment,
     config: ReadConfig,
     *,
     known: Profiles,

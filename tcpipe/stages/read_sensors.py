@@ -11,11 +11,11 @@ from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import Timeline
 from tcpipe.logs.messages import frames
 from tcpipe.logs.placements import IDENTITY, Pose, Tree, base_link_from, is_base, static_tree
-from tcpipe.logs.roles import Assignment
+from tcpipe.logs.roles import RoleAssignment
 from tcpipe.recipe import ReadConfig, Role
 from tcpipe.stages.message_arrays import transforms
 from tcpipe.stages.protocols import LogReader
-from tcpipe.stages.read_sources import Source
+from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.levels import Sensor
 
 _WITHOUT_PLACE = ("power", "command")
@@ -24,8 +24,8 @@ _WITHOUT_PLACE = ("power", "command")
 def place_sensors(
     log: LogReader,
     tables: Mapping[str, pa.Table],
-    assignment: Assignment,
-    sources: Sequence[Source],
+    assignment: RoleAssignment,
+    sources: Sequence[TopicReadings],
     timelines: Mapping[str, Timeline],
     *,
     config: ReadConfig,
@@ -68,11 +68,11 @@ def place_sensors(
     return sensors, warnings
 
 
-def _frame(sources: Sequence[Source]) -> str:
+def _frame(sources: Sequence[TopicReadings]) -> str:
     return next(iter(frames(sources[0].columns, sources[0].type_name)), "")
 
 
-def _tree(log: LogReader, tables: Mapping[str, pa.Table], assignment: Assignment, open_frames: set[str]) -> Tree:
+def _tree(log: LogReader, tables: Mapping[str, pa.Table], assignment: RoleAssignment, open_frames: set[str]) -> Tree:
     static = [transforms(tables[topic]) for topic in assignment.transforms if topic in tables]
     tree = static_tree(static)
     moving = [topic for topic in assignment.transforms if topic not in tables]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.logs.imu_units import imu_in_si
 from tcpipe.logs.messages import Readings, needed_fields, read_messages
-from tcpipe.logs.roles import Assignment
+from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig, Role
@@ -21,7 +21,7 @@ from tcpipe.stages.read_power import power_of_topics, power_rows
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class TopicReadings:
     """A topic that plays a role: its messages' fields by dotted name, and what of them is usable."""
 
     topic: str
@@ -34,11 +34,11 @@ class Source:
 def read_sources(
     tables: Mapping[str, pa.Table],
     topics: Mapping[str, Topic],
-    assignment: Assignment,
+    assignment: RoleAssignment,
     config: ReadConfig,
     *,
     known: Profiles,
-) -> tuple[list[Source], PowerReadings, list[str]]:
+) -> tuple[list[TopicReadings], PowerReadings, list[str]]:
     """Read the tables of every topic that plays a role.
 
     Returns
@@ -74,7 +74,7 @@ def read_sources(
             readings = read_messages(columns, role, types[topic])
             if role == "imu":
                 readings = imu_in_si(readings, config.imu_units)
-            sources.append(Source(topic, role, types[topic], columns, readings))
+            sources.append(TopicReadings(topic, role, types[topic], columns, readings))
         elif topic in power.rails:
-            sources.append(Source(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))
+            sources.append(TopicReadings(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))
     return sources, power, warnings

@@ -25,8 +25,8 @@ from tcpipe.formats.logs.bag_records import (
     OP_CONNECTION,
     OP_HEADER,
     OP_INDEX,
+    BagRecord,
     ChunkRecords,
-    Record,
     header_fields,
     indexed_messages,
     stamp_ns,
@@ -67,7 +67,7 @@ class _Chunk:
     end_ns: int = 0
     counts: dict[int, int] | None = None
     cut: bool = False
-    record: Record | None = None
+    record: BagRecord | None = None
     size: int = 0
 
 
@@ -309,7 +309,7 @@ class BagPart:
             raise DamageError("the bag's index names a chunk twice")
         self._chunks.sort(key=lambda chunk: chunk.offset)
 
-    def _take_chunk_info(self, record: Record) -> None:
+    def _take_chunk_info(self, record: BagRecord) -> None:
         data = self._bytes.read(record.data_offset, record.data_bytes)
         counts = dict(struct.iter_unpack("<II", data[: len(data) // 8 * 8]))
         if len(data) != 8 * len(counts) or len(counts) != record.number(b"count"):
@@ -327,7 +327,7 @@ class BagPart:
         for connection, count in counts.items():
             self._tally(connection, count, chunk.start_ns, chunk.end_ns)
 
-    def _take_connection(self, record: Record, data: memoryview | bytes) -> None:
+    def _take_connection(self, record: BagRecord, data: memoryview | bytes) -> None:
         described = header_fields(data)
         topic = record.fields.get(b"topic", described.get(b"topic", b""))
         self._bounds.count(len(self._chunks), len(self._connections))
@@ -364,7 +364,7 @@ class BagPart:
             raise DamageError(f"no record begins with opcode {record.opcode}")
         return record.end
 
-    def _walk_chunk(self, position: int, record: Record) -> None:
+    def _walk_chunk(self, position: int, record: BagRecord) -> None:
         """Load a chunk for its connections and counts."""
         cut = record.end > self._bytes.size
         if cut and self._next_chunk(position + 1) < self._bytes.size:
@@ -422,7 +422,7 @@ class BagPart:
         except DamageError:
             return False
 
-    def _record(self, position: int) -> Record:
+    def _record(self, position: int) -> BagRecord:
         head = self._bytes.peek(position, 4)
         length = int.from_bytes(head, "little")
         if len(head) < 4 or length > MAX_HEADER_BYTES:
@@ -430,7 +430,9 @@ class BagPart:
         header = self._bytes.peek(position + 4, length + 4)
         if len(header) < length + 4:
             raise DamageError("the file ends inside a record")
-        return Record(header_fields(header[:length]), position + 8 + length, int.from_bytes(header[length:], "little"))
+        return BagRecord(
+            header_fields(header[:length]), position + 8 + length, int.from_bytes(header[length:], "little")
+        )
 
     def _tally(self, connection: int, count: int, start_ns: int, end_ns: int) -> None:
         tally = self._connections[connection]

@@ -22,7 +22,7 @@ _TIME = struct.Struct("<II")
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class BagRecord:
     """A record: its header fields, and where its data lies."""
 
     fields: dict[bytes, bytes]
@@ -55,7 +55,7 @@ class Record:
 class ChunkRecords:
     """What a walk through a chunk met: connections, each connection's messages, where the records end, and how many there are."""
 
-    connections: list[Record] = field(default_factory=list)
+    connections: list[BagRecord] = field(default_factory=list)
     offsets: dict[int, list[int]] = field(default_factory=dict)
     stamps: dict[int, list[int]] = field(default_factory=dict)
     end: int = 0
@@ -93,7 +93,7 @@ def walk_chunk(data: memoryview, most: int) -> ChunkRecords:
         connection = known.get(header[:time_at] + header[time_at + 8 :])
         if connection is None:
             try:
-                record = Record(header_fields(header), header_end + 4, end - header_end - 4)
+                record = BagRecord(header_fields(header), header_end + 4, end - header_end - 4)
                 if record.opcode == OP_CONNECTION:
                     found.connections.append(record)
                 elif record.opcode == OP_MESSAGE:

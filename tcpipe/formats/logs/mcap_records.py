@@ -104,7 +104,7 @@ class Statistics:
     messages_by_channel: dict[int, int]
 
 
-class Fields:
+class FieldReader:
     """Reads the fields of one record in order; raises `DamageError` where they do not fit."""
 
     def __init__(self, content: bytes | memoryview) -> None:
@@ -144,21 +144,21 @@ class Fields:
 
 def parse_schema(content: bytes | memoryview) -> tuple[int, Schema]:
     """Return a schema and its number."""
-    fields = Fields(content)
+    fields = FieldReader(content)
     (number,) = fields.take("H")
     return number, Schema(fields.text(), fields.text(), fields.text())
 
 
 def parse_channel(content: bytes | memoryview) -> tuple[int, ChannelRecord]:
     """Return a channel and its number."""
-    fields = Fields(content)
+    fields = FieldReader(content)
     number, schema = fields.take("HH")
     return number, ChannelRecord(fields.text(), schema, fields.text())
 
 
 def parse_chunk_head(content: bytes | memoryview, offset: int) -> Chunk:
     """Return the chunk whose record begins at ``offset``."""
-    fields = Fields(content)
+    fields = FieldReader(content)
     start_ns, end_ns, uncompressed, _ = fields.take("QQQI")
     compression = fields.text()
     (size,) = fields.take("Q")
@@ -186,7 +186,7 @@ def parse_chunk_index(content: bytes | memoryview) -> Chunk:
 
 def parse_statistics(content: bytes | memoryview) -> Statistics:
     """Return the counts of the file."""
-    fields = Fields(content)
+    fields = FieldReader(content)
     messages, _, _, _, _, chunks, start_ns, end_ns, map_bytes = fields.take("QHIIIIQQI")
     return Statistics(messages, chunks, start_ns, end_ns, fields.pairs(map_bytes))
 

@@ -70,7 +70,7 @@ class Pair:
 
 
 @dataclass(frozen=True, slots=True)
-class Offset:
+class RoleOffset:
     """How late a sensor's stamps are against the reference's [s], their drift [s/h, NaN where unknown], with standard deviations.
 
     ``noted`` and ``drifts``: whether a person should act on either.
@@ -102,7 +102,7 @@ class ClockOffsets:
 
     pairs: tuple[Pair, ...]
     reference: str
-    offsets: Mapping[str, Offset]
+    offsets: Mapping[str, RoleOffset]
     span_s: float = 0.0
 
 
@@ -233,7 +233,7 @@ def _settled(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
     """Return each sensor's offset from the clock that most sensors share, by weighted least squares over the pairs that are determined."""
     known = [pair for pair in pairs if pair.determined]
     linked = [role for role in ROLES if any(role in {pair.late, pair.against} for pair in known)]
-    best: dict[str, Offset] = {}
+    best: dict[str, RoleOffset] = {}
     reference = ""
     for role in linked:
         offsets = _against(role, linked, known, span_s)
@@ -242,7 +242,7 @@ def _settled(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
     return ClockOffsets(pairs, reference, {role: offset for role, offset in best.items() if role != reference}, span_s)
 
 
-def _agreeing(offsets: Mapping[str, Offset]) -> int:
+def _agreeing(offsets: Mapping[str, RoleOffset]) -> int:
     """Count the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
     return sum(
         abs(offset.offset_s) <= _NOTED_S.get(role, _NOTED_MOTION_S) and not offset.drifts
@@ -250,7 +250,7 @@ def _agreeing(offsets: Mapping[str, Offset]) -> int:
     )
 
 
-def _against(reference: str, roles: list[str], pairs: list[Pair], span_s: float) -> dict[str, Offset]:
+def _against(reference: str, roles: list[str], pairs: list[Pair], span_s: float) -> dict[str, RoleOffset]:
     """Return the offsets of the sensors that pairs connect to the reference, its own (zero) included."""
     offsets = _solved(reference, roles, [(p.late, p.against, p.offset_s, max(p.std_s, _LEAST_STD_S)) for p in pairs])
     least = 3600.0 * _LEAST_STD_S / max(span_s, 1.0)
@@ -264,7 +264,7 @@ def _against(reference: str, roles: list[str], pairs: list[Pair], span_s: float)
         rate, rate_std = drifts.get(role, (math.nan, math.nan))
         wanders = abs(rate) > max(_SURE * rate_std, limit_s * 3600.0 / max(span_s, 1.0))
         noted = abs(offset_s) > max(limit_s, _SURE * std_s)
-        found[role] = Offset(offset_s, std_s, noted, rate, rate_std, drifts=bool(wanders))
+        found[role] = RoleOffset(offset_s, std_s, noted, rate, rate_std, drifts=bool(wanders))
     return found
 
 

@@ -75,7 +75,7 @@ class Checks:
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class CommandedSpeed:
     """Commanded forward velocity: stamps [ns] and values [m/s], in order."""
 
     stamp_ns: NDArray[np.int64]
@@ -83,7 +83,7 @@ class Command:
 
 
 def check_sensors(
-    measurements: Measurements, *, command: Command | None, stated: Mapping[str, bool], felt: float
+    measurements: Measurements, *, command: CommandedSpeed | None, stated: Mapping[str, bool], felt: float
 ) -> Checks:
     """Return which sensors of a clock epoch are not to be fused.
 
@@ -121,7 +121,9 @@ def check_sensors(
     return checks
 
 
-def _with_command(twists: Mapping[str, Floats], command: Command | None, at_ns: NDArray[np.int64]) -> dict[str, Floats]:
+def _with_command(
+    twists: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
+) -> dict[str, Floats]:
     """Return the twists and, under `COMMAND`, the commanded speed with the yaw rate that an odometry tells."""
     if command is None or not twists:
         return dict(twists)
@@ -272,7 +274,7 @@ def _check_directions(
     twists: Mapping[str, Floats],
     at_ns: NDArray[np.int64],
     *,
-    command: Command | None,
+    command: CommandedSpeed | None,
     looks: Mapping[str, float],
     stated: Mapping[str, bool],
 ) -> None:
@@ -303,7 +305,7 @@ def _check_directions(
 
 
 def _against_command(
-    forward: Mapping[str, Floats], command: Command | None, at_ns: NDArray[np.int64]
+    forward: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
 ) -> dict[str, bool]:
     """Return for each odometry that moves while a command stands whether it goes the other way."""
     if command is None:

@@ -114,9 +114,11 @@ def measure_balance(
     speeds = np.searchsorted(edges, samples.labels[velocity_column], side="right").astype(np.int64)
     pairs = count_cells((samples.terrain, slopes), samples.split, xy_m, known, splits=_USED)
     cells = count_cells((samples.terrain, slopes, speeds), samples.split, xy_m, known, splits=_USED)
-    rooms = [_Room(source, sources[:number], sources[0], regions, buffer_m) for number, source in enumerate(sources)]
+    grounds = [
+        _OpenGround(source, sources[:number], sources[0], regions, buffer_m) for number, source in enumerate(sources)
+    ]
     names = dict(enumerate(sources[0].classes.names().tolist()))
-    rows, features = _by_ground(pairs, rooms, samples, slopes, names)
+    rows, features = _by_ground(pairs, grounds, samples, slopes, names)
     facts = {
         "slope_edges_deg": list(SLOPE_EDGES_DEG),
         "speed_edges_mps": list(edges),
@@ -171,7 +173,7 @@ def _cell_json(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> 
     return found
 
 
-class _Room:
+class _OpenGround:
     """The ground of one map that is worth driving: not what an earlier map covers, a region excludes, or the buffer takes."""
 
     def __init__(
@@ -247,22 +249,22 @@ def _ground(source: MapFile) -> Ground:
 
 
 def _by_ground(
-    pairs: Sequence[Cell], rooms: Sequence[_Room], samples: _Samples, slopes: Ints, names: Mapping[int, str]
+    pairs: Sequence[Cell], grounds: Sequence[_OpenGround], samples: _Samples, slopes: Ints, names: Mapping[int, str]
 ) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Return a row for each class and slope that was driven or that the maps offer, and the features of where to drive next."""
     driven = {(cell.terrain_class, cell.slope): cell for cell in pairs}
-    kinds = {int(kind) for room in rooms for kind in np.unique(room.ground.terrain_class)} - {CLOSED}
+    kinds = {int(kind) for part in grounds for kind in np.unique(part.ground.terrain_class)} - {CLOSED}
     rows, thin = [], []
     for kind in sorted(kinds | {kind for kind, _ in driven}):
         for slope in range(len(SLOPE_NAMES)):
             cell = driven.get((kind, slope)) or Cell(kind, slope, None, dict.fromkeys(_USED, 0), 0.0, 0.0)
-            area_m2 = sum(room.area_m2(kind, slope) for room in rooms)
+            area_m2 = sum(part.area_m2(kind, slope) for part in grounds)
             if area_m2 == 0.0 and (kind, slope) not in driven:
                 continue
             rows.append({**_cell_json(cell, names, ()), "offered_m2": area_m2})
             if cell.rare and area_m2 > 0.0:
                 here = samples.xy_m[(samples.terrain == kind) & (slopes == slope) & (samples.split != "buffer")]
-                thin += [(cell, patch, lonlat) for room in rooms for patch, lonlat in room.patches(kind, slope, here)]
+                thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, here)]
     thin.sort(key=lambda found: (found[0].effective or 0.0, found[0].terrain_class, found[0].slope, -found[1].area_m2))
     features = [_feature(rank, cell, patch, lonlat, names) for rank, (cell, patch, lonlat) in enumerate(thin, start=1)]
     return rows, features

@@ -157,7 +157,7 @@ def build_dataset(
 
     """
     ruling = _ruling(recipe, holdout=holdout, seed=seed)
-    place, house = local_output(out), open_store(store)
+    place, opened = local_output(out), open_store(store)
     clear_beside(place)
     known, proved = _card_in_place(place)
     regions = None if split is None else read_regions(Path(split))
@@ -165,7 +165,7 @@ def build_dataset(
     robot = robot or ruling.robot
     earlier = None if keep_split is None else earlier_splits(Path(keep_split))
     inputs = choose_inputs(
-        house,
+        opened,
         ruling,
         map_names=(map_name,) if isinstance(map_name, str) else tuple(map_name or ()),
         robot=robot,

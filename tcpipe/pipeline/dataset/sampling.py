@@ -32,8 +32,8 @@ from tcpipe.terrain.tiles import TilePool, level_for
 _BATCH_ROWS = 8_192
 """Segments sampled together: 50 MB of patches."""
 
-_DRAWER_ROWS = 16_384
-"""Segments in a drawer of the spool: 0.1 GB of patches, read together."""
+_BUCKET_ROWS = 16_384
+"""Segments in a bucket of the spool: 0.1 GB of patches, read together."""
 
 _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that a map tile is decoded for few of them."""
@@ -50,8 +50,8 @@ _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAV
 class Spool:
     """Pixels on disk while they wait for their place in the dataset: one file a layer, one slot a segment.
 
-    Slots are drawers of segments whose ranks are near, in the order of the ranks; what is sampled together lies side by side in a drawer.
-    So pixels are written in stretches as they come, and read in the dataset's order one drawer after another: shuffled on disk, never
+    Slots are buckets of segments whose ranks are near, in the order of the ranks; what is sampled together lies side by side in a bucket.
+    So pixels are written in stretches as they come, and read in the dataset's order one bucket after another: shuffled on disk, never
     held in memory.
     """
 
@@ -259,12 +259,12 @@ def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
 
 
 def _slots(batches: Sequence[NDArray[np.int64]], ranks: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Return the slot of every segment, (M,): by drawer of near ranks, then by batch."""
+    """Return the slot of every segment, (M,): by bucket of near ranks, then by batch."""
     sequence = np.concatenate(batches)
-    drawers = np.uint64(-(-len(ranks) // _DRAWER_ROWS))
-    drawer = (ranks[sequence] >> np.uint64(32)) * drawers >> np.uint64(32)
+    buckets = np.uint64(-(-len(ranks) // _BUCKET_ROWS))
+    bucket = (ranks[sequence] >> np.uint64(32)) * buckets >> np.uint64(32)
     slots = np.empty(len(ranks), np.int64)
-    slots[sequence[np.argsort(drawer, kind="stable")]] = np.arange(len(ranks))
+    slots[sequence[np.argsort(bucket, kind="stable")]] = np.arange(len(ranks))
     return slots
 
 

@@ -53,7 +53,7 @@ def sigma(P):
     return np.vstack((np.zeros(N), root.T, -root.T)), mean_weight, np.concatenate(([2.0], mean_weight[1:]))
 
 
-def predict(x, P, q, shake, dt, w, a, mode):  # noqa: PLR0917
+def predict(x, P, q, velocity_density, dt, w, a, mode):  # noqa: PLR0917
     """Return x⁻, P⁻ and the cross covariance."""
     d, wm, wc = sigma(P)
     centre = move(x, w, a, dt, mode, q)
@@ -61,12 +61,12 @@ def predict(x, P, q, shake, dt, w, a, mode):  # noqa: PLR0917
     mean = wm @ D
     return (
         plus(centre, mean),
-        (D - mean).T * wc @ (D - mean) + stray(x, centre, q, shake, w, mode) * dt,
+        (D - mean).T * wc @ (D - mean) + stray(x, centre, q, velocity_density, w, mode) * dt,
         d.T * wc @ (D - mean),
     )
 
 
-def stray(x, centre, q, shake, w, mode):  # noqa: PLR0917
+def stray(x, centre, q, velocity_density, w, mode):  # noqa: PLR0917
     """Return the noise density of the error."""
     inertial = mode == kernel.INERTIAL
     noise = np.diag(q[:N])
@@ -79,7 +79,11 @@ def stray(x, centre, q, shake, w, mode):  # noqa: PLR0917
     if not inertial:  # what is kept in the body turns with it
         spread[9:12, :3] = later @ np.cross(np.eye(3), body).T
     noise[:3, :3] = 0.0
-    slides = [shake] * 3 if inertial else [shake, q[10] + q[9] * shake, q[11] + q[9] * shake]
+    slides = (
+        [velocity_density] * 3
+        if inertial
+        else [velocity_density, q[10] + q[9] * velocity_density, q[11] + q[9] * velocity_density]
+    )
     return noise + spread @ np.diag(np.concatenate((turned, slides))) @ spread.T
 
 

@@ -5,7 +5,7 @@ import pytest
 from tcpipe.errors import RecipeError
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.logs import roles
-from tcpipe.logs.roles import Assignment
+from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 
 FIX, IMU = "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/Imu"
@@ -25,11 +25,11 @@ def topic(name: str, type_name: str, count: int | None = 101, problem: str | Non
     return Topic(name, type_name, count, 0, 10_000_000_000, "cdr", "", problem)
 
 
-def assign(*topics: tuple[str, str], chosen=None, ignored=(), robot=None) -> Assignment:
+def assign(*topics: tuple[str, str], chosen=None, ignored=(), robot=None) -> RoleAssignment:
     return assign_roles([topic(name, kind) for name, kind in topics], chosen or {}, ignored, robot)
 
 
-def played(assignment: Assignment) -> dict[str, tuple[str, ...]]:
+def played(assignment: RoleAssignment) -> dict[str, tuple[str, ...]]:
     assert assignment.problems == ()
     return {name: role.topics for name, role in assignment.roles.items()}
 

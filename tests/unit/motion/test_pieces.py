@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from made_tracks import stamps
 
-from tcpipe.motion.pieces import dilated, lasting, mask_of, piece_of_rows, piece_spans, runs, slope, window_mean
+from tcpipe.motion.pieces import dilated, lasting, mask_of, piece_of_rows, piece_spans, slope, spans_where, window_mean
 
 
 def mask(text):
@@ -37,7 +37,7 @@ def test_no_rows_make_no_pieces():
 
 def test_runs_stay_inside_pieces():
     piece = np.array([0, 0, 0, 1, 1, 1])
-    assert runs(mask("xxxx.x"), piece).tolist() == [[0, 2], [3, 3], [5, 5]]
+    assert spans_where(mask("xxxx.x"), piece).tolist() == [[0, 2], [3, 3], [5, 5]]
 
 
 def test_lasting_and_dilated():

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from tcpipe.errors import UsageError
 from tcpipe.simulation import scenario, simulated_drive, true_cost
 from tcpipe.simulation.drive import drive
-from tcpipe.simulation.robot import GRAVITY_MPS2, Ground, Robot
+from tcpipe.simulation.robot import GRAVITY_MPS2, GroundModel, SimulatedRobot
 from tcpipe.simulation.route import Leg, Pause, Turn
 from tcpipe.simulation.scenarios import small_world
 from tcpipe.simulation.site import Site
@@ -103,7 +103,7 @@ def test_nothing_jumps(truth):
 
 
 def test_slope_slows_the_robot_and_costs_what_gravity_asks():
-    plain = Robot(resistance_noise=0.0, ground={GRASS: Ground(0.9, 0.0, 0.15)})
+    plain = SimulatedRobot(resistance_noise=0.0, ground={GRASS: GroundModel(0.9, 0.0, 0.15)})
     site = Site()
     rise = 0.3
     # 40 km of sine look straight over 30 m: a plane of 30 % along the map's x axis
@@ -182,7 +182,7 @@ def test_a_leg_too_short_to_stop_on_still_stops():
         small_world(),
         [Leg(((14.4, 34.0),)), Pause(0.5)],
         start_m=(14.0, 34.0),
-        robot=Robot(),
+        robot=SimulatedRobot(),
         rng=np.random.default_rng(0),
     )
     assert truth.forward_velocity_mps[-1] == 0.0
@@ -191,13 +191,13 @@ def test_a_leg_too_short_to_stop_on_still_stops():
 
 def test_an_empty_plan_is_refused():
     with pytest.raises(UsageError, match="plan is empty"):
-        drive(small_world(), [], start_m=(14.0, 34.0), robot=Robot(), rng=np.random.default_rng(0))
+        drive(small_world(), [], start_m=(14.0, 34.0), robot=SimulatedRobot(), rng=np.random.default_rng(0))
 
 
 def test_turns_end_where_they_should():
     truth = drive(
         small_world(), [Pause(0.1), Turn(1.5), Turn(-0.05), Pause(0.1)], start_m=(14.0, 34.0), start_yaw_rad=0.3,
-        robot=Robot(), rng=np.random.default_rng(0),
+        robot=SimulatedRobot(), rng=np.random.default_rng(0),
     )  # fmt: skip
     yaw = Rotation.from_quat(truth.quat_xyzw).as_euler("ZYX")[:, 0]
     assert yaw[-1] - yaw[0] == pytest.approx(1.45, abs=1e-9)

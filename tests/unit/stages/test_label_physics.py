@@ -9,7 +9,7 @@ from simulated_streams import log_of, streams_of
 from tcpipe.pipeline.ingest import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation import Faults, scenario
-from tcpipe.simulation.robot import GRAVITY_MPS2, Robot
+from tcpipe.simulation.robot import GRAVITY_MPS2, SimulatedRobot
 from tcpipe.simulation.route import Wander
 from tcpipe.stages.label_physics import with_physics
 from tcpipe.tables.bits import Quality
@@ -26,7 +26,7 @@ def stages(tmp_path_factory):
 
 
 def test_the_fit_is_the_robot(stages):
-    robot, facts = Robot(), stages[2].info.findings.facts.label.physics
+    robot, facts = SimulatedRobot(), stages[2].info.findings.facts.label.physics
     assert facts.standing_watt == pytest.approx(robot.idle_watt, abs=1.0)
     # Wheels without the slip fault still run faster than the ground by up to 12 %; the work is the wheels'.
     wheel = robot.mass_kg * GRAVITY_MPS2 / robot.drive_efficiency
