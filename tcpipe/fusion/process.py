@@ -28,10 +28,10 @@ _SLIDE_WINDOW_S = 1.0
 _ACCELERATION_LASTS_S = 0.05
 _DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
 _MAX_GAP_NS = 300_000_000
-_STEADY = 1e-4  # m²/s³
-_SLIDE = 1e-4
-_UNSEEN_SLIDE = 4e-4
-_FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3
+_STEADY = 1e-4  # m²/s³: 1 cm/s in a second
+_SLIDE = 1e-4  # m²/s³
+_UNSEEN_SLIDE = 4e-4  # m²/s³
+_FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3  # the last in m²/s³
 _UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
 
 
