@@ -52,3 +52,26 @@ def test_lines_name_each_held_out_split():
     lines = list(audit_lines(audit(["train", "test", "unseen"], [(0, 0), (1, 0), (9, 0)])))
     assert lines[0].startswith("test: 1 samples, 0 share ground with train")
     assert "nearest train footprint 8.00 m" in lines[1]
+
+
+def test_a_chord_and_a_half_is_still_a_neighbour_and_another_run_is_none():
+    test, _ = audit(["train", "test"], [(0, 0), (1.5, 0)])
+    assert test.same_track_pairs == 1
+    test, _ = audit(["train", "test"], [(0, 0), (1, 0)], run=["a", "b"])
+    assert test.same_track_pairs == 0
+
+
+def test_neighbours_are_those_in_time_whatever_the_rows_order():
+    test, _ = audit(["train", "test", "train"], [(0, 0), (2, 0), (1, 0)], start=[0, 2, 1])
+    assert test.same_track_pairs == 1
+
+
+@pytest.mark.parametrize(("apart_m", "pairs"), [(0.9995, 0), (0.998, 1)])
+def test_to_touch_is_not_to_share(apart_m, pairs):
+    test, _ = audit(["train", "test"], [(0, 0), (apart_m, 0)], run=["a", "b"])
+    assert (test.overlapping_pairs, test.overlapping_samples, test.repeated_place_samples) == (pairs, pairs, pairs)
+
+
+def test_two_corners_share_ground_far_from_both_centres():
+    test, _ = audit(["train", "test"], [(0, 0), (1.35, 0)], course_rad=np.pi / 4)
+    assert test.overlapping_pairs == 1

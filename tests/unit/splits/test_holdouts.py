@@ -3,7 +3,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from tcpipe.splits.holdouts import UNDECIDED, Groups, blocks, draw_folds, draw_groups, draw_samples
+from tcpipe.splits.holdouts import UNDECIDED, Groups, blocks, draw_folds, draw_groups, draw_samples, runs_as_groups
 from tcpipe.splits.ranking import hash_ranks, order_ranks
 
 IDS = [f"run-{i:05d}" for i in range(1000)]
@@ -136,3 +136,65 @@ def test_a_fold_once_given_stays():
     early = arrival == 0
     first = draw_folds(Groups(groups.member[early], groups.names[:10]), arrival[early], folds=3, seed=0)
     assert draw_folds(groups, arrival, folds=3, seed=0)[:10].tolist() == first.tolist()
+
+
+def test_an_even_vote_trains_and_without_a_vote_nothing_is_decided():
+    groups = grouped([2, 4])
+    assert groups.decided(np.array([1, 0, 2, 2, 1, 0])).tolist() == [0, 2]
+    assert groups.decided(np.full(6, UNDECIDED)).tolist() == [UNDECIDED, UNDECIDED]
+
+
+def test_a_cell_begins_at_its_border_and_holds_one_group_in_every_direction():
+    found = blocks(np.array([[10.0, 0.0], [9.999, 0.0], [-10.0, -0.001], [-0.001, -10.0]]), block_m=10.0)
+    assert [found.names[member] for member in found.member] == ["10:1:0", "10:0:0", "10:-1:-1", "10:-1:-1"]
+    assert blocks(np.zeros((0, 2)), block_m=10.0).names == ()
+
+
+def test_more_kept_than_wanted_draws_no_more():
+    kept = np.array([1, 1, 1, UNDECIDED, UNDECIDED])
+    assert (
+        draw_samples(np.arange(5)[::-1], np.zeros(5, int), test_fraction=0.2, kept=kept).tolist()
+        == [True] * 3 + [False] * 2
+    )
+    two_runs = np.array([0, 0, 0, 1, 1])
+    assert draw_samples(np.arange(5), two_runs, test_fraction=0.2, kept=kept).sum() == 3
+
+
+def test_what_a_run_cannot_give_the_lowest_ranks_of_all_make_up():
+    kept = np.array([UNDECIDED, UNDECIDED, UNDECIDED, 0, 0, 0])
+    test = draw_samples(np.array([2, 0, 1, 3, 4, 5]), np.array([0, 0, 0, 1, 1, 1]), test_fraction=0.5, kept=kept)
+    assert test.tolist() == [True, True, True, False, False, False]
+
+
+def test_a_group_that_brings_the_share_no_nearer_trains():
+    kept = np.array([1, UNDECIDED, UNDECIDED])
+    for seed in range(4):  # 10 test of 100, 20 are wanted: with 20 more it would be 30
+        assert drawn(grouped([10, 20, 70]), kept=kept, seed=seed).sum() == 10
+
+
+def test_at_least_one_tests_the_nearest_in_size_and_one_trains():
+    for seed in range(4):
+        assert drawn(grouped([60, 50, 90]), test_fraction=0.01, seed=seed).sum() == 50
+        assert drawn(grouped([1, 1, 1]), test_fraction=0.1, seed=seed).sum() == 1
+        assert drawn(grouped([10, 10, 10]), test_fraction=0.99, seed=seed).sum() == 20
+    assert not drawn(grouped([10, 10]), kept=np.zeros(2, int), seed=0).any()
+
+
+def test_a_run_counts_once_it_came():
+    arrival = np.repeat([0, 1], [30, 30])
+    test = drawn(grouped([15, 15, 15, 15]), arrival, test_fraction=0.5)
+    assert (test[:30].sum(), test[30:].sum()) == (15, 15)
+
+
+def test_folds_are_dealt_from_the_largest_on():
+    groups = grouped([1, 3, 5, 3])
+    fold = draw_folds(groups, np.zeros(12, int), folds=2, seed=0)
+    assert np.bincount(fold, weights=[1, 3, 5, 3]).tolist() == [6, 6]
+    assert (fold[2], fold[1], fold[3], fold[0]) == (0, 1, 1, 0)
+    kept = np.array([UNDECIDED, UNDECIDED, 1, UNDECIDED])
+    assert draw_folds(groups, np.zeros(12, int), folds=2, seed=0, kept=kept).tolist() == [1, 0, 1, 0]
+
+
+def test_runs_are_groups_by_their_names():
+    found = runs_as_groups(np.array([3, 1, 3]), ["a", "b", "c", "d"])
+    assert [found.names[member] for member in found.member] == ["d", "b", "d"]
