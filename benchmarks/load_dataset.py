@@ -22,9 +22,11 @@ from pathlib import Path
 from statistics import median
 
 import numpy as np
+import zarr
 from big_store import store_of
 
 from tcpipe import open_dataset
+from tcpipe.formats.dataset_files import CHUNK_ROWS, SHARD_ROWS
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import DatasetConfig, Recipe
 
@@ -100,12 +102,20 @@ def decode(split):
         files.read(piece, layers, out=out)
 
 
+def decode_by_zarr(path, rows):
+    """Decode all layers with zarr itself, ``rows`` at a call: a chunk, or a whole shard, which it decodes in one batch."""
+    group = zarr.open_group(str(path), mode="r")
+    for layer in ("height", "ortho", "terrain"):
+        for first in range(0, len(group[layer]), rows):
+            group[layer][first : first + rows]
+
+
 def epoch(batches):
     for _ in batches:
         pass
 
 
-def contestants_of(zstd, lz4, path, order):
+def contestants_of(zstd, lz4, path, order, patches):
     """Return what to run by name, and how many samples that is."""
     count, few = len(order), order[:5000]
     rows = zstd.view.stored.files.starts[-1]
@@ -117,6 +127,8 @@ def contestants_of(zstd, lz4, path, order):
         "write alone": (lambda: write_alone(count, zstd[0][0].shape), count),
         "decode only, zstd": (lambda: decode(zstd), rows),
         "decode only, lz4": (lambda: decode(lz4), rows),
+        "zarr a chunk, zstd": (lambda: decode_by_zarr(patches, CHUNK_ROWS), rows),
+        "zarr a shard, zstd": (lambda: decode_by_zarr(patches, SHARD_ROWS), rows),
         "epoch from disk, zstd": (lambda: epoch(zstd.batches(SIZE, shuffle=True, from_disk=True)), count),
         "epoch from disk, lz4": (lambda: epoch(lz4.batches(SIZE, shuffle=True, from_disk=True)), count),
         "epoch from memory": (lambda: epoch(zstd.batches(SIZE, shuffle=True, from_disk=False)), count),
@@ -138,7 +150,7 @@ def main():
     zstd, lz4 = (dataset(directory, samples, compression) for compression in ("zstd", "lz4"))
     path = memmap_of(directory / f"patches-{samples}.npy", zstd)
     order = np.random.default_rng(0).permutation(len(zstd))
-    contestants = contestants_of(zstd, lz4, path, order)
+    contestants = contestants_of(zstd, lz4, path, order, directory / f"dataset-{samples}-zstd" / "patches.zarr")
     spent = {name: [] for name in contestants}
     for repeat in range(REPEATS + 1):
         for name, (run, count) in contestants.items():

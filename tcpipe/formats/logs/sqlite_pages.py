@@ -5,6 +5,9 @@ give each column's type, then the columns. What does not fit in a page goes on i
 parsed at once here, so that a message costs no step of its own. A page that contradicts itself or the tree above it (its cells do not
 fill it, ids that the page above does not allow) raises `UnusualError`, and the caller leaves the file to SQLite; a row that contradicts
 itself is counted.
+
+What it is worth: so a .db3 is read 6 to 10 times as fast as by rosbags, by SQLite alone, a row at a time, 2.1 to 2.7 times
+(``python benchmarks/read_logs.py --only other``). It goes when SQLite alone comes to 5 times.
 """
 
 from __future__ import annotations
