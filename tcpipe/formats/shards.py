@@ -1,7 +1,7 @@
 """Chunks of sharded Zarr v3 arrays, read and written directly: the same bytes as zarr's, without a millisecond of machinery a chunk.
 
-Against zarr 3.1 reading the same arrays (``python benchmarks/load_dataset.py DIRECTORY``, CPU time, 1 is this): 3.5 (zstd) to 4.8 (lz4) a chunk
-at a time, 1.9 and 1.7 whole shards at a time, and through obstore, whose reads are batched, 4.3 to 7.2 and 2.2 to 2.1. It goes when
+Against zarr 3.1 reading the same arrays (``python benchmarks/load_dataset.py DIRECTORY``, CPU time, 1 is this): 3.5 (zstd) and 4.8 (lz4) a
+chunk at a time, 1.9 and 1.7 whole shards at a time; through obstore, whose reads are batched, 4.3 and 7.2, 2.2 and 2.1. It goes when
 zarr comes below 1.3.
 
 A shard is a file: encoded chunks one after another, then an index of (offset, size) pairs, each chunk and the index followed by its

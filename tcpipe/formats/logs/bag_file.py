@@ -32,7 +32,7 @@ from tcpipe.formats.logs.bag_records import (
     stamp_ns,
     walk_chunk,
 )
-from tcpipe.formats.logs.chunk_runs import Entries, Excerpt, Messages, by_place, chunk_blocks, copy_pieces
+from tcpipe.formats.logs.chunk_reading import Entries, Excerpt, Messages, by_place, chunk_blocks, copy_pieces
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     Bounds,

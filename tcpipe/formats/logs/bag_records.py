@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.chunk_runs import Excerpt, Messages
+from tcpipe.formats.logs.chunk_reading import Excerpt, Messages
 from tcpipe.formats.logs.log_part import DamageError, gathered
 
 MAGIC = b"#ROSBAG V2.0\n"

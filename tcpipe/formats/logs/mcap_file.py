@@ -17,7 +17,7 @@ from isal.isal_zlib import crc32
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.chunk_runs import (
+from tcpipe.formats.logs.chunk_reading import (
     MAX_PLANNED_BYTES,
     Entries,
     Excerpt,
@@ -67,7 +67,7 @@ from tcpipe.formats.logs.mcap_records import (
 from tcpipe.formats.logs.mcap_summary import Contents, read_summary
 from tcpipe.logs.topics import Damage, normalized_type_name
 
-_RUN_BYTES = 1 << 22
+_LOOSE_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
 
 
@@ -320,15 +320,15 @@ class McapPart:
         if not crc or not any(chunk.headless for chunk in contents.chunks):
             return
         found = 0
-        for start in range(0, end, _RUN_BYTES):
-            found = crc32(self._bytes.read_once(start, min(_RUN_BYTES, end - start)), found)
+        for start in range(0, end, _LOOSE_BYTES):
+            found = crc32(self._bytes.read_once(start, min(_LOOSE_BYTES, end - start)), found)
         if found != crc:
             self._note(end, "the CRC of the data does not match; messages outside chunks may be wrong or missing")
 
     def _walk(self, contents: Contents, start: int, end: int) -> bool:
         """Step from record to record; after one that cannot be, search for the next chunk. Return whether the data's end was met."""
         position = start
-        run = _MessageRun()
+        run = _LooseMessages()
         closed = False
         while position + RECORD_HEAD <= end:
             try:
@@ -537,7 +537,7 @@ class McapPart:
         )
 
 
-class _MessageRun:
+class _LooseMessages:
     """Messages outside chunks that follow one another: read together, as if they were a chunk."""
 
     def __init__(self) -> None:
@@ -545,7 +545,7 @@ class _MessageRun:
 
     def extend(self, start: int, end: int, chunks: list[Chunk]) -> None:
         """Add one message."""
-        if self._end - self._start > _RUN_BYTES:
+        if self._end - self._start > _LOOSE_BYTES:
             self.finish(chunks)
         if self._end == self._start:
             self._start = start

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.formats.logs.chunk_runs import Messages
+from tcpipe.formats.logs.chunk_reading import Messages
 from tcpipe.formats.logs.log_part import DamageError, Int64Array, gathered
 
 MAGIC = b"\x89MCAP0\r\n"

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcpipe.formats.logs.chunk_runs import GROUP_BYTES, by_place, copy_pieces, excerpt, groups, runs
+from tcpipe.formats.logs.chunk_reading import GROUP_BYTES, by_place, copy_pieces, excerpt, groups, spans
 from tcpipe.formats.logs.log_part import DamageError
 
 LEAST_BYTES = 4
@@ -47,12 +47,12 @@ def test_an_excerpt_holds_the_bytes_of_every_wanted_message_and_of_no_other(chun
         if channel in wanted
     ]
     found, followed = [], []
-    for run in runs(entries, sizes, sound, wanted):
-        followed += run.chunks
-        assert run.compact or len(run.chunks) == 1
+    for span in spans(entries, sizes, sound, wanted):
+        followed += span.chunks
+        assert span.compact or len(span.chunks) == 1
         got = excerpt(
-            run,
-            run.entries,
+            span,
+            span.entries,
             load=lambda number: memoryview(chunks[number][0]),
             copy=lambda number, places, to: copy_pieces(memoryview(chunks[number][0]), places, to),
         )
@@ -74,13 +74,13 @@ def test_a_chunk_that_is_lost_costs_no_other(chunks, broken):
             raise DamageError("broken")
         return memoryview(chunks[number][0])
 
-    for run in runs(entries, sizes, sound, [1, 2]):
+    for span in spans(entries, sizes, sound, [1, 2]):
         got = excerpt(
-            run, run.entries, load=load, copy=lambda number, places, to: copy_pieces(load(number), places, to)
+            span, span.entries, load=load, copy=lambda number, places, to: copy_pieces(load(number), places, to)
         )
-        assert [number for number, _ in got.lost] == [number for number in run.chunks if number == broken]
+        assert [number for number, _ in got.lost] == [number for number in span.chunks if number == broken]
         assert broken not in got.entries.chunk
-        assert len(got.offset) == len(got.entries.chunk) == (run.entries.chunk != broken).sum()
+        assert len(got.offset) == len(got.entries.chunk) == (span.entries.chunk != broken).sum()
 
 
 @pytest.mark.parametrize(
@@ -101,8 +101,8 @@ def test_an_unsound_chunk_is_read_alone():
     number, place = np.array([0, 2]), np.array([10, 10])
     sizes = np.full(3, 1000)
     entries, _ = by_place(number, np.array([7, 7]), place, place, sizes, least_bytes=LEAST_BYTES)
-    (before, alone, after) = runs(entries, sizes, np.array([True, False, True]), [8])
-    assert [run.chunks for run in (before, alone, after)] == [range(1), range(1, 2), range(2, 3)]
+    (before, alone, after) = spans(entries, sizes, np.array([True, False, True]), [8])
+    assert [span.chunks for span in (before, alone, after)] == [range(1), range(1, 2), range(2, 3)]
     assert alone.entries is None
     assert len(before.entries.chunk) == len(after.entries.chunk) == 0
 

@@ -49,7 +49,7 @@ class Entries:
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class Span:
     """Chunks to read at once: their numbers in the group, and the wanted messages (None: only the chunk's records can tell).
 
     Of a ``compact`` one only the pieces with wanted messages are kept; others are single chunks, kept whole.
@@ -61,8 +61,8 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Pieces:
-    """The parts of a run's chunks that hold wanted messages, laid one after the other: ``size`` bytes in all.
+class Layout:
+    """The parts of a span's chunks that hold wanted messages, laid one after the other: ``size`` bytes in all.
 
     ``places`` gives of each chunk, by its number, where a piece starts and stops in it, and where it is laid; ``offset`` where each
     message then begins, in the order of their entries, shape (N,).
@@ -75,7 +75,7 @@ class Pieces:
 
 @dataclass(frozen=True, slots=True)
 class Excerpt:
-    """Bytes in which a run's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,).
+    """Bytes in which a span's messages lie: ``offset`` is where in ``data`` each of ``entries`` begins, shape (N,).
 
     ``lost`` lists the chunks, by number, of which there is none, and why.
     """
@@ -137,79 +137,79 @@ class PlacedChunk(Protocol):
         """Bytes of its records."""
 
 
-Chunk = TypeVar("Chunk", bound=PlacedChunk)
+AnyChunk = TypeVar("AnyChunk", bound=PlacedChunk)
 
 
-class ChunkedFile(Protocol[Chunk]):
+class ChunkedFile(Protocol[AnyChunk]):
     """A file of chunks: what `chunk_blocks` asks of it. `DamageError` where a chunk is lost."""
 
     name: str
     damage: dict[Damage, None]
 
-    def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, Chunk]]:
+    def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, AnyChunk]]:
         """Return the chunks that may hold wanted channels, each with the number of bytes in all chunks before it."""
 
-    def entries(self, chunks: list[Chunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
+    def entries(self, chunks: list[AnyChunk], sizes: Int64Array) -> tuple[Entries, NDArray[np.bool_]]:
         """Return the messages of chunks of ``sizes`` bytes by their indexes, and which of the chunks have a sound index."""
 
-    def load(self, chunk: Chunk) -> memoryview:
+    def load(self, chunk: AnyChunk) -> memoryview:
         """Return all records of a chunk."""
 
-    def copy(self, chunk: Chunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
+    def copy(self, chunk: AnyChunk, places: list[tuple[int, int, int]], to: memoryview) -> None:
         """Copy pieces (start, stop, place) of a chunk."""
 
     def indexed(self, found: Excerpt) -> tuple[Messages, NDArray[np.bool_]]:
         """Return the messages of an excerpt, and which of them there are: the chunk bears its index out."""
 
-    def walked(self, chunk: Chunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
+    def walked(self, chunk: AnyChunk, data: memoryview, wanted: frozenset[int], noted: list[Damage]) -> Messages:
         """Return the wanted messages of a chunk by its records; what these lack is added to ``noted``."""
 
-    def is_proved(self, chunk: Chunk) -> bool:
+    def is_proved(self, chunk: AnyChunk) -> bool:
         """Tell whether a checksum covers the chunk's records, so that it is the index that is wrong where they differ."""
 
-    def needs_index(self, chunk: Chunk) -> bool:
+    def needs_index(self, chunk: AnyChunk) -> bool:
         """Tell whether a broken index of this chunk is worth a word."""
 
-    def lost(self, chunk: Chunk, why: str) -> Damage:
+    def lost(self, chunk: AnyChunk, why: str) -> Damage:
         """Return what to say of a chunk that is lost as a whole."""
 
 
-def chunk_blocks(file: ChunkedFile[Chunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
+def chunk_blocks(file: ChunkedFile[AnyChunk], wanted: frozenset[int], *, threads: int) -> Iterator[MessageBlock]:
     """Yield the messages of the wanted channels, chunk by chunk, or some chunks at once where little of them is wanted."""
 
-    def read(planned: tuple[Run, list[tuple[int, Chunk]]]) -> tuple[list[MessageBlock], list[Damage]]:
+    def read(planned: tuple[Span, list[tuple[int, AnyChunk]]]) -> tuple[list[MessageBlock], list[Damage]]:
         noted: list[Damage] = []
-        return list(_run_blocks(file, *planned, wanted, noted)), noted
+        return list(_span_blocks(file, *planned, wanted, noted)), noted
 
     for blocks, noted in in_order(read, _planned(file, wanted), threads=threads):
         file.damage.update(dict.fromkeys(noted))
         yield from blocks
 
 
-def _planned(file: ChunkedFile[Chunk], wanted: frozenset[int]) -> Iterator[tuple[Run, list[tuple[int, Chunk]]]]:
+def _planned(file: ChunkedFile[AnyChunk], wanted: frozenset[int]) -> Iterator[tuple[Span, list[tuple[int, AnyChunk]]]]:
     """Yield what to read at once, and the chunks of its group; the indexes of a group are read ahead."""
     chunks = file.chunks_with(wanted)
     for group in groups(chunk.size for _, chunk in chunks):
         members = chunks[group.start : group.stop]
         sizes = np.array([min(chunk.size, MAX_PLANNED_BYTES) for _, chunk in members], np.int64)
         entries, sound = file.entries([chunk for _, chunk in members], sizes)
-        for run in runs(entries, sizes, sound, sorted(wanted)):
-            yield run, members
+        for span in spans(entries, sizes, sound, sorted(wanted)):
+            yield span, members
 
 
-def _run_blocks(
-    file: ChunkedFile[Chunk],
-    run: Run,
-    members: list[tuple[int, Chunk]],
+def _span_blocks(
+    file: ChunkedFile[AnyChunk],
+    span: Span,
+    members: list[tuple[int, AnyChunk]],
     wanted: frozenset[int],
     noted: list[Damage],
 ) -> Iterator[MessageBlock]:
-    """Yield the wanted messages of a run; what is lost or contradicts itself is added to ``noted``."""
-    doubtful: Sequence[int] = run.chunks
-    if run.entries is not None:
+    """Yield the wanted messages of a span; what is lost or contradicts itself is added to ``noted``."""
+    doubtful: Sequence[int] = span.chunks
+    if span.entries is not None:
         found = excerpt(
-            run,
-            run.entries,
+            span,
+            span.entries,
             load=lambda number: file.load(members[number][1]),
             copy=lambda number, places, to: file.copy(members[number][1], places, to),
         )
@@ -229,7 +229,7 @@ def _run_blocks(
             noted.append(file.lost(chunk, str(error)))
         else:
             messages = file.walked(chunk, data, wanted, noted)
-            entries = None if run.entries is None else run.entries.of_chunk(number)
+            entries = None if span.entries is None else span.entries.of_chunk(number)
             noted += _disagreement(file, chunk, messages, entries)
             yield from _in_time(file.name, messages, base + messages.offset, noted)
 
@@ -243,7 +243,9 @@ def _in_time(name: str, messages: Messages, ordinal: Int64Array, noted: list[Dam
     return messages.blocks(ordinal)
 
 
-def _disagreement(file: ChunkedFile[Chunk], chunk: Chunk, messages: Messages, entries: Entries | None) -> list[Damage]:
+def _disagreement(
+    file: ChunkedFile[AnyChunk], chunk: AnyChunk, messages: Messages, entries: Entries | None
+) -> list[Damage]:
     """Return what to say where a chunk's index is broken, or names other messages than its records hold."""
     what, lost = "the index of a chunk is broken; its messages are read without it", 0
     if entries is None and (chunk.size > MAX_PLANNED_BYTES or not file.needs_index(chunk)):
@@ -298,7 +300,7 @@ def by_place(
     return (entries if sound.all() else entries.at(sound[chunk])), sound
 
 
-def runs(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted: Sequence[int]) -> Iterator[Run]:
+def spans(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted: Sequence[int]) -> Iterator[Span]:
     """Yield, in order, how to read the chunks of a group: those of which little is wanted together, others one by one.
 
     Parameters
@@ -322,12 +324,12 @@ def runs(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted: 
         while sparse[first] and after < len(sparse) and sparse[after]:
             after += 1
         chosen = entries.at(slice(bounds[first], bounds[after])) if sound[first] else None
-        yield Run(range(first, after), chosen, sparse[first])
+        yield Span(range(first, after), chosen, sparse[first])
         first = after
 
 
-def pieces(entries: Entries) -> Pieces:
-    """Return the pieces of a run's chunks that hold its messages."""
+def layout(entries: Entries) -> Layout:
+    """Return the pieces of a span's chunks that hold its messages."""
     begins = np.ones(len(entries.offset), np.bool_)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
     begins[1:] = far | (entries.chunk[1:] != entries.chunk[:-1])
@@ -338,31 +340,31 @@ def pieces(entries: Entries) -> Pieces:
     places: dict[int, list[tuple[int, int, int]]] = {}
     for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
         places.setdefault(chunk, []).append((place[0], place[1], place[2]))
-    return Pieces(places, offset, int((stop - start).sum()))
+    return Layout(places, offset, int((stop - start).sum()))
 
 
 def excerpt(
-    run: Run,
+    span: Span,
     entries: Entries,
     *,
     load: Callable[[int], memoryview],
     copy: Callable[[int, list[tuple[int, int, int]], memoryview], None],
 ) -> Excerpt:
-    """Read what a run wants.
+    """Read what a span wants.
 
     Parameters
     ----------
-    run, entries
-        The run, and its messages.
+    span, entries
+        The span, and its messages.
     load
         Returns all records of a chunk by its number.
     copy
         Copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
     """
-    kept = pieces(entries) if run.compact else None
+    kept = layout(entries) if span.compact else None
     data = np.empty(kept.size if kept else 0, np.uint8).data
     lost = []
-    for number in run.chunks:
+    for number in span.chunks:
         try:
             if kept:
                 copy(number, kept.places.get(number, []), data)
