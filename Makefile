@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test check check-and-train kernels lock schemas docs clean
+.PHONY: help demo test test-mutants check check-and-train kernels lock schemas docs clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -60,6 +60,19 @@ kernels: .venv/installed-dev
 	$(BIN)/python tests/tiny_pipeline.py .venv/tiny
 	@rm -rf .venv/tiny
 
+# Changes of the rooms of numbers, one at a time: does a test notice? docs/explanation/mutants.md; an hour and more on one core.
+# MUTANTS="--rooms motion path --draw 0" tries less.
+MUTANTS ?=
+.venv-mutants/installed: requirements-dev.lock pyproject.toml
+	$(PYTHON) -m venv .venv-mutants
+	.venv-mutants/bin/python -m pip --disable-pip-version-check install --quiet --require-hashes -r requirements-dev.lock
+	.venv-mutants/bin/python -m pip --disable-pip-version-check install --quiet cosmic-ray==8.7.0
+	.venv-mutants/bin/python -m pip --disable-pip-version-check install --quiet --no-deps --no-build-isolation --editable .
+	@touch $@
+
+test-mutants: .venv-mutants/installed
+	.venv-mutants/bin/python tests/mutants.py $(MUTANTS)
+
 # The locks: hashes, no registry address. Needs uv; run it when pyproject.toml's dependencies change.
 # The one for training holds Keras and what PyTorch needs beside itself.
 UV_LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet
@@ -76,4 +89,4 @@ docs: .venv/installed
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf .venv tcpipe-demo
+	rm -rf .venv .venv-mutants tcpipe-demo

@@ -33,12 +33,19 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "motion": (("tcpipe/motion",), ("tests/unit/motion",)),
     "path": (("tcpipe/path",), ("tests/unit/path",)),
     "splits": (("tcpipe/splits",), ("tests/unit/splits",)),
-    "cost": (("tcpipe/cost",), ("tests/unit/cost", "tests/unit/stages/test_label.py", "tests/property/cost")),
-    "terrain": (
-        ("tcpipe/terrain",),
-        ("tests/unit/terrain", "tests/unit/stages/test_sample.py", "tests/property/terrain"),
+    "power": (("tcpipe/power",), ("tests/unit/power",)),
+    "cost": (("tcpipe/cost",), ("tests/unit/cost", "tests/unit/stages/test_label.py")),
+    "terrain": (("tcpipe/terrain",), ("tests/unit/terrain", "tests/unit/stages/test_sample.py")),
+    "findings": (
+        (
+            "tcpipe/tables/findings.py",
+            "tcpipe/stages/read_findings.py",
+            "tcpipe/stages/fuse_findings.py",
+            "tcpipe/stages/label_quality.py",
+        ),
+        ("tests/unit/stages",),
     ),
-    "verify": (("tcpipe/pipeline/verify_dataset.py",), ("tests/property/test_dataset_damage.py",)),
+    "verify": (("tcpipe/pipeline/verify_dataset.py",), ("tests/unit/pipeline/test_trust.py",)),
 }
 """What is changed, and the tests that are to notice, the quick ones first."""
 THOROUGH = ("motion", "path", "splits")
@@ -117,12 +124,12 @@ def mutants_of(room: str) -> list[Mutant]:
     return found
 
 
-def chosen(rooms: list[str], draw: int, seed: int) -> list[Mutant]:
-    """Return the changes to try."""
-    every = [mutant for room in rooms for mutant in mutants_of(room)]
-    thorough = [mutant for mutant in every if mutant.room in THOROUGH and mutant.is_boundary]
+def chosen(draw: int, seed: int, *, thorough: bool) -> list[Mutant]:
+    """Return the changes to try: as many as are drawn of all rooms, and every comparison and number of some."""
+    every = [mutant for room in ROOMS for mutant in mutants_of(room)]
     drawn = random.Random(seed).sample(every, min(draw, len(every)))
-    return list(dict.fromkeys(thorough + drawn))
+    boundaries = [mutant for mutant in every if mutant.room in THOROUGH and mutant.is_boundary]
+    return list(dict.fromkeys(drawn + boundaries if thorough else drawn))
 
 
 def run_pytest(tests: tuple[str, ...]) -> int:
@@ -184,17 +191,18 @@ def warm_up(tests: tuple[str, ...]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS))
-    parser.add_argument("--draw", type=int, default=400, help="how many are drawn of all, beside what is tried anyway")
-    parser.add_argument("--seed", type=int, default=11)
-    parser.add_argument("--file", default="", help="only files whose path holds this")
+    parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS), help="try only those of these")
+    parser.add_argument("--draw", type=int, default=400, help="how many are drawn of all rooms")
+    parser.add_argument("--seed", type=int, default=11, help="of the draw")
+    parser.add_argument("--only-drawn", action="store_true", help="leave out what is tried anyway")
     given = parser.parse_args()
     os.environ["NUMBA_DISABLE_JIT"] = "1"
     os.chdir(ROOT)
     os.nice(19 - os.nice(0))
     sys.path.insert(0, str(ROOT))
     began = time.monotonic()
-    mutants = [mutant for mutant in chosen(given.rooms, given.draw, given.seed) if given.file in mutant.path]
+    every = chosen(given.draw, given.seed, thorough=not given.only_drawn)
+    mutants = [mutant for mutant in every if mutant.room in given.rooms]
     lived = 0
     for room in given.rooms:
         mine, tests = [mutant for mutant in mutants if mutant.room == room], ROOMS[room][1]
