@@ -11,7 +11,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import cycle
 from pathlib import Path
 from statistics import median
@@ -28,6 +28,7 @@ from tcpipe.formats.maps.geotiff import write_geotiff
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import paper_layers
 from tcpipe.terrain.patches import map_px_from_patch, patch_frames
 from tcpipe.terrain.sampling import sample_patches
 from tcpipe.terrain.tiles import TilePool, groups_by_tile
@@ -50,7 +51,7 @@ class MemoryMap:
     arrays: dict[str, Any]
     grid: MapGrid = GRID
     classes: ClassTable = PAPER_CLASSES
-    layers: tuple[str, ...] = LAYERS
+    layers: dict[str, Any] = field(default_factory=lambda: paper_layers(LAYERS, PAPER_CLASSES))
     tile_px: int = max(ROWS, COLS)
     height_reference_m: float = 600.0
     name: str = "memory"

@@ -1,7 +1,7 @@
 """Analytic worlds for map tests: closed-form height, grey and class, written as GeoTIFFs, and segments that lie in them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from rasterio import Affine
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import missing, paper_layers
 
 
 @dataclass(frozen=True)
@@ -128,10 +129,12 @@ class ArrayMap:
     classes: ClassTable = PAPER_CLASSES
     name: str = "m"
     factors: tuple = (1,)
+    more: dict = field(default_factory=dict)
+    """Layers that are not the paper's."""
 
     @property
     def layers(self):
-        return tuple(self.arrays)
+        return paper_layers([name for name in self.arrays if name not in self.more], self.classes) | self.more
 
     def read(self, layer, row0, row1, col0, col1):
         return self.arrays[layer][row0:row1, col0:col1]
@@ -139,7 +142,7 @@ class ArrayMap:
     def read_tile(self, layer, i, j, out):
         side = self.tile_px
         part = self.read(layer, i * side, (i + 1) * side, j * side, (j + 1) * side)
-        out[...] = np.nan if layer == "height" else 0
+        out[...] = missing(self.layers[layer].mapped)
         out[: part.shape[0], : part.shape[1]] = part
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import click
 
 from tcpipe.cli.options import INPUT_FILE, ONE_OF_SEVERAL, json_option, quiet_option, store_option
@@ -29,6 +31,26 @@ from tcpipe.errors import UsageError
     help="What the terrain values mean: CSV value,id,name,traversable, or TOML.",
 )
 @click.option(
+    "--layer",
+    "layers",
+    multiple=True,
+    metavar="NAME=FILE",
+    help="Another raster of one band, as a layer NAME; repeat it for more layers.",
+)
+@click.option(
+    "--categorical",
+    multiple=True,
+    metavar="NAME[=FILE]",
+    help="Layer NAME holds classes: those of FILE, like --classes, or as the raster itself names its values.",
+)
+@click.option(
+    "--ortho-bands",
+    type=click.Choice(("grey", "rgb")),
+    default="grey",
+    show_default=True,
+    help="rgb keeps red, green and blue as layers beside the grey.",
+)
+@click.option(
     "--crs", metavar="EPSG:n", help="Projected, metric CRS of the map (default: the height's, or its UTM zone)."
 )
 @click.option("--force", is_flag=True, help="Replace a map of that name made from something else.")
@@ -42,6 +64,9 @@ def add_map(
     height: tuple[str, ...],
     ortho: tuple[str, ...],
     terrain: tuple[str, ...],
+    layers: tuple[str, ...],
+    categorical: tuple[str, ...],
+    ortho_bands: Literal["grey", "rgb"],
     classes: str | None,
     crs: str | None,
     force: bool,
@@ -61,9 +86,45 @@ def add_map(
         raise UsageError(f"{strays[0]}: belongs to no option; is a pattern without quotes? wanted --height 'dem/*.tif'")
     with progress(f"map {name}", 1, quiet=quiet):
         added = run(
-            name, height=height, ortho=ortho, terrain=terrain, classes=classes, crs=crs, store=store, force=force
+            name,
+            height=height,
+            ortho=ortho,
+            terrain=terrain,
+            layers=_layers(layers),
+            categorical=_categorical(categorical),
+            ortho_bands=ortho_bands,
+            classes=classes,
+            crs=crs,
+            store=store,
+            force=force,
         )
     if as_json:
         print_json(added)
     else:
         say_lines(added)
+
+
+def _layers(given: tuple[str, ...]) -> dict[str, str]:
+    """Return the file, or the pattern, of each layer, from NAME=FILE."""
+    files: dict[str, str] = {}
+    for text in given:
+        name, sign, file = text.partition("=")
+        if not (sign and name and file):
+            raise UsageError(f"--layer {text}: wanted NAME=FILE")
+        if name in files:
+            raise UsageError(
+                f"--layer {name}: is given twice; the tiles of one layer are a pattern: {name}='tiles/*.tif'"
+            )
+        files[name] = file
+    return files
+
+
+def _categorical(given: tuple[str, ...]) -> dict[str, str | None]:
+    """Return the class table of each categorical layer, from NAME or NAME=FILE; None where the raster names its values."""
+    tables: dict[str, str | None] = {}
+    for text in given:
+        name, _, file = text.partition("=")
+        if name in tables:
+            raise UsageError(f"--categorical {name}: is given twice; wanted one class table a layer")
+        tables[name] = file or None
+    return tables

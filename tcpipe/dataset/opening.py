@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from tcpipe.dataset.split import SampleColumns, Split
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_files import open_patches, read_current_card, read_samples, rows_in_files
+from tcpipe.terrain.layers import LAYERS
 
 
 class Dataset(Mapping[str, Split]):
@@ -44,13 +45,15 @@ class Dataset(Mapping[str, Split]):
         return f"Dataset({str(self.path)!r}: {counts})"
 
 
-def open_dataset(path: str | Path) -> Dataset:
+def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None) -> Dataset:
     """Open a dataset that ``tcpipe build-dataset`` wrote.
 
     Parameters
     ----------
     path
         Its directory, of either format.
+    layers
+        The tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, those of them that are there.
 
     Returns
     -------
@@ -59,7 +62,7 @@ def open_dataset(path: str | Path) -> Dataset:
     Raises
     ------
     DatasetError
-        There is no dataset, it is of another data model, or its samples do not fit its card.
+        There is no dataset, it is of another data model, or its samples do not fit its card, or it has no such layer.
 
     """
     directory = Path(path)
@@ -70,7 +73,8 @@ def open_dataset(path: str | Path) -> Dataset:
             f"{directory}: samples.parquet has {len(split)} rows, its card says {card['samples']}; build it again"
         )
     files = open_patches(directory, card)
-    form = tensor_form(files.layers, files.layers, max((entry["id"] for entry in card["classes"]), default=1))
+    asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
+    form = tensor_form(asked, files.layers)
     parts = {}
     for name, rows in rows_in_files(card, split).items():
         columns = SampleColumns(directory, np.flatnonzero(split == name))

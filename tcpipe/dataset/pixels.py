@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset.tensor import TensorForm
-from tcpipe.formats.dataset_files import PatchFiles, layer_dtype
+from tcpipe.formats.dataset_files import PatchFiles
 
 Ints = NDArray[np.int64]
 Pixels = dict[str, NDArray[Any]]
@@ -22,12 +21,6 @@ IN_MEMORY_BYTES = 2 << 30
 
 CACHED_PIECES = 64
 """Pieces kept for reading at random from a split that is not in memory."""
-
-
-@cache
-def sample_bytes(layers: tuple[str, ...], patch_px: int) -> int:
-    """Return what the stored layers of a sample take [byte]."""
-    return sum(np.dtype(layer_dtype(layer)).itemsize for layer in layers) * patch_px**2
 
 
 class StoredPixels:
@@ -45,7 +38,8 @@ class StoredPixels:
 
     def fit(self, layers: tuple[str, ...]) -> bool:
         """Return whether the layers are kept in memory."""
-        return len(self.rows) * sample_bytes(layers, self.files.patch_px) <= IN_MEMORY_BYTES
+        values = sum(self.files.layers[layer].stored.itemsize for layer in layers) * self.files.patch_px**2
+        return len(self.rows) * values <= IN_MEMORY_BYTES
 
     def in_memory(self, layers: tuple[str, ...]) -> Pixels:
         """Return the layers of all samples, and others that were asked for before, read once and kept, each of shape (N, px, px)."""
@@ -94,7 +88,7 @@ class StoredPixels:
         if rng is not None:
             parts = [parts[number] for number in rng.permutation(len(parts))]
         shape = (spare + min(pieces, len(parts)) * files.piece_rows, files.patch_px, files.patch_px)
-        pool = {layer: np.empty(shape, layer_dtype(layer)) for layer in layers}
+        pool = {layer: np.empty(shape, files.layers[layer].stored) for layer in layers}
         for first in range(0, len(parts), pieces):
             here, places = parts[first : first + pieces], []
             for number, part in enumerate(here):
@@ -108,7 +102,7 @@ class StoredPixels:
     def _read(self, rows: Ints, layers: Sequence[str]) -> Pixels:
         """Read the pieces that hold ``rows`` (of the files), each once."""
         px = self.files.patch_px
-        out: Pixels = {layer: np.empty((len(rows), px, px), layer_dtype(layer)) for layer in layers}
+        out: Pixels = {layer: np.empty((len(rows), px, px), self.files.layers[layer].stored) for layer in layers}
         piece_of = np.searchsorted(self.files.starts, rows, side="right") - 1
         for piece in np.unique(piece_of).tolist():
             here = np.flatnonzero(piece_of == piece)

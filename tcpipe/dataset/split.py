@@ -105,7 +105,7 @@ class Split:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The tensor's channels: ortho, terrain, height, or those of them that the map has, unless others were chosen."""
+        """The tensor's channels: ortho, terrain, height, or those of them that the map has, unless others were asked for."""
         return self.view.form.channels
 
     @property
@@ -141,7 +141,7 @@ class Split:
         return self._columns[name][self.view.at]
 
     def layers(self, indices: NDArray[np.int64]) -> dict[str, NDArray[Any]]:
-        """Return the stored layers of samples, each of shape (B, px, px): grey, class ids, height in steps of 0.5 mm."""
+        """Return the stored layers of samples, each of shape (B, px, px): as ``dataset.json`` says of each."""
         return self.view.stored.gather(self.view.at[indices], self.view.form.layers)
 
     def batch(self, indices: ArrayLike) -> tuple[Floats, Floats]:
@@ -152,8 +152,8 @@ class Split:
         return patches, self.labels[at]
 
     def with_channels(self, *channels: str) -> Split:
-        """Return the split with these channels: ``ortho``, ``terrain``, ``height``, ``terrain_one_hot`` (one channel a class)."""
-        form = tensor_form(channels, self.view.stored.files.layers, self.view.form.class_count)
+        """Return the split with these channels: layers by name, or ``terrain_one_hot`` (a channel a class; of any categorical layer)."""
+        form = tensor_form(channels, self.view.stored.files.layers)
         return self._with(replace(self.view, form=form))
 
     def take(self, chosen: ArrayLike) -> Split:

@@ -11,34 +11,40 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.terrain.layers import HEIGHT_RANGE_M, HEIGHT_STEP_M, LAYERS, ortho_channel, terrain_channel
+from tcpipe.terrain.layers import LAYERS, Layer, in_order
 
 Floats = NDArray[np.float32]
 Pixels = Mapping[str, NDArray[Any]]
 
-ONE_HOT = "terrain_one_hot"
-"""A channel for each class of the table, 1 where the pixel is of it."""
+ONE_HOT = "_one_hot"
+"""Ending of a categorical layer's name: a channel for each of its classes, 1 where the pixel is of it."""
 
 _BYTES = np.arange(256, dtype=np.uint8)
 
 
 @dataclass(frozen=True)
 class TensorForm:
-    """Channels in their order: ``ortho``, ``terrain``, ``height`` as in the paper, or `ONE_HOT`."""
+    """Channels in their order: names of layers as in the paper, or of a categorical one with `ONE_HOT`; ``known`` are all layers."""
 
     channels: tuple[str, ...]
-    class_count: int
+    known: Mapping[str, Layer]
 
     @cached_property
     def layers(self) -> tuple[str, ...]:
         """Stored layers that are needed."""
-        needed = {"terrain" if channel == ONE_HOT else channel for channel in self.channels}
-        return tuple(layer for layer in LAYERS if layer in needed)
+        return tuple(in_order({name: self.known[name] for name in map(self._of, self.channels)}))
 
     @cached_property
     def depth(self) -> int:
         """Length of the tensor's last axis."""
-        return sum(self.class_count if channel == ONE_HOT else 1 for channel in self.channels)
+        return sum(self._width(channel) for channel in self.channels)
+
+    def _of(self, channel: str) -> str:
+        return channel if channel in self.known else channel.removesuffix(ONE_HOT)
+
+    def _width(self, channel: str) -> int:
+        layer = self.known[self._of(channel)]
+        return 1 if layer.name == channel else round(layer.high)
 
     def form(self, pixels: Pixels, rows: NDArray[np.int64], mirrored: NDArray[np.bool_] | None = None) -> Floats:
         """Return the tensor of ``rows`` of the stored layers, float32, shape (B, px, px, depth).
@@ -53,36 +59,37 @@ class TensorForm:
             Whether each is mirrored across its direction of travel, shape (B,).
 
         """
-        from tcpipe.dataset.tensor_kernel import form_bytes, form_height, form_paper_tensor  # noqa: PLC0415  numba loads with the first batch
+        from tcpipe.dataset.tensor_kernel import form_bytes, form_numbers, form_paper_tensor  # noqa: PLC0415  numba loads with the first batch
 
         flips = np.zeros(len(rows), np.bool_) if mirrored is None else mirrored
         px = next(iter(pixels.values())).shape[1]
         out = np.empty((len(rows), px, px, self.depth), np.float32)
-        step = np.float32(HEIGHT_STEP_M / HEIGHT_RANGE_M)
         if self.channels == LAYERS:
-            most = np.float32(255.0), np.float32(max(self.class_count - 1, 1))
+            most = np.float32(255.0), np.float32(max(self.known["terrain"].high - 1.0, 1.0))
+            step = np.float32(self.known["height"].scaling[0])
             form_paper_tensor(*(pixels[layer] for layer in LAYERS), rows, flips, *most, step, out)
             return out
-        grey, scaled = ortho_channel(_BYTES), terrain_channel(_BYTES, self.class_count)
         at = 0
         for channel in self.channels:
-            if channel == "height":
-                form_height(pixels["height"], rows, flips, step, at, out)
-            elif channel == ONE_HOT:
-                for class_id in range(1, self.class_count + 1):
-                    is_it = np.equal(_BYTES, class_id).astype(np.float32)
-                    form_bytes(pixels["terrain"], rows, flips, is_it, at + class_id - 1, out)
+            layer = self.known[self._of(channel)]
+            if layer.name != channel:
+                for place in range(self._width(channel)):
+                    is_it = np.equal(_BYTES, place + 1).astype(np.float32)
+                    form_bytes(pixels[layer.name], rows, flips, is_it, at + place, out)
+            elif layer.stored == np.uint8:
+                form_bytes(pixels[channel], rows, flips, layer.channel(_BYTES), at, out)
             else:
-                form_bytes(pixels[channel], rows, flips, grey if channel == "ortho" else scaled, at, out)
-            at += self.class_count if channel == ONE_HOT else 1
+                scaling = (np.float32(number) for number in layer.scaling)
+                form_numbers(pixels[channel], rows, flips, layer.stored.type(layer.nodata), *scaling, at, out)
+            at += self._width(channel)
         return out
 
 
-def tensor_form(channels: Sequence[str], stored: Sequence[str], class_count: int) -> TensorForm:
+def tensor_form(channels: Sequence[str], known: Mapping[str, Layer]) -> TensorForm:
     """Return the form with these channels; `DatasetError` names those that the stored layers cannot give."""
-    possible = [*stored, *([ONE_HOT] if "terrain" in stored else [])]
+    possible = [*known, *(f"{name}{ONE_HOT}" for name, layer in known.items() if layer.kind == "categorical")]
     unknown = [channel for channel in channels if channel not in possible]
     if unknown or not channels:
         named = ", ".join(unknown) or "none"
         raise DatasetError(f"channels asked for: {named}; this dataset can give {', '.join(possible)}")
-    return TensorForm(tuple(channels), class_count)
+    return TensorForm(tuple(channels), known)

@@ -66,14 +66,16 @@ def form_bytes(layer: Any, rows: Any, mirrored: Any, value: Floats, channel: int
 
 
 @kernel
-def form_height(layer: Any, rows: Any, mirrored: Any, step: Any, channel: int, out: Floats) -> None:  # noqa: PLR0917
-    """Write heights of ``rows`` over 1 m, at most 1, to one channel of ``out``, (B, px, px, C)."""
-    px = out.shape[1]
+def form_numbers(  # noqa: PLR0917
+    layer: Any, rows: Any, mirrored: Any, nodata: Any, scale: Any, offset: Any, channel: int, out: Floats
+) -> None:
+    """Write numbers of ``rows``, scaled and clipped to [0, 1], to one channel of ``out``, (B, px, px, C); NaN and ``nodata`` become 0."""
+    px, none, whole = out.shape[1], np.float32(0.0), np.float32(1.0)
     for b in range(rows.size):
         n = rows[b]
         for r in range(px):
             source = px - 1 - r if mirrored[b] else r
             stored, line = layer[n, source], out[b, r]
             for c in range(px):
-                rise = min(np.float32(stored[c]) * step, np.float32(1.0))
-                line[c, channel] = rise if stored[c] != HEIGHT_NODATA else np.float32(0.0)
+                value = min(max(np.float32(stored[c]) * scale + offset, none), whole)
+                line[c, channel] = value if stored[c] == stored[c] and stored[c] != nodata else none

@@ -81,7 +81,7 @@ def croissant(
     samples: pa.Schema,
     version: str,
     shards: str | None = None,
-    layers: Mapping[str, int] | None = None,
+    layers: Mapping[str, tuple[int, str]] | None = None,
 ) -> dict[str, Any]:
     """Return the document.
 
@@ -98,7 +98,8 @@ def croissant(
     version
         Of the dataset.
     shards, layers
-        Pattern of the Parquet files that hold the patches, and the values a patch of each layer has; None where patches are no Parquet.
+        Pattern of the Parquet files that hold the patches, and of each layer how many values a patch has and of which kind (numpy's
+        letter); None where patches are no Parquet.
 
     Returns
     -------
@@ -121,7 +122,11 @@ def croissant(
             }
         )
         columns = pa.schema(
-            [samples.field("sample_id"), samples.field("split"), *(_patch_field(*layer) for layer in layers.items())]
+            [
+                samples.field("sample_id"),
+                samples.field("split"),
+                *(_patch_field(layer, *values) for layer, values in layers.items()),
+            ]
         )
         about = "One record a sample with its patch, split by split: rows of the patch one after another."
         records.append(_records("patches", about, columns, {"fileSet": {"@id": "shards"}}))
@@ -164,10 +169,10 @@ def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Any
     }
 
 
-def _patch_field(layer: str, values: int) -> pa.Field:
+def _patch_field(layer: str, values: int, kind: str) -> pa.Field:
     return pa.field(
         layer,
-        pa.list_(pa.uint16(), values),
+        pa.list_(pa.float32() if kind == "f" else pa.uint16(), values),
         metadata={"doc": f"layer {layer} as stored; dataset.json says how to decode it"},
     )
 

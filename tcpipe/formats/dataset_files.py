@@ -10,7 +10,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -20,14 +20,15 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, StoreError, UsageError
+from tcpipe.formats.layer_descriptions import cf_attributes, layers_described
+from tcpipe.formats.maps.class_table import table_from_json
 from tcpipe.formats.parquet import column_names, read_row_group, read_table, write_table
 from tcpipe.formats.seals import prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION
-from tcpipe.terrain.classes import NODATA_ID, ClassTable
-from tcpipe.terrain.layers import HEIGHT_NODATA, HEIGHT_STEP_M, LAYERS
+from tcpipe.terrain.layers import Layer, in_order, missing
 
 FileFormat = Literal["zarr", "parquet"]
 
@@ -61,57 +62,10 @@ MOST_PX = 1024
 
 
 @dataclass(frozen=True, slots=True)
-class Layer:
-    """A stored layer: its numpy type and its CF attributes, by which xarray decodes it."""
-
-    name: str
-    dtype: type[np.unsignedinteger[Any]]
-    nodata: int
-    attributes: Mapping[str, Any]
-
-
-def layers_of(names: Sequence[str], classes: ClassTable | None) -> list[Layer]:
-    """Return the description of each layer in ``names``; ``classes`` names the ids of ``terrain``."""
-    table = () if classes is None else classes.classes
-    known = {
-        "ortho": Layer(
-            "ortho",
-            np.uint8,
-            0,
-            {"long_name": "orthophoto, grey", "units": "1", "scale_factor": 1 / 255, "add_offset": 0.0},
-        ),
-        "terrain": Layer(
-            "terrain",
-            np.uint8,
-            NODATA_ID,
-            {
-                "long_name": "terrain class id",
-                "units": "1",
-                "flag_values": [entry.id for entry in table],
-                "flag_meanings": " ".join(entry.name.replace(" ", "_") for entry in table),
-            },
-        ),
-        "height": Layer(
-            "height",
-            np.uint16,
-            HEIGHT_NODATA,
-            {
-                "long_name": "height above height_min_m of the sample",
-                "units": "m",
-                "scale_factor": HEIGHT_STEP_M,
-                "add_offset": 0.0,
-                "missing_value": HEIGHT_NODATA,
-            },
-        ),
-    }
-    return [known[name] for name in names]
-
-
-@dataclass(frozen=True, slots=True)
 class Pixels:
     """Patches to be written: row i of the dataset is what ``read(layer, slots[i : i + 1])`` returns, shape (1, px, px)."""
 
-    layers: Sequence[Layer]
+    layers: Mapping[str, Layer]
     patch_px: int
     slots: NDArray[np.int64]
     read: Callable[[str, NDArray[np.int64]], NDArray[Any]]
@@ -145,16 +99,17 @@ def write_patches_zarr(
     shard = min(SHARD_ROWS, max(-(-n // CHUNK_ROWS), 1) * CHUNK_ROWS)
     attributes = {"Conventions": "CF-1.11", "title": "patches of a tcpipe dataset, in the order of samples.parquet"}
     group = create_group(directory / PATCHES, attributes)
-    for layer in pixels.layers:
+    for layer in pixels.layers.values():
         add_array(
             group,
             layer.name,
             shape=(n, px, px),
-            dtype=layer.dtype,
+            dtype=layer.stored,
             chunks=(CHUNK_ROWS, px, px),
             shards=(shard, px, px),
             dimensions=("sample", "row", "column"),
-            attributes={**layer.attributes, "coordinates": "sample_id"},
+            fill_value=missing(layer.stored),
+            attributes={**cf_attributes(layer), "coordinates": "sample_id"},
             compression=compression,
             level=_LEVELS[compression],
         )
@@ -209,7 +164,7 @@ def write_patches_parquet(
         for number in range(count):
             part = here[number * SHARD_ROWS : (number + 1) * SHARD_ROWS]
             table = samples(part)
-            for layer in pixels.layers:
+            for layer in pixels.layers.values():
                 table = table.append_column(*_list_column(layer, pixels.read(layer.name, pixels.slots[part])))
             path = f"{SHARDS}/{name}-{number:05d}-of-{count:05d}.parquet"
             write_table(table, directory / path, rows_per_group=GROUP_ROWS)
@@ -220,8 +175,8 @@ def write_patches_parquet(
 def _list_column(layer: Layer, patches: NDArray[Any]) -> tuple[pa.Field, pa.Array]:
     """Return a layer as a column: rows of the patch one after another."""
     px = patches.shape[1]
-    values = pa.array(np.ascontiguousarray(patches, layer.dtype).reshape(-1))
-    metadata = {"shape": f"[{px}, {px}]", **{key: str(value) for key, value in layer.attributes.items()}}
+    values = pa.array(np.ascontiguousarray(patches, layer.stored).reshape(-1))
+    metadata = {"shape": f"[{px}, {px}]", **{key: str(value) for key, value in cf_attributes(layer).items()}}
     dtype = pa.list_(values.type, px * px)  # plain: a tensor extension type makes other readers fail
     column = pa.FixedSizeListArray.from_arrays(values, px * px)
     return pa.field(layer.name, dtype, nullable=False, metadata=metadata), column
@@ -316,7 +271,7 @@ class PatchFiles:
     """
 
     directory: Path
-    layers: tuple[str, ...]
+    layers: Mapping[str, Layer]
     patch_px: int
     starts: NDArray[np.int64]
     arrays: Mapping[str, ShardedArray] = field(default_factory=dict)
@@ -330,7 +285,7 @@ class PatchFiles:
         return CHUNK_ROWS if self.arrays else GROUP_ROWS
 
     def read(
-        self, piece: int, layers: Sequence[str], out: Mapping[str, NDArray[Any]] | None = None
+        self, piece: int, layers: Iterable[str], out: Mapping[str, NDArray[Any]] | None = None
     ) -> dict[str, NDArray[Any]]:
         """Return layers of one piece, each of shape (rows, px, px); `DatasetError` if it cannot be read.
 
@@ -344,7 +299,7 @@ class PatchFiles:
         """
         rows = int(self.starts[piece + 1] - self.starts[piece])
         shape = (self.piece_rows, self.patch_px, self.patch_px)
-        into = {layer: np.empty(shape, layer_dtype(layer)) for layer in layers} if out is None else out
+        into = {layer: np.empty(shape, self.layers[layer].stored) for layer in layers} if out is None else out
         try:
             if self.arrays:
                 for layer in layers:
@@ -364,21 +319,17 @@ class PatchFiles:
         return {layer: into[layer][:rows] for layer in layers}
 
 
-def layer_dtype(layer: str) -> type[np.unsignedinteger[Any]]:
-    """Return the type in which a layer is stored."""
-    return np.uint16 if layer == "height" else np.uint8
-
-
 def open_patches(directory: Path, card: Mapping[str, Any]) -> PatchFiles:
     """Return where the patches of a dataset lie; `DatasetError` if they are gone, or not what the card says."""
-    layers, px, samples = tuple(layer for layer in LAYERS if layer in card["layers"]), card["patch_px"], card["samples"]
+    px, samples, classes = card["patch_px"], card["samples"], card["classes"]
+    layers = in_order(layers_described(card["layers"], table_from_json(classes).classes, directory / CARD))
     known = card["format"] in get_args(FileFormat)
     if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES):
         raise DatasetError(
             f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card['format']}: wanted up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"
         )
-    if "terrain" in layers and not card["classes"]:
+    if "terrain" in layers and not classes:
         raise DatasetError(f"{directory / CARD}: a layer terrain, but no classes; build the dataset again")
     if card["format"] == "parquet":
         return _in_shards(directory, layers, px, card)
@@ -388,14 +339,14 @@ def open_patches(directory: Path, card: Mapping[str, Any]) -> PatchFiles:
         raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
     for layer, array in arrays.items():
         found = f"{array.shape} in {array.chunk_shape} of {array.dtype}"
-        wanted = f"{(samples, px, px)} in {(CHUNK_ROWS, px, px)} of {np.dtype(layer_dtype(layer))}"
+        wanted = f"{(samples, px, px)} in {(CHUNK_ROWS, px, px)} of {layers[layer].stored}"
         if found != wanted:
             raise DatasetError(f"{array.path}: holds {found}, the card says {wanted}; build the dataset again")
     starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
     return PatchFiles(directory, layers, px, starts, arrays)
 
 
-def _in_shards(directory: Path, layers: tuple[str, ...], px: int, card: Mapping[str, Any]) -> PatchFiles:
+def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: Mapping[str, Any]) -> PatchFiles:
     rows = [shard["rows"] for shard in card["shards"]]
     if min(rows, default=0) < 0 or sum(rows) != card["samples"]:
         raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, wanted {card['samples']}")

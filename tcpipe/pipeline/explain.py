@@ -39,16 +39,6 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS, Streams
 _NEARBY_NS = 5_000_000_000
 """Gates and refusals this long before and after a segment are told [ns]."""
 
-_PATCH_COLUMNS = (
-    "terrain_class",
-    "terrain_purity",
-    "slope_rad",
-    "cross_slope_rad",
-    "valid_fraction",
-    "height_min_m",
-    "height_clipped_fraction",
-)
-
 
 @dataclass(frozen=True, slots=True)
 class Explained:
@@ -288,16 +278,15 @@ def _differences(
         if name in sample and sample[name] != value:
             yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
     patches = made["patches"]
-    for name in _PATCH_COLUMNS:
-        values = getattr(patches, name)
-        now = None if values is None else values[0].item()
+    for name, values in patches.columns().items():
+        now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
         if now != sample[name]:
             yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"
     for layer, stored in _stored(directory, card, sample["row"]).items():
-        pixels = getattr(patches, layer)
+        pixels = patches.pixels.get(layer)
         if pixels is None:
             yield f"{layer}: map {sample['map']} has no such layer any more"
-        elif not np.array_equal(pixels[0], stored):
+        elif not np.array_equal(pixels[0], stored, equal_nan=pixels.dtype.kind == "f"):
             yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
 
 

@@ -12,7 +12,7 @@ from typing import Any
 
 from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import place_state
-from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import raster_files
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
@@ -20,7 +20,9 @@ from tcpipe.formats.maps.text import map_lines
 from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.report.overview import quick_look, shows_map, write_quick_look
 from tcpipe.store import Store, open_store
+from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.classes import ClassScheme
+from tcpipe.terrain.layers import wrong_name
 
 logger = logging.getLogger("tcpipe")
 
@@ -28,6 +30,8 @@ Files = str | Path | Sequence[str | Path]
 """A file, a pattern of files, or several of both."""
 
 _ROLES = ("height", "ortho", "terrain", "classes")
+_CLASSES = "classes"
+"""Role of a class table, and behind a layer's name that of the layer's own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +60,9 @@ def add_map(
     height: Files,
     ortho: Files | None = None,
     terrain: Files | None = None,
+    layers: Mapping[str, Files] | None = None,
+    categorical: Mapping[str, str | Path | None] | None = None,
+    ortho_bands: OrthoBands = "grey",
     classes: str | Path | None = None,
     crs: str | None = None,
     store: str | Path = "tcpipe-store",
@@ -71,6 +78,12 @@ def add_map(
         GeoTIFF, JPEG 2000, ERDAS Imagine or VRT; the three need not share grid, resolution or CRS. Each is one file, a pattern such as
         ``dem/*.tif`` (its files by name), or several of both: tiles of one grid, the last on top where they overlap. Terrain may also be
         GeoJSON polygons whose property ``class`` is a class name, value or id.
+    layers
+        Other rasters of one band by the layer's name: numbers in a unit of their own, or classes.
+    categorical
+        Which of these are classes, with their class tables, as ``classes``; None: as the raster names its values.
+    ortho_bands
+        ``rgb`` keeps an orthophoto's colours as layers ``ortho_red``, ``ortho_green`` and ``ortho_blue`` beside its grey.
     classes
         CSV ``value,id,name,traversable`` or the same as TOML; None takes the store's, else the paper's seven classes. The first map with
         terrain or classes sets the store's table; the others must have the same.
@@ -86,10 +99,18 @@ def add_map(
 
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, "classes": classes}
-    files = _found({role: value for role, value in given.items() if value})
+    layers, categorical = layers or {}, categorical or {}
+    _refuse_layers(layers, categorical, ortho=bool(ortho), ortho_bands=ortho_bands)
+    tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
+    files = _found({role: value for role, value in {**given, **layers, **tables}.items() if value})
     opened = open_store(store, create=True)
     path = opened.map_path(name)
-    inputs = _inputs(files, crs)
+    inputs = _inputs(files, {"crs": crs} | _kinds(categorical, ortho_bands))
+    more = MoreLayers(
+        {name: files[name] for name in layers},
+        {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
+        ortho_bands,
+    )
     before = place_state(path)
     if path.exists() and not force:
         return _unchanged(name, path, inputs)
@@ -102,6 +123,7 @@ def add_map(
             height=files["height"],
             ortho=files.get("ortho", ()),
             terrain=files.get("terrain", ()),
+            more=more,
             classes=files["classes"][0] if "classes" in files else None,
             agreed=_agreed(opened, name),
             crs=crs,
@@ -115,6 +137,29 @@ def add_map(
         if force or place_state(path) == before:
             raise
         return _unchanged(name, path, inputs)  # another process was faster
+
+
+def _refuse_layers(
+    layers: Mapping[str, Files], categorical: Mapping[str, Any], *, ortho: bool, ortho_bands: OrthoBands
+) -> None:
+    """Raise `UsageError` for names that cannot be, classes of no layer, and colours of no orthophoto: all at once."""
+    problems = [problem for name in layers if (problem := wrong_name(name, taken=SAMPLES.names()))]
+    listed = ", ".join(layers) or "none is given"
+    problems += [
+        f"--categorical {name}: no layer of that name; --layer gives {listed}"
+        for name in categorical
+        if name not in layers
+    ]
+    if ortho_bands == "rgb" and not ortho:
+        problems.append("--ortho-bands rgb: no orthophoto is given; add --ortho")
+    if problems:
+        raise UsageError(*problems)
+
+
+def _kinds(categorical: Mapping[str, Any], ortho_bands: OrthoBands) -> dict[str, Any]:
+    """Return the options that say how rasters are read, those that are not at their default."""
+    kinds = {"categorical": sorted(categorical), "ortho_bands": "" if ortho_bands == "grey" else ortho_bands}
+    return {name: value for name, value in kinds.items() if value}
 
 
 def _unchanged(name: str, path: Path, inputs: Mapping[str, Any]) -> AddedMap:
@@ -156,7 +201,7 @@ def _no_file(text: str) -> str:
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
 
 
-def _inputs(files: Mapping[str, Sequence[Path]], crs: str | None) -> dict[str, Any]:
+def _inputs(files: Mapping[str, Sequence[Path]], options: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a map is made from: a checksum for every file of every role, in their order, and the options."""
     checksums: dict[str, dict[str, str]] = {}
     problems: list[str] = []
@@ -164,7 +209,7 @@ def _inputs(files: Mapping[str, Sequence[Path]], crs: str | None) -> dict[str, A
         checksums[role] = {}
         folder = os.path.commonpath([path.absolute().parent for path in paths])
         try:
-            plain = role == "classes" or (role == "terrain" and is_drawn(paths))
+            plain = role.endswith(_CLASSES) or (role == "terrain" and is_drawn(paths))
             for part in dict.fromkeys(part for path in paths for part in ([path] if plain else raster_files(path))):
                 checksums[role][os.path.relpath(part, folder)] = file_checksum(part)[1]
         except MapError as error:
@@ -173,7 +218,7 @@ def _inputs(files: Mapping[str, Sequence[Path]], crs: str | None) -> dict[str, A
             problems.append(f"{error.filename}: cannot be read ({error.strerror})")
     if problems:
         raise MapError(*problems)
-    return {"files": checksums, "crs": crs}
+    return {"files": checksums, **options}
 
 
 def _same(name: str, path: Path, inputs: Mapping[str, Any]) -> MapFile:
@@ -183,10 +228,13 @@ def _same(name: str, path: Path, inputs: Mapping[str, Any]) -> MapFile:
     except MapError as error:
         raise MapError(*error.problems, f"map {name}: add it anew with --force") from None
     before = found.facts["inputs"]
-    changes = [_change(role, before["files"].get(role, {}), inputs["files"].get(role, {})) for role in _ROLES]
+    roles = dict.fromkeys([*_ROLES, *before["files"], *inputs["files"]])
+    changes = [_change(role, before["files"].get(role, {}), inputs["files"].get(role, {})) for role in roles]
     changes = [change for change in changes if change]
-    if before["crs"] != inputs["crs"]:
-        changes.append(f"--crs is {inputs['crs'] or 'not given'}, was {before['crs'] or 'not given'}")
+    for option in ("crs", "categorical", "ortho_bands"):
+        now, then = (made_from.get(option) or "not given" for made_from in (inputs, before))
+        if now != then:
+            changes.append(f"--{option.replace('_', '-')} is {now}, was {then}")
     if changes:
         raise MapError(
             f"map {name}: is in the store already, made from something else: {'; '.join(changes)}; "
@@ -202,7 +250,8 @@ def _change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str
     if sorted(before.values()) == sorted(now.values()):
         return f"the files of {role} come in another order"
     if not before or not now:
-        return f"--{role} was not given then, but is now" if now else f"--{role} was given then, but is not now"
+        option = f"--{role}" if role in _ROLES else f"--layer {role}"
+        return f"{option} was not given then, but is now" if now else f"{option} was given then, but is not now"
     names = [name for name in now if now[name] not in before.values()]
     return f"{role} has another content ({', '.join(names or before)})"
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from tcpipe.cost.budget import pooled
 from tcpipe.errors import DatasetError, TcpipeError
@@ -36,6 +37,7 @@ from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
+from tcpipe.terrain.layers import Layer
 
 Finding = tuple[str, int] | str
 
@@ -147,25 +149,36 @@ def _patches(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Ite
     place = np.empty(samples.num_rows, np.int64)  # of each row of samples in the files
     for name, rows in rows_in_files(card, split).items():
         place[split == name] = rows
-    classes = max((entry["id"] for entry in card["classes"]), default=0)
     for piece in range(len(files.starts) - 1):
         try:
-            yield from _piece(files, piece, classes)
+            yield from _piece(files, piece)
         except DatasetError as error:
             yield from error.problems
     in_files = samples.take(pa.array(np.argsort(place, kind="stable")))
     yield from _beside_patches(directory, card, in_files)
 
 
-def _piece(files: PatchFiles, piece: int, classes: int) -> Iterator[Finding]:
+def _piece(files: PatchFiles, piece: int) -> Iterator[Finding]:
     pixels = files.read(piece, files.layers)
     first, rows = int(files.starts[piece]), len(next(iter(pixels.values())))
-    if "terrain" in pixels and pixels["terrain"].max(initial=0) > classes:
-        yield f"{files.directory}: patches {first} to {first + rows - 1} hold classes above {classes}, the last of the table"
+    where = f"{files.directory}: patches {first} to {first + rows - 1}"
+    for name, layer in files.layers.items():
+        if layer.kind == "categorical" and pixels[name].max(initial=0) > layer.high:
+            of = "" if name == "terrain" else f" of {name}"
+            yield f"{where} hold classes{of} above {layer.high:g}, the last of the table"
+        if layer.stack == "floats" and not _within(pixels[name], layer):
+            yield f"{where} hold {name} beyond {layer.low!r} to {layer.high!r} {layer.unit}"
     floor = pixels["height"].reshape(rows, -1).min(axis=1)
     if floor.any():
-        yield f"{files.directory}: patches {first} to {first + rows - 1}: {int((floor > 0).sum())} do not begin at height 0"
+        yield f"{where}: {int((floor > 0).sum())} do not begin at height 0"
     yield "patches", rows
+
+
+def _within(pixels: NDArray[Any], layer: Layer) -> bool:
+    """Return whether all pixels with data lie in the layer's range, but for rounding."""
+    there = pixels[np.isfinite(pixels)]
+    slack = 1e-5 * max(abs(layer.low), abs(layer.high))
+    return bool(((there >= layer.low - slack) & (there <= layer.high + slack)).all())
 
 
 def _beside_patches(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Iterator[str]:

@@ -202,7 +202,7 @@ def _wrong_joins(directory: Path, manifest: Mapping[str, Any], tables: Mapping[s
 
 def _layer(path: Path, level: MapFile, layer: str, covered: float | None) -> Iterator[Finding]:
     """Decode every tile of a layer; compare its coverage with what was recorded, and its classes with the table."""
-    grid, side, with_data, highest = level.grid, level.tile_px, 0, 0
+    grid, side, kind, with_data, highest = level.grid, level.tile_px, level.layers[layer], 0, 0
     for row in range(0, grid.rows, side):
         for col in range(0, grid.cols, side):
             try:
@@ -210,11 +210,11 @@ def _layer(path: Path, level: MapFile, layer: str, covered: float | None) -> Ite
             except TcpipeError as error:
                 yield from error.problems
                 continue
-            with_data += int(np.isfinite(tile).sum() if layer == "height" else (tile > 0).sum())
-            highest = max(highest, int(tile.max(initial=0)) if layer == "terrain" else 0)
+            with_data += int(kind.has_data(tile).sum())
+            highest = max(highest, int(tile.max(initial=0)) if kind.kind == "categorical" else 0)
             yield "tiles", 1
     share = with_data / (grid.rows * grid.cols)
     if covered is not None and not math.isclose(share, covered, rel_tol=1e-9):
         yield f"{path}: {layer} covers {share:.6%} of the map, {covered:.6%} when it was added; add the map again"
-    if highest > level.classes.count:
-        yield f"{path}: {layer} holds class {highest}, the table ends at {level.classes.count}"
+    if highest > kind.high:
+        yield f"{path}: {layer} holds class {highest}, the table ends at {kind.high:g}"

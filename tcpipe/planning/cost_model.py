@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.dataset.tensor import TensorForm
 from tcpipe.errors import ModelError
 from tcpipe.terrain.classes import ClassTable
-from tcpipe.terrain.layers import LAYERS
+from tcpipe.terrain.layers import PAPER_LAYERS, paper_layers
 from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.tiles import MapReader
 
@@ -100,10 +100,14 @@ class Predicted:
     velocity_mps: Floats
 
 
+def _form(model: CostModel) -> TensorForm:
+    return TensorForm(model.channels, paper_layers(PAPER_LAYERS, model.classes))
+
+
 def check_model(model: CostModel, source: MapReader) -> None:
     """Raise `ModelError` if a map cannot give the model what it was trained on; all differences at once."""
     problems = []
-    needed = TensorForm(model.channels, model.classes.count).layers
+    needed = _form(model).layers
     missing = [layer for layer in needed if layer not in source.layers]
     if missing:
         problems.append(
@@ -127,8 +131,8 @@ def predict_patches(model: CostModel, patches: Patches, asked: NDArray[np.bool_]
     ModelError
         It gives something else than power and velocity.
     """
-    form = TensorForm(model.channels, model.classes.count)
-    pixels = {layer: getattr(patches, layer) for layer in LAYERS if layer in form.layers}
+    form = _form(model)
+    pixels = {layer: patches.pixels[layer] for layer in form.layers}
     out = np.full((asked.size, 2), np.nan)
     for rows in _batches(np.flatnonzero(asked)):
         said = model.predict(form.form(pixels, rows))

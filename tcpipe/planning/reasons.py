@@ -85,13 +85,13 @@ def reasons_of(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, so
     ranges = {
         Reason.SLOPE_NOT_SEEN: (patches.slope_rad, "slope_rad"),
         Reason.CROSS_SLOPE_NOT_SEEN: (patches.cross_slope_rad, "cross_slope_rad"),
-        Reason.RELIEF_NOT_SEEN: (relief_m(patches.height), "relief_m"),
+        Reason.RELIEF_NOT_SEEN: (relief_m(patches.pixels["height"]), "relief_m"),
     }
     for reason, (values, name) in ranges.items():
         low, high = model.seen[name]
         bits[~((values >= low) & (values <= high))] |= np.uint16(reason)
-    if patches.terrain is not None:
-        bits |= _class_reasons(patches, patches.terrain, model, source)
+    if "terrain" in patches.pixels:
+        bits |= _class_reasons(patches, patches.pixels["terrain"], model, source)
     bits[~on_map] = Reason.OUTSIDE_MAP
     bits[bits & Reason.NODATA != 0] = Reason.NODATA
     return bits

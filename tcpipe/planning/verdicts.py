@@ -73,7 +73,7 @@ def _judged(model: CostModel, source: MapReader, patches: Patches, on_map: NDArr
     bits[asked & np.isnan(said.velocity_mps)] |= np.uint16(Reason.NO_MOTION)
     known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
     horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0
-    middle = patches.height[:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
+    middle = patches.pixels["height"][:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
     return Verdicts(
         reasons=bits,
         power_watt=said.power_watt,

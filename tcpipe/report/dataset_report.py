@@ -126,7 +126,7 @@ def _gallery_section(directory: Path, card: Mapping[str, Any], samples: pa.Table
     place = np.empty(samples.num_rows, dtype=np.int64)  # where each row of samples lies in the files
     for name, rows in rows_in_files(card, splits).items():
         place[splits == name] = rows
-    stacks: dict[str, list[NDArray[Any]]] = {layer: [] for layer in card["tensor"]["channels"]}
+    stacks: dict[str, list[NDArray[Any]]] = {layer: [] for layer in files.layers}
     for row in chosen:
         piece = int(np.searchsorted(files.starts, place[row], side="right")) - 1
         pixels = files.read(piece, list(stacks))

@@ -195,7 +195,7 @@ def patch_gallery(layers: Mapping[str, Array], titles: Sequence[str]) -> str:
 
 
 def _layer_look(name: str, stack: Array) -> dict[str, Any]:
-    if name == "ortho":
+    if name.startswith("ortho"):
         low, high = np.percentile(stack, (1, 99))
         return {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1)}
     if name == "terrain":

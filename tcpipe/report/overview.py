@@ -72,7 +72,7 @@ def quick_look(source: MapFile) -> NDArray[np.uint8]:
     missing = np.zeros(picture.shape[:2], np.bool_)
     for layer in level.layers:
         pixels = _thinned(level, layer, step)
-        missing |= pixels == 0 if layer != "height" else ~np.isfinite(pixels)
+        missing |= ~level.layers[layer].has_data(pixels)
         if layer == "terrain":
             index = (pixels.astype(np.int64) - 1) % len(CLASS_COLOURS)
             tints = np.array([[int(colour[n : n + 2], 16) for n in (1, 3, 5)] for colour in CLASS_COLOURS])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.recipe import SampleConfig
-from tcpipe.tables.bits import Loss, name_of
+from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
@@ -24,21 +23,19 @@ _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAV
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """L6 before the split: N patches of M segments.
+    """L6 before the split: N patches of M segments, from one map or several.
 
-    ``kept`` are the rows of the segments that have a patch, rising, (N,); ``patches`` are in that order; ``terrain_name`` is None without
-    a terrain layer. Footprints are counter-clockwise from rear right, (N, 4, 2): in the map's CRS [m], and as WGS 84 lon, lat [deg].
-    ``lost_by`` is each segment's `Loss`, 0 if kept, (M,); ``ledger_m`` metres driven by loss.
+    ``kept`` are the rows of the segments that have a patch, (N,), rising on each map; all else of N is in that order. ``map_index`` says
+    which map each lies on. Footprints are counter-clockwise from rear right, (N, 4, 2): in the first map's CRS [m], and as WGS 84 lon, lat
+    [deg]. ``lost_by`` is each segment's `Loss`, 0 if kept, (M,). Where pixels wait in files, those of ``patches`` are empty.
     """
 
-    map_name: str
     kept: NDArray[np.int64]
+    map_index: NDArray[np.uint8]
     patches: Patches
-    terrain_name: NDArray[np.str_] | None
     footprint_xy_m: NDArray[np.float64]
     footprint_lonlat_deg: NDArray[np.float64]
     lost_by: NDArray[np.uint32]
-    ledger_m: Mapping[str, float]
     warnings: tuple[str, ...]
 
 
@@ -77,14 +74,12 @@ def sample_segments(
     good = lost_by[rows] == 0
     kept, patches = rows[good], patches if good.all() else patches.only(good)
     return Sampled(
-        map_name=source.name,
         kept=kept,
+        map_index=np.zeros(kept.size, np.uint8),
         patches=patches,
-        terrain_name=None if patches.terrain is None else source.classes.names()[patches.terrain_class],
         footprint_xy_m=corners[kept],
         footprint_lonlat_deg=Projection(CRS.from_epsg(4326), crs, projection.area_deg).inverse(corners[kept]),
         lost_by=lost_by,
-        ledger_m=ledger_by_loss(floats(segments, "arc_length_m"), lost_by),
         warnings=_warnings(source, config, projection),
     )
 
@@ -93,7 +88,7 @@ def _lost(
     patches: Patches, corners: NDArray[np.float64], source: MapReader, config: SampleConfig
 ) -> NDArray[np.uint32]:
     lost = np.zeros(patches.valid_fraction.size, np.uint32)
-    if patches.terrain is not None:
+    if "terrain" in patches.pixels:
         lost[~source.classes.traversable()[patches.terrain_class]] = Loss.NOT_TRAVERSABLE
         lost[patches.terrain_class == 0] = Loss.NODATA
     thin = patches.valid_fraction < max(config.min_valid_fraction, 1.0 / config.patch_px**2)
@@ -102,10 +97,9 @@ def _lost(
     return lost
 
 
-def ledger_by_loss(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -> dict[str, float]:
-    """Return metres driven, kept and by loss."""
-    named = {"kept": 0} | {name_of(loss): loss for loss in _LOSSES}
-    return {name: float(arc_length_m[lost_by == loss].sum()) for name, loss in named.items()}
+def metres_lost(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) -> dict[Loss, float]:
+    """Return metres driven by what they are lost to."""
+    return {loss: float(arc_length_m[lost_by == loss].sum()) for loss in _LOSSES}
 
 
 def _warnings(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[str, ...]:

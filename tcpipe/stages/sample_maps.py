@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
+from pyproj import CRS
 
 from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import Sampled, ledger_by_loss, sample_segments
+from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.tables.bits import Loss
-from tcpipe.tables.columns import floats
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.sampling import joined
 from tcpipe.terrain.tiles import MapReader, TilePool
 
 _ELSEWHERE = (Loss.OUTSIDE_MAP, Loss.NODATA)
 """What is lost so on one map may be found on the next; what is not traversable, or nobody knows where, is lost on all."""
-
-
-@dataclass(frozen=True, slots=True)
-class SampledOnMaps:
-    """L6 before the split, by map, in the order of the maps.
-
-    ``rows`` are the segments that each map has patches of, rising; ``sampled`` are those patches, in that order. ``lost_by`` is each
-    segment's `Loss`, 0 if kept, (M,); ``ledger_m`` metres driven by loss; ``warnings`` those of all maps.
-    """
-
-    rows: tuple[NDArray[np.int64], ...]
-    sampled: tuple[Sampled, ...]
-    lost_by: NDArray[np.uint32]
-    ledger_m: Mapping[str, float]
-    warnings: tuple[str, ...]
 
 
 def sample_on_maps(
@@ -42,8 +29,8 @@ def sample_on_maps(
     *,
     gnss_crs: str,
     pools: Sequence[TilePool | None] | None = None,
-) -> SampledOnMaps:
-    """Return the patches of all segments that lie on one of the maps.
+) -> Sampled:
+    """Return the patches of all segments that lie on one of the maps, map by map.
 
     Parameters
     ----------
@@ -54,24 +41,43 @@ def sample_on_maps(
 
     Raises
     ------
-    TableError, MapError : as `sample_segments`; the maps have not the same layers or classes.
+    TableError, MapError : as `sample_segments`; the maps have not the same layers or classes, or lie too far from one another.
     """
     check_alike(sources)
     lost_by = np.full(segments.num_rows, Loss.OUTSIDE_MAP, np.uint32)
     waiting = np.arange(segments.num_rows)
-    rows: list[NDArray[np.int64]] = []
-    sampled: list[Sampled] = []
-    for source, pool in zip(sources, pools or [None] * len(sources), strict=True):
+    parts: list[Sampled] = []
+    for number, (source, pool) in enumerate(zip(sources, pools or [None] * len(sources), strict=True)):
         here = segments if len(waiting) == segments.num_rows else segments.take(pa.array(waiting))
         found = sample_segments(here, source, config, gnss_crs=gnss_crs, pool=pool)
         known = found.lost_by != Loss.OUTSIDE_MAP  # a hole in one map outweighs lying outside the next
         lost_by[waiting[known]] = found.lost_by[known]
-        rows.append(waiting[found.kept])
-        sampled.append(found)
+        place = np.full(found.kept.size, number, np.uint8)
+        placed = _in_first_plane(found, source, sources[0])
+        parts.append(replace(found, kept=waiting[found.kept], map_index=place, footprint_xy_m=placed))
         waiting = waiting[np.isin(found.lost_by, _ELSEWHERE)]
-    warnings = dict.fromkeys(warning for found in sampled for warning in found.warnings)
-    ledger_m = ledger_by_loss(floats(segments, "arc_length_m"), lost_by)
-    return SampledOnMaps(tuple(rows), tuple(sampled), lost_by, ledger_m, tuple(warnings))
+    return Sampled(
+        kept=np.concatenate([part.kept for part in parts]),
+        map_index=np.concatenate([part.map_index for part in parts]),
+        patches=joined([part.patches for part in parts]),
+        footprint_xy_m=np.concatenate([part.footprint_xy_m for part in parts]),
+        footprint_lonlat_deg=np.concatenate([part.footprint_lonlat_deg for part in parts]),
+        lost_by=lost_by,
+        warnings=tuple(dict.fromkeys(warning for part in parts for warning in part.warnings)),
+    )
+
+
+def _in_first_plane(sampled: Sampled, source: MapReader, first: MapReader) -> NDArray[np.float64]:
+    """Return footprints in the CRS of the first map [m], in which splits are drawn and distances measured."""
+    if source.grid.crs == first.grid.crs:
+        return sampled.footprint_xy_m
+    crs = parse_crs(first.grid.crs, where=f"map {first.name}")
+    placed = Projection(CRS.from_epsg(4326), crs, area_of(crs, first.grid.bounds_m)).forward(
+        sampled.footprint_lonlat_deg
+    )
+    if not np.isfinite(placed).all():
+        raise MapError(f"map {source.name}: lies too far from map {first.name} for one dataset; build one from each")
+    return placed
 
 
 def check_alike(sources: Sequence[MapReader]) -> None:
@@ -83,8 +89,16 @@ def check_alike(sources: Sequence[MapReader]) -> None:
                 f"map {other.name}: has {', '.join(other.layers)}, but map {first.name} has {', '.join(first.layers)}; "
                 "maps of one dataset have the same layers"
             )
-        elif "terrain" in first.layers and other.classes != first.classes:
-            different = "; ".join(other.classes.differences(first.classes))
-            problems.append(f"map {other.name}: its classes differ from those of map {first.name}: {different}")
+            continue
+        for name, layer in first.layers.items():
+            its = other.layers[name]
+            if its.kind != layer.kind or its.unit != layer.unit:
+                problems.append(
+                    f"map {other.name}: {name} is {its.kind} [{its.unit}], but {layer.kind} [{layer.unit}] in map {first.name}"
+                )
+            elif layer.classes is not None and its.classes is not None and its.classes != layer.classes:
+                different = "; ".join(its.classes.differences(layer.classes))
+                of = "its classes" if name == "terrain" else f"its classes of {name}"
+                problems.append(f"map {other.name}: {of} differ from those of map {first.name}: {different}")
     if problems:
         raise MapError(*problems)

@@ -100,6 +100,23 @@ def named_scheme(name_by_value: Mapping[int, str], table: ClassTable) -> ClassSc
     return ClassScheme(table, found) if found else None
 
 
+def own_scheme(name_by_value: Mapping[int, str]) -> ClassScheme | None:
+    """Return classes as a raster itself names them, all traversable; None where it names none, or more than there are ids.
+
+    A class's id is its value where all values can be ids, else its place in the order of the values; values of one name are one class.
+    """
+    first = {name: value for value, name in sorted(name_by_value.items(), reverse=True)}
+    values = sorted(first.values())
+    plain = all(0 < value <= MAX_ID for value in values)
+    id_of = {name_by_value[value]: value if plain else place for place, value in enumerate(values, 1)}
+    if not 0 < len(id_of) <= MAX_ID:
+        return None
+    entries = sorted(
+        (TerrainClass(number, name, traversable=True) for name, number in id_of.items()), key=lambda entry: entry.id
+    )
+    return ClassScheme(ClassTable(tuple(entries)), {value: id_of[name] for value, name in name_by_value.items()})
+
+
 PAPER_CLASSES = ClassTable(
     (
         TerrainClass(1, "obstacle", traversable=False),

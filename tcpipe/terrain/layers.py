@@ -1,23 +1,47 @@
-"""From stored layers to the paper's tensor: scaling and clipping (section IV-B), done only when the tensor is formed.
+"""Layers of maps and patches as data: what is interpolated and how, what is stored, and what becomes of it in the tensor (section IV-B).
 
-=========  ==========================================  =======================================
-layer      stored                                      in the tensor
-=========  ==========================================  =======================================
-ortho      grey, one byte                              O / 255
-terrain    class id, one byte, 0 = no data             (C - 1) / (c - 1)
-height     0.5 mm steps above the patch's smallest     (H - min H) / 1 m, clipped to [0, 1]
-=========  ==========================================  =======================================
+============  ==============  ============================  =======================================
+kind          taken from map  in a patch                    in the tensor
+============  ==============  ============================  =======================================
+continuous    bilinear        the value, in steps           (value - low) / (high - low)
+categorical   nearest         class id, 0 = no data         (C - 1) / (c - 1)
+relative      bilinear        steps above the patch's       the same, in its range
+                              smallest
+============  ==============  ============================  =======================================
 
-A pixel without data is 0 in every channel; only a recipe with ``min_valid_fraction`` below 1 lets one in.
+The paper has one of each: ortho O / 255, terrain (C - 1) / (c - 1), height (H - min H) / 1 m, all clipped to [0, 1]. A user's own rasters
+are continuous or categorical (ADR 58). A pixel without data in any layer is 0 in every channel; only a recipe with ``min_valid_fraction``
+below 1 lets one in.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+
+Kind = Literal["continuous", "categorical", "relative"]
+Stack = Literal["relative", "floats", "greys", "classes"]
+
 LAYERS = ("ortho", "terrain", "height")
 """The paper's order of channels: O, C, H."""
+
+COLOURS = ("ortho_red", "ortho_green", "ortho_blue")
+"""Layers of an orthophoto that is kept in colour, beside its grey."""
+
+STACKS: dict[Stack, type[np.generic]] = {
+    "relative": np.float32,
+    "floats": np.float32,
+    "greys": np.uint8,
+    "classes": np.uint8,
+}
+"""What layers are sampled together, and their type in a map."""
 
 HEIGHT_STEP_M = 0.0005
 """One step of a stored height [m]."""
@@ -31,29 +55,135 @@ HEIGHT_RANGE_M = 1.0
 LUMA_RGB = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in grey (ITU-R BT.601)."""
 
-
-def ortho_channel(ortho: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return grey in [0, 1]."""
-    return ortho.astype(np.float32) / np.float32(255.0)
-
-
-def terrain_channel(terrain: NDArray[np.uint8], class_count: int) -> NDArray[np.float32]:
-    """Return (C - 1) / (c - 1): ids from 1 to ``class_count`` onto [0, 1]."""
-    above = np.maximum(terrain.astype(np.float32) - np.float32(1.0), np.float32(0.0))
-    scaled: NDArray[np.float32] = above / np.float32(max(class_count - 1, 1))
-    return scaled
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+_TAKEN = (*LAYERS, *COLOURS, *("classes", "row", "column", "sample", "spatial_ref", "x", "y", "overviews"))
+"""What else a map or a dataset calls by name; the columns of samples are taken, too."""
 
 
-def height_channel(height: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Return heights above the patch's smallest over 1 m, clipped to [0, 1]."""
-    scaled = height.astype(np.float32) * np.float32(HEIGHT_STEP_M / HEIGHT_RANGE_M)
-    clipped: NDArray[np.float32] = np.minimum(scaled, np.float32(1.0))
-    return np.where(height == HEIGHT_NODATA, np.float32(0.0), clipped)
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One layer; values are in ``unit``, those of a relative one above the patch's smallest."""
+
+    name: str
+    kind: Kind
+    long_name: str
+    mapped: np.dtype[Any]
+    """Type in a map: float32 with NaN as no data, or bytes with 0."""
+    stored: np.dtype[Any]
+    """Type in a patch."""
+    unit: str = "1"
+    step: float = 1.0
+    """What one stored number is worth [unit]."""
+    low: float = 0.0
+    high: float = 1.0
+    """What becomes 0 and 1 in the tensor [unit]."""
+    classes: ClassTable | None = None
+    """Of a categorical layer."""
+
+    @property
+    def nodata(self) -> float:
+        """Return what a pixel of a patch without data holds: 0, NaN, or the largest number of a relative layer."""
+        return HEIGHT_NODATA if self.kind == "relative" else missing(self.stored)
+
+    @property
+    def stack(self) -> Stack:
+        """Return what it is sampled together with."""
+        if self.kind == "continuous":
+            return "greys" if self.mapped == np.uint8 else "floats"
+        return "relative" if self.kind == "relative" else "classes"
+
+    def has_data(self, pixels: NDArray[Any]) -> NDArray[np.bool_]:
+        """Return which pixels of the map have data."""
+        return np.isfinite(pixels) if self.mapped.kind == "f" else np.asarray(pixels != 0)
+
+    def channel(self, pixels: NDArray[Any]) -> NDArray[np.float32]:
+        """Return pixels of patches as a channel of the tensor, in [0, 1]."""
+        one = np.float32
+        if self.stored == np.uint8:
+            above = np.maximum(pixels.astype(one) - one(self.low / self.step), one(0.0))
+            return np.asarray(np.minimum(above / one(max((self.high - self.low) / self.step, 1.0)), one(1.0)))
+        scale, offset = self.scaling
+        there = np.equal(pixels, pixels) & (pixels != self.nodata)
+        scaled = np.where(there, pixels, 0).astype(one) * one(scale) + one(offset)
+        return np.where(there, np.clip(scaled, one(0.0), one(1.0)), one(0.0))
+
+    @property
+    def scaling(self) -> tuple[float, float]:
+        """Return what a stored number is multiplied by, and what is added, so that low and high become 0 and 1."""
+        width = (self.high - self.low) or 1.0
+        return self.step / width, -self.low / width
 
 
-def paper_tensor(
-    ortho: NDArray[np.uint8], terrain: NDArray[np.uint8], height: NDArray[np.uint16], class_count: int
-) -> NDArray[np.float32]:
-    """Return the paper's M: shape (N, px, px, 3), channels ortho, terrain, height, all in [0, 1]."""
-    channels = (ortho_channel(ortho), terrain_channel(terrain, class_count), height_channel(height))
-    return np.stack(channels, axis=-1)
+def missing(dtype: np.dtype[Any]) -> float:
+    """Return what stands for no data in a map's pixels of a type."""
+    return float("nan") if dtype.kind == "f" else 0
+
+
+_BYTE, _STEPS, _FLOAT = (np.dtype(kind) for kind in (np.uint8, np.uint16, np.float32))
+
+_ORTHO = Layer("ortho", "continuous", "orthophoto, grey", _BYTE, _BYTE, step=1 / 255)
+
+PAPER_LAYERS: dict[str, Layer] = {
+    "ortho": _ORTHO,
+    "terrain": Layer(
+        "terrain", "categorical", "terrain class id", _BYTE, _BYTE, low=1.0, high=7.0, classes=PAPER_CLASSES
+    ),
+    "height": Layer(
+        "height",
+        "relative",
+        "height above height_min_m of the sample",
+        _FLOAT,
+        _STEPS,
+        unit="m",
+        step=HEIGHT_STEP_M,
+        high=HEIGHT_RANGE_M,
+    ),
+    **{name: replace(_ORTHO, name=name, long_name=f"orthophoto, {name[6:]}") for name in COLOURS},
+}
+"""Layers that a map may have by their names alone; those of a user are made by `continuous_layer` and `categorical_layer`."""
+
+
+def continuous_layer(name: str, *, unit: str, low: float, high: float) -> Layer:
+    """Return a user's continuous layer, whose values from ``low`` to ``high`` [unit] are scaled onto [0, 1]."""
+    return Layer(name, "continuous", name.replace("_", " "), _FLOAT, _FLOAT, unit=unit or "1", low=low, high=high)
+
+
+def categorical_layer(name: str, classes: ClassTable) -> Layer:
+    """Return a categorical layer with classes of its own."""
+    long_name = f"{name.replace('_', ' ')} class id"
+    return Layer(name, "categorical", long_name, _BYTE, _BYTE, low=1.0, high=float(classes.count), classes=classes)
+
+
+def paper_layers(names: Iterable[str], classes: ClassTable) -> dict[str, Layer]:
+    """Return layers of `PAPER_LAYERS` by name, in the order given; ``classes`` are those of terrain."""
+    terrain = categorical_layer("terrain", classes)
+    known = {**PAPER_LAYERS, "terrain": replace(terrain, long_name=PAPER_LAYERS["terrain"].long_name)}
+    return {name: known[name] for name in names}
+
+
+def in_order(layers: Mapping[str, Layer]) -> dict[str, Layer]:
+    """Return layers in the order of channels: the paper's first, then the others as they come."""
+    rest = [name for name in layers if name not in LAYERS]
+    return {name: layers[name] for name in (*(name for name in LAYERS if name in layers), *rest)}
+
+
+def joint(maps: Sequence[Mapping[str, Layer]]) -> dict[str, Layer]:
+    """Return the layers that maps have in common, each with the range of all."""
+    return {
+        name: replace(layer, low=min(each[name].low for each in maps), high=max(each[name].high for each in maps))
+        for name, layer in maps[0].items()
+    }
+
+
+def stacked(layers: Mapping[str, Layer]) -> dict[Stack, list[str]]:
+    """Return the names of layers by what they are sampled together with."""
+    return {stack: [name for name, layer in layers.items() if layer.stack == stack] for stack in STACKS}
+
+
+def wrong_name(name: str, *, taken: Collection[str]) -> str | None:
+    """Say why a user's layer cannot have a name, among those that are taken already; None where it can."""
+    if name in _TAKEN or name in taken or name.endswith("_one_hot"):
+        return f"layer {name}: the name is taken; choose another"
+    if not _NAME.fullmatch(name):
+        return f"layer {name!r}: wanted small letters, digits and '_', beginning with a letter, 40 at most"
+    return None

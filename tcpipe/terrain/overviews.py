@@ -1,6 +1,6 @@
 """Coarser levels of a map, so that a patch whose pixels are wider than the map's shows what is there on average, not every n-th pixel.
 
-A level's pixel spans ``factor`` x ``factor`` map pixels: height and grey are their mean, class the commonest (ties go to the lower id,
+A level's pixel spans ``factor`` x ``factor`` map pixels: what is continuous is their mean, a class the commonest (ties go to the lower id,
 no data votes like a class). As everywhere, a mean with a part that is missing is missing. A patch takes the coarsest level that is not
 coarser than its own pixels.
 """
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import Layer
 from tcpipe.terrain.resampling_kernel import block_majority
 
 COARSEST_M = 1.0
@@ -46,28 +47,29 @@ def factor_for(factors: Sequence[int], map_pitch_m: float, pitch_m: float) -> in
     return max((factor for factor in factors if factor * map_pitch_m <= _SLACK * pitch_m), default=min(factors))
 
 
-def coarser_levels(layer: str, values: NDArray[Any], factors: Sequence[int]) -> Iterator[tuple[int, NDArray[Any]]]:
+def coarser_levels(layer: Layer, values: NDArray[Any], factors: Sequence[int]) -> Iterator[tuple[int, NDArray[Any]]]:
     """Yield each factor above 1 and the layer at it.
 
     Parameters
     ----------
     layer
-        ``height``, ``ortho`` or ``terrain``.
+        What it is.
     values
-        Pixels of the map, shape (R, C): heights [m] with NaN, or bytes with 0, as no data.
+        Pixels of the map, shape (R, C): floats with NaN, or bytes with 0, as no data.
     factors
         Powers of two, rising, as `overview_factors` gives them.
     """
-    if layer == "terrain":
+    if layer.kind == "categorical":
         for factor in factors[1:]:
             out = np.empty((values.shape[0] // factor, values.shape[1] // factor), np.uint8)
             block_majority(values, factor, out)
             yield factor, out
         return
-    means = np.where(values == 0, np.float32(np.nan), values.astype(np.float32)) if layer == "ortho" else values
+    grey = layer.stack == "greys"
+    means = np.where(values == 0, np.float32(np.nan), values.astype(np.float32)) if grey else values
     for factor in factors[1:]:
         means = _halved(means)
-        yield factor, _grey(means) if layer == "ortho" else means
+        yield factor, _grey(means) if grey else means
 
 
 def _halved(values: NDArray[Any]) -> NDArray[Any]:

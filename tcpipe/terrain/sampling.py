@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from itertools import product
 from typing import Any
@@ -9,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.terrain.layers import HEIGHT_STEP_M, LAYERS
+from tcpipe.terrain.layers import HEIGHT_STEP_M, STACKS, stacked
 from tcpipe.terrain.patches import PatchFrames, chord_px, map_px_from_patch
-from tcpipe.terrain.sampling_kernel import sample_tiles
+from tcpipe.terrain.sampling_kernel import Ground, Stacks, sample_tiles
 from tcpipe.terrain.tiles import MapReader, TilePool, groups_by_tile, level_for
 
 _MOVED_ROWS = 128
@@ -20,15 +21,14 @@ _MOVED_ROWS = 128
 
 @dataclass(frozen=True, slots=True)
 class Patches:
-    """N sampled patches; ``ortho`` and ``terrain`` are None where the map has no such layer.
+    """N sampled patches.
 
-    Layers as in `tcpipe.terrain.layers`; the other arrays have shape (N,): smallest height [m], slopes of the fitted plane [rad], valid
-    share, share clipped by the tensor, majority class under the chord (0: none) and its share.
+    ``pixels`` are the layers that the map has, by name, (N, S, S), as `tcpipe.terrain.layers` says; the other arrays have shape (N,):
+    smallest height [m], slopes of the fitted plane [rad], valid share, share clipped by the tensor, majority class of terrain under the
+    chord (0: none) and its share.
     """
 
-    ortho: NDArray[np.uint8] | None
-    terrain: NDArray[np.uint8] | None
-    height: NDArray[np.uint16]
+    pixels: Mapping[str, NDArray[Any]]
     height_min_m: NDArray[np.float64]
     slope_rad: NDArray[np.float64]
     cross_slope_rad: NDArray[np.float64]
@@ -37,17 +37,27 @@ class Patches:
     terrain_class: NDArray[np.uint8]
     terrain_purity: NDArray[np.float64]
 
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Return all but the pixels, by name."""
+        return {entry.name: getattr(self, entry.name) for entry in fields(self)[1:]}
+
     def only(self, good: NDArray[np.bool_]) -> Patches:
         """Return the good patches, in their order; their pixels move together in place, and these patches are void."""
         rising = np.flatnonzero(good)
-        layers: list[NDArray[Any]] = [layer for layer in (self.ortho, self.terrain, self.height) if layer is not None]
-        for layer, first in product(layers, range(0, len(rising), _MOVED_ROWS)):
+        for layer, first in product(self.pixels.values(), range(0, len(rising), _MOVED_ROWS)):
             here = rising[first : first + _MOVED_ROWS]
             layer[first : first + len(here)] = layer[here]
-        found: dict[str, Any] = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        for name, values in found.items():
-            found[name] = None if values is None else values[: len(rising)] if name in LAYERS else values[good]
-        return Patches(**found)
+        pixels = {name: layer[: len(rising)] for name, layer in self.pixels.items()}
+        return Patches(pixels, **{name: values[good] for name, values in self.columns().items()})
+
+
+def joined(parts: Sequence[Patches]) -> Patches:
+    """Return patches one after another, all of the same layers."""
+    if len(parts) == 1:
+        return parts[0]
+    pixels = {name: np.concatenate([part.pixels[name] for part in parts]) for name in parts[0].pixels}
+    columns = [part.columns() for part in parts]
+    return Patches(pixels, **{name: np.concatenate([each[name] for each in columns]) for name in columns[0]})
 
 
 def sample_patches(
@@ -79,20 +89,24 @@ def sample_patches(
     points = max(round(patch_px * float(np.median(chord_m)) / patch_m), 1) if chord_m.size else 1
     chords = chord_px(frames, level.grid, chord_m=chord_m, points=points)
     boxes = _boxes(pixels, patch_px, chords, points)
-    has_ortho, has_terrain = "ortho" in level.layers, "terrain" in level.layers
-    shape, nothing = (chord_m.size, patch_px, patch_px), (0, patch_px, patch_px)
-    height = np.empty(shape, np.uint16)
-    ortho, terrain = (np.empty(shape if has else nothing, np.uint8) for has in (has_ortho, has_terrain))
-    stats = np.empty((chord_m.size, 7))
-    pool, pitch_m = pool or TilePool(level), patch_m / patch_px
+    pitch_m, stacks = patch_m / patch_px, stacked(level.layers)
+    ground = Ground(boxes, pixels, chords, points, _place("terrain", stacks["classes"]), pitch_m, HEIGHT_STEP_M)
+    shape = (chord_m.size, patch_px, patch_px)
+    floats, greys, classes = (
+        np.empty((len(stacks[stack]), *shape), STACKS[stack]) for stack in ("floats", "greys", "classes")
+    )
+    out = Stacks(np.empty(shape, np.uint16), floats, greys, classes, np.empty((chord_m.size, 7)))
+    pool = pool or TilePool(level)
     for chosen in groups_by_tile(level.grid.px_from_xy(frames.centre_xy_m), level):
         pool.hold(boxes[chosen])
-        where = (pool.slots, *pool.tile_shape, chosen, boxes, pixels, chords, points, pitch_m, HEIGHT_STEP_M)
-        sample_tiles(*pool.layers, *where, height, ortho, terrain, stats)
+        sample_tiles(pool.tiles, ground, chosen, out)
+    stats = out.stats
     return Patches(
-        ortho=ortho if has_ortho else None,
-        terrain=terrain if has_terrain else None,
-        height=height,
+        pixels={
+            name: out.relative if stack == "relative" else getattr(out, stack)[number]
+            for stack, names in stacks.items()
+            for number, name in enumerate(names)
+        },
         height_min_m=stats[:, 0] + level.height_reference_m,
         slope_rad=stats[:, 1],
         cross_slope_rad=stats[:, 2],
@@ -101,6 +115,10 @@ def sample_patches(
         terrain_class=stats[:, 5].astype(np.uint8),
         terrain_purity=stats[:, 6],
     )
+
+
+def _place(name: str, names: Sequence[str]) -> int:
+    return names.index(name) if name in names else -1
 
 
 def _boxes(pixels: NDArray[np.float64], patch_px: int, chords: NDArray[np.float64], points: int) -> NDArray[np.int64]:

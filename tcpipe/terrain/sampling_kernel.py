@@ -10,6 +10,8 @@ since numba tests signed ones for Python's counting from the end. The rest is pa
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,110 +24,135 @@ HEIGHT_NODATA = np.uint16(65535)
 """A stored height without data (`tcpipe.terrain.layers.HEIGHT_NODATA`), as kernels compare it."""
 
 
-@kernel
-def sample_tiles(
-    height: NDArray[np.float32],
-    ortho: NDArray[np.uint8],
-    terrain: NDArray[np.uint8],
-    slots: NDArray[np.int32],
-    tile_rows: int,
-    tile_cols: int,
-    chosen: NDArray[np.int64],
-    boxes: NDArray[np.int64],
-    frames: NDArray[np.float64],
-    chords: NDArray[np.float64],
-    chord_points: int,
-    pitch_m: float,
-    step_m: float,
-    out_height: NDArray[np.uint16],
-    out_ortho: NDArray[np.uint8],
-    out_terrain: NDArray[np.uint8],
-    out_stats: NDArray[np.float64],
-) -> None:
-    """Sample patches from tiles that are in memory.
+class Tiles(NamedTuple):
+    """Tiles in memory, one after another; layers of a kind follow each other, and there may be none of it.
 
-    Parameters
-    ----------
-    height, ortho, terrain
-        Tiles one after another, flat: float32 [m] with NaN as no data, uint8 and uint8 with 0 as no data; empty where the map has no such
-        layer.
-    slots
-        Which of them is the tile in row i and column j of the map, shape (A, B); -1 where there is none, which is ground without data.
-    tile_rows, tile_cols
-        Pixels of a tile.
-    chosen
-        Which patches to sample: rows of all that follows, shape (n,).
-    boxes
-        First row and column, last row and column (exclusive) of the map pixels that a patch and its chord touch, taps and a pixel all
-        around included, shape (N, 4).
-    frames, chords
-        Affine map pixel positions (`patches.map_px_from_patch`, `patches.chord_px`), shapes (N, 6), (N, 4).
-    chord_points
-        Points on the chord to take the class at.
-    pitch_m, step_m
-        Side of a patch pixel on the ground [m]; one step of a stored height [m].
-    out_height, out_ortho, out_terrain
-        Shape (N, S, S): uint16 steps above the smallest (65535 no data), uint8, uint8; of length 0 where the map has no such layer.
-    out_stats
-        Shape (N, 7), float64: smallest height [m], slope along and to the left [rad], valid fraction, share of valid pixels more than 1 m
-        above the smallest, majority class under the chord, its share.
+    ``relative`` is float32 [m] with NaN as no data, shape (S,); ``floats`` the same, (F·S,); ``greys`` and ``classes`` are uint8 with 0 as
+    no data, (G·S,), (C·S,). ``slots`` says which of them is the tile in row i and column j of the map, (A, B), -1 where there is none,
+    which is ground without data; ``rows`` and ``cols`` are the pixels of a tile.
     """
-    side = out_height.shape[1]
-    has_ortho, has_terrain = ortho.size > 0, terrain.size > 0
+
+    relative: NDArray[np.float32]
+    floats: NDArray[np.float32]
+    greys: NDArray[np.uint8]
+    classes: NDArray[np.uint8]
+    slots: NDArray[np.int32]
+    rows: int
+    cols: int
+
+
+class Ground(NamedTuple):
+    """Where N patches lie on the map.
+
+    ``boxes`` are the first row and column, last row and column (exclusive) of the map pixels that a patch and its chord touch, taps and a
+    pixel all around included, (N, 4); ``frames`` and ``chords`` affine map pixel positions (`patches.map_px_from_patch`,
+    `patches.chord_px`), (N, 6), (N, 4), with ``chord_points`` points on the chord to take the class at, which is that of layer
+    ``classed`` of the classes, -1 for none. ``pitch_m`` is the side of a patch pixel on the ground [m], ``step_m`` of a stored height [m].
+    """
+
+    boxes: NDArray[np.int64]
+    frames: NDArray[np.float64]
+    chords: NDArray[np.float64]
+    chord_points: int
+    classed: int
+    pitch_m: float
+    step_m: float
+
+
+class Stacks(NamedTuple):
+    """N patches of S x S pixels, by kind, as in `Tiles`.
+
+    ``relative`` is uint16 steps above the patch's smallest (65535 no data), (N, S, S); the others are (F, N, S, S), (G, N, S, S) and
+    (C, N, S, S). ``stats``, (N, 7): smallest height [m], slope along and to the left [rad], valid fraction, share of valid pixels more
+    than 1 m above the smallest, majority class under the chord, its share.
+    """
+
+    relative: NDArray[np.uint16]
+    floats: NDArray[np.float32]
+    greys: NDArray[np.uint8]
+    classes: NDArray[np.uint8]
+    stats: NDArray[np.float64]
+
+
+class _Near(NamedTuple):
+    """A patch's surroundings, by kind, as in `Tiles`: (M,), (F·M,), (G·M,), (C·M,)."""
+
+    relative: NDArray[np.float32]
+    floats: NDArray[np.float32]
+    greys: NDArray[np.uint8]
+    classes: NDArray[np.uint8]
+
+
+@kernel
+def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: Stacks) -> None:
+    """Sample patches from tiles that are in memory; ``chosen`` are those rows of ``ground`` and ``out``, shape (n,)."""
+    side = out.relative.shape[1]
+    whole_patch = side * side
     most = 0
     for n in chosen:
-        most = max(most, (boxes[n, 2] - boxes[n, 0] + 2) * _width(boxes[n]) + 2 * RUN_PX)
-    near_height = np.zeros(most, np.float32)
-    near_ortho, near_terrain = np.ones(most, np.uint8), np.ones(most, np.uint8)
+        box = ground.boxes[n]
+        most = max(most, (box[2] - box[0] + 2) * _width(box) + 2 * RUN_PX)
+    near = _Near(
+        np.zeros(most, np.float32),
+        np.zeros(len(out.floats) * most, np.float32),
+        np.ones(len(out.greys) * most, np.uint8),
+        np.ones(len(out.classes) * most, np.uint8),
+    )
     taps = np.zeros(most, np.uint32)
-    at = np.empty(side * side, np.uint32)
-    fx, fy = np.empty(side * side, np.float32), np.empty(side * side, np.float32)
-    rise = np.empty(side * side, np.float32)
-    good = np.ones(side * side, np.uint8)
+    at = np.empty(whole_patch, np.uint32)
+    fx, fy = np.empty(whole_patch, np.float32), np.empty(whole_patch, np.float32)
+    rise = np.empty(whole_patch, np.float32)
+    good = np.ones(whole_patch, np.uint8)
     votes = np.zeros(256, np.int64)
     for n in chosen:
-        box, frame = boxes[n], frames[n]
+        box, frame = ground.boxes[n], ground.frames[n]
         width, rows = _width(box), box[2] - box[0]
-        heights = out_height[n].reshape(-1)
-        greys = out_ortho[n].reshape(-1) if has_ortho else out_ortho.reshape(-1)
-        classes = out_terrain[n].reshape(-1) if has_terrain else out_terrain.reshape(-1)
+        heights = out.relative[n].reshape(-1)
         middle_x = np.int64(np.floor(frame[0] + 0.5 * (side - 1) * (frame[2] + frame[4])))
         middle_y = np.int64(np.floor(frame[1] + 0.5 * (side - 1) * (frame[3] + frame[5])))
-        reference = _height_at(height, slots, tile_rows, tile_cols, middle_y, middle_x)
-        _copy_near(
-            height, ortho, terrain, slots, tile_rows, tile_cols, box, reference, near_height, near_ortho, near_terrain
-        )
-        _find_positions(width, box, frame, side, at, fx, fy)
-        _sample_height(near_height, width, at, fx, fy, rise)
-        if has_ortho:
-            _pack_taps(near_ortho, width, rows, taps)
-            _sample_ortho(taps, at, fx, fy, greys)
-        whole, count = _is_whole(near_height, near_ortho, near_terrain, rows * width), side * side
+        reference = _height_at(tiles, middle_y, middle_x)
+        _copy_near(tiles, box, near)
+        _lower(near.relative[: rows * width], reference)
+        whole = _is_known(near.relative[: rows * width]) and _is_whole(near, rows * width)
         if not whole:
-            count = _find_good(rise, taps, greys, at, good)
-        if has_terrain:
-            _pack_taps(near_terrain, width, rows, taps)
-            _sample_terrain(taps, at, fx, fy, classes)
+            good[:] = 1
+        _find_positions(width, box, frame, side, at, fx, fy)
+        _sample_floats(near.relative, width, at, fx, fy, rise)
+        if not whole:
+            _mark_known(rise, good)
+        for k in range(len(out.floats)):
+            values = out.floats[k, n].reshape(-1)
+            _sample_floats(near.floats[k * most :], width, at, fx, fy, values)
             if not whole:
-                count = _find_classed(classes, good)
-        if count == side * side:
-            lowest, clipped = _store_height(rise, step_m, heights)
+                _mark_known(values, good)
+        for k in range(len(out.greys)):
+            _pack_taps(near.greys[k * most :], width, rows, taps)
+            _sample_greys(taps, at, fx, fy, out.greys[k, n].reshape(-1))
+            if not whole:
+                _mark_tapped(taps, at, good)
+        for k in range(len(out.classes)):
+            classes = out.classes[k, n].reshape(-1)
+            _pack_taps(near.classes[k * most :], width, rows, taps)
+            _sample_classes(taps, at, fx, fy, classes)
+            if not whole:
+                _mark_classed(classes, good)
+        count = whole_patch if whole else int(good.sum())
+        if count == whole_patch:
+            lowest, clipped = _store_height(rise, ground.step_m, heights)
             along, left = _slopes(rise, side)
         else:
-            lowest, clipped = _store_good_height(rise, good, step_m, heights)
+            lowest, clipped = _store_good_height(rise, good, ground.step_m, heights)
             along, left = _good_slopes(rise, good, side)
-            _clear(greys, good)
-            _clear(classes, good)
+            _clear(out, n, good)
         entry, share = np.int64(0), 0.0
-        if has_terrain:
-            entry, share = _class_under(near_terrain, width, box, chords[n], chord_points, votes)
-        out_stats[n, 0] = np.float64(reference) + np.float64(lowest)
-        out_stats[n, 1] = np.arctan(along / pitch_m)
-        out_stats[n, 2] = np.arctan(left / pitch_m)
-        out_stats[n, 3] = count / (side * side)
-        out_stats[n, 4] = clipped / max(count, 1)
-        out_stats[n, 5] = entry
-        out_stats[n, 6] = share
+        if ground.classed >= 0:
+            under = near.classes[ground.classed * most :]
+            entry, share = _class_under(under, width, box, ground.chords[n], ground.chord_points, votes)
+        stats = out.stats[n]
+        stats[0] = np.float64(reference) + np.float64(lowest)
+        stats[1], stats[2] = np.arctan(along / ground.pitch_m), np.arctan(left / ground.pitch_m)
+        stats[3], stats[4] = count / whole_patch, clipped / max(count, 1)
+        stats[5], stats[6] = entry, share
 
 
 @kernel
@@ -139,85 +166,103 @@ def _slot(slots: NDArray[np.int32], i: int, j: int) -> int:
 
 
 @kernel
-def _height_at(
-    height: NDArray[np.float32], slots: NDArray[np.int32], tile_rows: int, tile_cols: int, row: int, col: int
-) -> np.float32:
+def _height_at(tiles: Tiles, row: int, col: int) -> np.float32:
     """Return a pixel's height; 0 where it has none."""
-    i, j = row // tile_rows, col // tile_cols
-    slot = _slot(slots, i, j)
+    i, j = row // tiles.rows, col // tiles.cols
+    slot = _slot(tiles.slots, i, j)
     if slot < 0:
         return np.float32(0.0)
-    found = height[(slot * tile_rows + row - i * tile_rows) * tile_cols + col - j * tile_cols]
+    found = tiles.relative[(slot * tiles.rows + row - i * tiles.rows) * tiles.cols + col - j * tiles.cols]
     return found if np.isfinite(found) else np.float32(0.0)
 
 
 @kernel
-def _copy_near(
-    height: NDArray[np.float32],
-    ortho: NDArray[np.uint8],
-    terrain: NDArray[np.uint8],
-    slots: NDArray[np.int32],
-    tile_rows: int,
-    tile_cols: int,
-    box: NDArray[np.int64],
-    reference: np.float32,
-    near_height: NDArray[np.float32],
-    near_ortho: NDArray[np.uint8],
-    near_terrain: NDArray[np.uint8],
-) -> None:
+def _copy_near(tiles: Tiles, box: NDArray[np.int64], near: _Near) -> None:
     """Copy a box of the map from one or more tiles, row by row; what a run carries too far, the next one overwrites."""
-    run, width, size = np.uint64(RUN_PX), _width(box), np.uint64(height.size)
-    has_ortho, has_terrain = ortho.size > 0, terrain.size > 0
-    first_j, last_j = box[1] // tile_cols, (box[3] - 1) // tile_cols
-    for i in range(box[0] // tile_rows, (box[2] - 1) // tile_rows + 1):
-        for row in range(max(box[0], i * tile_rows), min(box[2], (i + 1) * tile_rows)):
+    heights, floats, greys, classes, slots, high, wide = (
+        tiles  # taken out once: a field costs a reference count each time
+    )
+    near_heights, near_floats, near_greys, near_classes = near
+    width, size, most = _width(box), heights.size, near_heights.size
+    float_count, grey_count, class_count = near_floats.size // most, near_greys.size // most, near_classes.size // most
+    first_j, last_j = box[1] // wide, (box[3] - 1) // wide
+    for i in range(box[0] // high, (box[2] - 1) // high + 1):
+        for row in range(max(box[0], i * high), min(box[2], (i + 1) * high)):
             for j in range(first_j, last_j + 1):
-                begin, end = max(box[1], j * tile_cols), min(box[3], (j + 1) * tile_cols)
-                there = np.uint64((row - box[0]) * width + begin - box[1])
-                count = np.uint64(end - begin)
-                slot = _slot(slots, i, j)
+                begin, end = max(box[1], j * wide), min(box[3], (j + 1) * wide)
+                there, slot = (row - box[0]) * width + begin - box[1], _slot(slots, i, j)
                 if slot < 0:
-                    for k in range(count):
-                        near_height[there + k] = np.nan
-                        near_ortho[there + k] = 0 if has_ortho else 1
-                        near_terrain[there + k] = 0 if has_terrain else 1
+                    _blank(near, there, there + end - begin)
                     continue
-                here = np.uint64((slot * tile_rows + row - i * tile_rows) * tile_cols + begin - j * tile_cols)
-                stop = there + count
-                while there < stop and here + run <= size:
-                    for k in range(run):
-                        near_height[there + k] = height[here + k] - reference
-                    if has_ortho:
-                        for k in range(run):
-                            near_ortho[there + k] = ortho[here + k]
-                    if has_terrain:
-                        for k in range(run):
-                            near_terrain[there + k] = terrain[here + k]
-                    there += run
-                    here += run
-                while there < stop:  # the last pixels of all
-                    near_height[there] = height[here] - reference
-                    if has_ortho:
-                        near_ortho[there] = ortho[here]
-                    if has_terrain:
-                        near_terrain[there] = terrain[here]
-                    there += np.uint64(1)
-                    here += np.uint64(1)
+                here = (slot * high + row - i * high) * wide + begin - j * wide
+                _copy_run(heights, here, near_heights, there, end - begin)
+                for k in range(float_count):
+                    _copy_run(floats, k * size + here, near_floats, k * most + there, end - begin)
+                for k in range(grey_count):
+                    _copy_run(greys, k * size + here, near_greys, k * most + there, end - begin)
+                for k in range(class_count):
+                    _copy_run(classes, k * size + here, near_classes, k * most + there, end - begin)
 
 
 @kernel
-def _is_whole(
-    near_height: NDArray[np.float32], near_ortho: NDArray[np.uint8], near_terrain: NDArray[np.uint8], count: int
-) -> bool:
-    """Tell whether no pixel of the window lacks data."""
-    broken, least = np.uint32(0), np.uint8(255)
-    for k in range(count):
-        broken |= np.uint32(near_height[k] != near_height[k])  # true for NaN
-    for k in range(count):
-        least = min(least, near_ortho[k])
-    for k in range(count):
-        least = min(least, near_terrain[k])
-    return bool(broken == 0 and least > 0)
+def _copy_run(source: NDArray[Any], here: int, near: NDArray[Any], there: int, count: int) -> None:
+    run, begin, place = np.uint64(RUN_PX), np.uint64(here), np.uint64(there)
+    if here + count + RUN_PX > source.size:  # the last pixels of all
+        for k in range(np.uint64(count)):
+            near[place + k] = source[begin + k]
+        return
+    for j in range(np.uint64(count + RUN_PX - 1) // run):
+        for k in range(run):
+            near[place + j * run + k] = source[begin + j * run + k]
+
+
+@kernel
+def _blank(near: _Near, first: int, last: int) -> None:
+    """Leave a stretch of the window without data."""
+    most = near.relative.size
+    near.relative[first:last] = np.nan
+    for k in range(near.floats.size // most):
+        near.floats[k * most + first : k * most + last] = np.nan
+    for k in range(near.greys.size // most):
+        near.greys[k * most + first : k * most + last] = 0
+    for k in range(near.classes.size // most):
+        near.classes[k * most + first : k * most + last] = 0
+
+
+@kernel
+def _lower(near: NDArray[np.float32], reference: np.float32) -> None:
+    """Take heights above a reference."""
+    for k in range(near.size):
+        near[k] -= reference
+
+
+@kernel
+def _is_whole(near: _Near, count: int) -> bool:
+    """Tell whether no pixel of the window lacks data of any other layer."""
+    most, whole = near.relative.size, True
+    for first in range(0, near.floats.size, most):
+        whole &= _is_known(near.floats[first : first + count])
+    for first in range(0, near.greys.size, most):
+        whole &= _least(near.greys[first : first + count]) > 0
+    for first in range(0, near.classes.size, most):
+        whole &= _least(near.classes[first : first + count]) > 0
+    return whole
+
+
+@kernel
+def _is_known(values: NDArray[np.float32]) -> bool:
+    broken = np.uint32(0)
+    for k in range(values.size):
+        broken |= np.uint32(values[k] != values[k])  # true for NaN
+    return bool(broken == 0)
+
+
+@kernel
+def _least(values: NDArray[np.uint8]) -> np.uint8:
+    least = np.uint8(255)
+    for k in range(values.size):
+        least = min(least, values[k])
+    return least
 
 
 @kernel
@@ -257,7 +302,7 @@ def _find_positions(
 
 
 @kernel
-def _sample_height(
+def _sample_floats(
     near: NDArray[np.float32],
     width: int,
     at: NDArray[np.uint32],
@@ -276,7 +321,7 @@ def _sample_height(
 
 
 @kernel
-def _sample_ortho(
+def _sample_greys(
     taps: NDArray[np.uint32],
     at: NDArray[np.uint32],
     fx: NDArray[np.float32],
@@ -294,7 +339,7 @@ def _sample_ortho(
 
 
 @kernel
-def _sample_terrain(
+def _sample_classes(
     taps: NDArray[np.uint32],
     at: NDArray[np.uint32],
     fx: NDArray[np.float32],
@@ -308,34 +353,27 @@ def _sample_terrain(
 
 
 @kernel
-def _find_good(
-    rise: NDArray[np.float32],
-    taps_ortho: NDArray[np.uint32],
-    greys: NDArray[np.uint8],
-    at: NDArray[np.uint32],
-    good: NDArray[np.uint8],
-) -> int:
-    """Find the pixels of which neither height nor orthophoto (``greys`` is empty without one) lacks a tap; return how many."""
-    b8, b16, b24, byte = np.uint32(8), np.uint32(16), np.uint32(24), np.uint32(255)
-    count = 0
-    for k in range(rise.size):
-        whole = rise[k] == rise[k]  # false for NaN
-        if greys.size > 0:
-            four = taps_ortho[at[k]]
-            whole &= (four & byte != 0) & (four >> b8 & byte != 0) & (four >> b16 & byte != 0) & (four >> b24 != 0)
-        good[k] = whole
-        count += good[k]
-    return count
+def _mark_known(values: NDArray[np.float32], good: NDArray[np.uint8]) -> None:
+    """Leave good what is not NaN: no tap lacked data."""
+    for k in range(values.size):
+        good[k] &= np.uint8(values[k] == values[k])
 
 
 @kernel
-def _find_classed(classes: NDArray[np.uint8], good: NDArray[np.uint8]) -> int:
-    """Leave good what has a class; return how many."""
-    count = 0
+def _mark_tapped(taps: NDArray[np.uint32], at: NDArray[np.uint32], good: NDArray[np.uint8]) -> None:
+    """Leave good what has data in all four taps."""
+    b8, b16, b24, byte = np.uint32(8), np.uint32(16), np.uint32(24), np.uint32(255)
+    for k in range(at.size):
+        four = taps[at[k]]
+        whole = (four & byte != 0) & (four >> b8 & byte != 0) & (four >> b16 & byte != 0) & (four >> b24 != 0)
+        good[k] &= np.uint8(whole)
+
+
+@kernel
+def _mark_classed(classes: NDArray[np.uint8], good: NDArray[np.uint8]) -> None:
+    """Leave good what has a class."""
     for k in range(classes.size):
         good[k] &= np.uint8(classes[k] != 0)
-        count += good[k]
-    return count
 
 
 @kernel
@@ -380,9 +418,14 @@ def _store_good_height(
 
 
 @kernel
-def _clear(out: NDArray[np.uint8], good: NDArray[np.uint8]) -> None:
-    for k in range(out.size):
-        out[k] = out[k] if good[k] else 0
+def _clear(out: Stacks, n: int, good: NDArray[np.uint8]) -> None:
+    """Take the data of a patch where any layer lacks it."""
+    for k in range(good.size):
+        if not good[k]:
+            row, col = k // out.relative.shape[1], k % out.relative.shape[1]
+            out.floats[:, n, row, col] = np.nan
+            out.greys[:, n, row, col] = 0
+            out.classes[:, n, row, col] = 0
 
 
 @kernel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import product
 from typing import Any, Protocol
 
@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 
 from tcpipe.terrain.classes import ClassTable
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import STACKS, Layer, Stack, missing, stacked
 from tcpipe.terrain.overviews import factor_for
-from tcpipe.terrain.sampling_kernel import morton
+from tcpipe.terrain.sampling_kernel import Tiles, morton
 
 CACHED_TILES = 96
 """Decoded tiles kept: 150 MB of three layers at 512 px."""
 
 _STRIP_TILES = CACHED_TILES // 3 - 3
 """Three rows of a strip of the map are touched between two uses of a tile. So wide, 15,000 px, most maps are one strip."""
-
-_LAYERS: dict[str, tuple[type, float]] = {
-    "height": (np.float32, np.nan),
-    "ortho": (np.uint8, 0),
-    "terrain": (np.uint8, 0),
-}
-"""Type and nodata of each layer."""
 
 
 class MapReader(Protocol):
@@ -45,8 +39,8 @@ class MapReader(Protocol):
         """Its class table."""
 
     @property
-    def layers(self) -> tuple[str, ...]:
-        """Which of ``height``, ``ortho``, ``terrain`` it has."""
+    def layers(self) -> Mapping[str, Layer]:
+        """Its layers by name; ``height``, the relative one, is always there."""
 
     @property
     def tile_px(self) -> int:
@@ -66,8 +60,7 @@ class MapReader(Protocol):
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
         """Return rows ``row0:row1`` and columns ``col0:col1`` of a layer.
 
-        ``height`` is float32 metres above `height_reference_m`, NaN where there is no data; ``ortho`` is uint8 grey from 1 to 255 and
-        ``terrain`` uint8 class ids, 0 where there is no data.
+        Height is in metres above `height_reference_m`; no data is NaN, or 0 in layers of bytes.
         """
 
     def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
@@ -98,8 +91,8 @@ def read_window(  # noqa: PLR0917
     source: MapReader, layer: str, row0: int, row1: int, col0: int, col1: int
 ) -> NDArray[Any]:
     """Return a window of a layer that may reach beyond the map, where it holds no data."""
-    dtype, nodata = _LAYERS[layer]
-    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), nodata, dtype)
+    dtype = source.layers[layer].mapped
+    out: NDArray[Any] = np.full((row1 - row0, col1 - col0), missing(dtype), dtype)
     top, bottom = max(row0, 0), min(row1, source.grid.rows)
     left, right = max(col0, 0), min(col1, source.grid.cols)
     if top < bottom and left < right:
@@ -108,40 +101,44 @@ def read_window(  # noqa: PLR0917
 
 
 class TilePool:
-    """The tiles that are being sampled, side by side in one array a layer; the least recently used make room.
+    """The tiles that are being sampled, side by side in one array for each kind of layer; the least recently used make room.
 
-    A map of one tile is taken as it is read, without a copy.
+    Of a map of one tile, a layer that is alone of its kind is taken as it is read, without a copy.
     """
 
-    __slots__ = ("_flat", "_held", "_map", "decoded", "slots", "tile_shape")
+    __slots__ = ("_flat", "_held", "_map", "_stacks", "decoded", "slots", "tile_shape")
 
     def __init__(self, source: MapReader) -> None:
         grid, side = source.grid, source.tile_px
         self._map = source
+        self._stacks = stacked(source.layers)
         self.slots: NDArray[np.int32] = np.full((-(-grid.rows // side), -(-grid.cols // side)), -1, np.int32)
         """Which of the held tiles is the one in row i and column j; -1 where it is not held."""
         self.tile_shape = (side, side) if self.slots.size > 1 else (grid.rows, grid.cols)
         """Rows and columns of a tile."""
         self._held: OrderedDict[tuple[int, int], int] = OrderedDict()
-        self._flat: dict[str, NDArray[Any]] = {}
+        self._flat: dict[Stack, NDArray[Any]] = {
+            stack: np.empty((len(names), 0), STACKS[stack]) for stack, names in self._stacks.items()
+        }
         self.decoded: Counter[tuple[str, int, int]] = Counter()
         """How often each tile, by layer, row and column, was read."""
         self._grow(min(CACHED_TILES, self.slots.size))
 
     @property
-    def layers(self) -> tuple[NDArray[Any], ...]:
-        """Height, ortho and terrain of the held tiles, flat; empty where the map has no such layer."""
-        return tuple(self._flat.get(layer, np.empty(0, dtype)) for layer, (dtype, _) in _LAYERS.items())
+    def tiles(self) -> Tiles:
+        """The held tiles, as the sampling kernel takes them."""
+        flat = {str(stack): values.reshape(-1) for stack, values in self._flat.items()}
+        return Tiles(**flat, slots=self.slots, rows=self.tile_shape[0], cols=self.tile_shape[1])
 
     def hold(self, boxes: NDArray[np.int64]) -> None:
         """Make the tiles available that any of the boxes touches (first row and column, last row and column exclusive; (N, 4))."""
         wanted = _touched(boxes, self._map.tile_px, self.slots.shape)
-        missing = [tile for tile in wanted if tile not in self._held]
+        absent = [tile for tile in wanted if tile not in self._held]
         for tile in wanted:
             if tile in self._held:
                 self._held.move_to_end(tile)
         self._grow(len(wanted))
-        for tile in missing:
+        for tile in absent:
             if len(self._held) < self._room():
                 slot = len(self._held)
             else:
@@ -152,28 +149,30 @@ class TilePool:
             self.slots[tile] = slot
 
     def _room(self) -> int:
-        return len(self._flat["height"]) // (self.tile_shape[0] * self.tile_shape[1])
+        return int(self._flat["relative"].shape[1]) // (self.tile_shape[0] * self.tile_shape[1])
 
     def _grow(self, tiles: int) -> None:
         """Make room for so many tiles."""
         size = tiles * self.tile_shape[0] * self.tile_shape[1]
-        for layer in self._map.layers:
-            dtype, _ = _LAYERS[layer]
-            old = self._flat.get(layer, np.empty(0, dtype))
-            if old.size < size:
-                self._flat[layer] = np.empty(size, dtype)
-                self._flat[layer][: old.size] = old
+        for stack, old in self._flat.items():
+            if old.shape[1] < size:
+                self._flat[stack] = np.empty((len(old), size), old.dtype)
+                self._flat[stack][:, : old.shape[1]] = old
 
     def _read(self, tile: tuple[int, int], slot: int) -> None:
         (high, wide), grid = self.tile_shape, self._map.grid
-        for layer in self._map.layers:
-            self.decoded[layer, *tile] += 1
-            if self.slots.size == 1:
-                whole = self._map.read(layer, 0, grid.rows, 0, grid.cols)
-                self._flat[layer] = np.ascontiguousarray(whole).reshape(-1)
-            else:
-                place = self._flat[layer][slot * high * wide : (slot + 1) * high * wide]
-                self._map.read_tile(layer, *tile, place.reshape(high, wide))
+        for stack, names in self._stacks.items():
+            for row, layer in enumerate(names):
+                self.decoded[layer, *tile] += 1
+                place = self._flat[stack][row, slot * high * wide : (slot + 1) * high * wide]
+                if self.slots.size > 1:
+                    self._map.read_tile(layer, *tile, place.reshape(high, wide))
+                    continue
+                whole = np.ascontiguousarray(self._map.read(layer, 0, grid.rows, 0, grid.cols)).reshape(-1)
+                if len(names) == 1:
+                    self._flat[stack] = whole[None]
+                else:
+                    place[:] = whole
 
 
 def _touched(boxes: NDArray[np.int64], side: int, shape: tuple[int, int]) -> list[tuple[int, int]]:

@@ -58,11 +58,11 @@ def test_patches_equal_the_world(site):
     x, y = pixel_centres(segments, world.crs, gnss_crs)
     patches = sampled.patches
 
-    height = patches.height_min_m[:, None, None] + 0.0005 * patches.height
+    height = patches.height_min_m[:, None, None] + 0.0005 * patches.pixels["height"]
     bound = 0.001 + world.bilinear_bound_m(source.grid.pitch_m)
     assert np.abs(height - world.height(x, y)).max() < bound
-    assert (patches.terrain == world.terrain(x, y)).mean() > 0.995
-    assert np.abs(patches.ortho - world.grey(x, y)).max() < 1.1
+    assert (patches.pixels["terrain"] == world.terrain(x, y)).mean() > 0.995
+    assert np.abs(patches.pixels["ortho"] - world.grey(x, y)).max() < 1.1
     assert patches.valid_fraction.min() == 1.0
 
 
@@ -164,9 +164,9 @@ def test_what_is_carried_over_with_its_ground_gives_the_same_patch(tmp_path, nam
         patches.append(sampled.patches)
     one, other = patches
     side = -1 if kind == "mirror" else 1
-    assert np.abs(one.height.astype(int) - other.height[:, ::side]).max() <= 1
-    assert np.abs(one.ortho.astype(int) - other.ortho[:, ::side]).max() <= 1
-    assert (one.terrain == other.terrain[:, ::side]).mean() > 0.998
+    assert np.abs(one.pixels["height"].astype(int) - other.pixels["height"][:, ::side]).max() <= 1
+    assert np.abs(one.pixels["ortho"].astype(int) - other.pixels["ortho"][:, ::side]).max() <= 1
+    assert (one.pixels["terrain"] == other.pixels["terrain"][:, ::side]).mean() > 0.998
     np.testing.assert_allclose(other.height_min_m, one.height_min_m, atol=2e-4)
     np.testing.assert_allclose(other.slope_rad, one.slope_rad, atol=2e-5)
     np.testing.assert_allclose(other.cross_slope_rad, side * one.cross_slope_rad, atol=2e-5)
@@ -196,7 +196,7 @@ def test_layers_of_three_resolutions_and_crss_show_one_world(tmp_path):
     sampled = sample_segments(segments, source, CONFIG, gnss_crs="EPSG:4326")
     assert sampled.kept.size == 400
     x, y = pixel_centres(segments, world.crs, "EPSG:4326")
-    got = sampled.patches.height_min_m[:, None, None] + 0.0005 * sampled.patches.height
+    got = sampled.patches.height_min_m[:, None, None] + 0.0005 * sampled.patches.pixels["height"]
     assert np.abs(got - world.height(x, y)).max() < 0.001 + 2.0 * world.bilinear_bound_m(0.2)
-    assert np.abs(sampled.patches.ortho - world.grey(x, y)).max() < 1.1
-    assert (sampled.patches.terrain == world.terrain(x, y)).mean() > 0.99
+    assert np.abs(sampled.patches.pixels["ortho"] - world.grey(x, y)).max() < 1.1
+    assert (sampled.patches.pixels["terrain"] == world.terrain(x, y)).mean() > 0.99

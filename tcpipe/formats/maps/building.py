@@ -4,27 +4,38 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
-
-import numpy as np
+from typing import Any, Literal
 
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import PlaceState, atomic_directory
 from tcpipe.formats.maps.class_table import read_class_scheme
-from tcpipe.formats.maps.layer_building import Layer, RasterLayer, shards_of
+from tcpipe.formats.maps.geotiff import USES, Use
+from tcpipe.formats.maps.layer_building import LayerSource, RasterLayer, shards_of
 from tcpipe.formats.maps.map_files import SHARD_PX, MapFile, MapWriter, open_map
 from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
 from tcpipe.formats.seals import write_checksums
-from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, ClassTable, named_scheme
+from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, ClassTable, named_scheme, own_scheme
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import (
+    COLOURS,
+    PAPER_LAYERS,
+    Layer,
+    categorical_layer,
+    continuous_layer,
+    paper_layers,
+)
 from tcpipe.terrain.placement import Footing, choose_crs, choose_grid, projection_to
 from tcpipe.terrain.projection import parse_crs
 
 Files = Path | Sequence[Path]
 """One file of a layer, or all; the last lies on top."""
+
+OrthoBands = Literal["grey", "rgb"]
+
+_RGB: tuple[Use, ...] = ("red", "green", "blue")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +57,22 @@ class MapSummary:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True, slots=True)
+class MoreLayers:
+    """What a map is to have beside height, ortho and terrain."""
+
+    files: Mapping[str, Files] = field(default_factory=dict)
+    """Rasters of one band by the layer's name."""
+    categorical: Mapping[str, Path | None] = field(default_factory=dict)
+    """Those of them whose values are classes, and their class tables; None: the raster's own names say what its values mean."""
+    ortho_bands: OrthoBands = "grey"
+    """rgb: the orthophoto's colours, too."""
+
+    def uses(self) -> dict[str, Use]:
+        """Return what is taken of each layer's rasters."""
+        return {name: "classes" if name in self.categorical else "numbers" for name in self.files}
+
+
 def build_map(
     out_path: Path,
     *,
@@ -53,6 +80,7 @@ def build_map(
     height: Files,
     ortho: Files = (),
     terrain: Files = (),
+    more: MoreLayers = MoreLayers(),
     classes: Path | None = None,
     agreed: ClassScheme | None = None,
     crs: str | None = None,
@@ -72,6 +100,8 @@ def build_map(
     height, ortho, terrain
         Rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid (`mosaic`); terrain also as
         GeoJSON polygons (`terrain_polygons`).
+    more
+        Other layers, put on the grid of these three.
     classes
         Class table (CSV or TOML); None takes ``agreed``, else the paper's seven classes, and where the terrain raster names its values,
         those names say which class each is.
@@ -95,41 +125,80 @@ def build_map(
     StoreError
         The map cannot be written, or another process has put something else there.
     """
-    given = {"height": height, "ortho": ortho, "terrain": terrain}
+    given = {"height": height, "ortho": ortho, "terrain": terrain, **more.files}
     paths = {role: [files] if isinstance(files, Path) else list(files) for role, files in given.items() if files}
     drawn = paths.pop("terrain") if "terrain" in paths and is_drawn(paths["terrain"]) else []
     with ExitStack() as stack:
-        rasters = _open_all(stack, paths)
+        rasters = _open_all(stack, paths, more)
         scheme, origin = _choose_scheme(classes, agreed, rasters.get("terrain"))
+        schemes = {"terrain": scheme} | _own_schemes(more, rasters)
         wanted = parse_crs(crs, where="--crs") if crs else None
         footings = _place_all(rasters, crs)
         map_crs = choose_crs(footings["height"], wanted)
-        others = [footings[role] for role in rasters if role != "height"]
+        others = [footings[role] for role in ("ortho", "terrain") if role in footings]
         grid = choose_grid(footings["height"], others, map_crs, pitch_m)
-        layers: dict[str, Layer] = {
-            role: RasterLayer(raster, footings[role], projection_to(footings[role], map_crs), scheme)
+        layers: dict[str, LayerSource] = {
+            role: RasterLayer(
+                _layer(raster, schemes),
+                raster,
+                footings[role],
+                projection_to(footings[role], map_crs),
+                schemes.get(role),
+            )
             for role, raster in rasters.items()
         }
         if drawn:
             layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
+        kinds = {role: source.layer for role, source in layers.items()}
         with atomic_directory(out_path, instead_of=instead_of) as half:
-            writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=tuple(layers))
+            writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
             summary = _summary(out_path, name, grid, scheme.table, layers)
-            writer.finish({**_facts(summary, layers), "classes_from": origin, "inputs": dict(inputs or {})})
+            facts = {**_facts(summary, layers), "classes_from": origin, "inputs": dict(inputs or {})}
+            writer.finish(facts, {role: _ranged(source) for role, source in layers.items()})
             write_checksums(half)
             if look is not None:
                 look(open_map(half), half)
     return summary
 
 
-def _write_layers(writer: MapWriter, layers: Mapping[str, Layer], grid: MapGrid) -> None:
+def _layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
+    """Return the layer that a raster becomes; the range of numbers is not known before they are read."""
+    if raster.role in PAPER_LAYERS:
+        return paper_layers([raster.role], schemes["terrain"].table)[raster.role]
+    if raster.role in schemes:
+        return categorical_layer(raster.role, schemes[raster.role].table)
+    return continuous_layer(raster.role, unit=raster.unit, low=0.0, high=1.0)
+
+
+def _ranged(source: LayerSource) -> Layer:
+    layer = source.layer
+    return replace(layer, low=source.tally.low, high=source.tally.high) if layer.stack == "floats" else layer
+
+
+def _write_layers(writer: MapWriter, layers: Mapping[str, LayerSource], grid: MapGrid) -> None:
     for role, layer in layers.items():
         for row0, col0, rows, cols in shards_of(grid, SHARD_PX):
             shard = layer.shard(grid, row0, col0, rows, cols)
             if layer.tally.count(layer, shard):
                 writer.write(role, row0, col0, shard)
+
+
+def _own_schemes(more: MoreLayers, rasters: Mapping[str, Raster]) -> dict[str, ClassScheme]:
+    """Return the classes of the user's categorical layers: of a file, or as the raster itself names its values."""
+    schemes = {
+        name: own_scheme(rasters[name].names) if table is None else read_class_scheme(table)
+        for name, table in more.categorical.items()
+    }
+    if problems := [
+        f"{rasters[name].label}: does not say what its values mean (no attribute table, no category names); "
+        f"give a table: --categorical {name}=classes.csv"
+        for name, scheme in schemes.items()
+        if scheme is None
+    ]:
+        raise MapError(*problems)
+    return {name: scheme for name, scheme in schemes.items() if scheme is not None}
 
 
 def _choose_scheme(classes: Path | None, agreed: ClassScheme | None, terrain: Raster | None) -> tuple[ClassScheme, str]:
@@ -161,16 +230,20 @@ def _scheme_of_file(classes: Path, agreed: ClassScheme | None) -> ClassScheme:
     return scheme
 
 
-def _open_all(stack: ExitStack, paths: Mapping[str, Sequence[Path]]) -> dict[str, Raster]:
+def _open_all(stack: ExitStack, paths: Mapping[str, Sequence[Path]], more: MoreLayers) -> dict[str, Raster]:
     rasters: dict[str, Raster] = {}
     problems: list[str] = []
+    uses = {**USES, **more.uses()}
+    if more.ortho_bands == "rgb":
+        paths = {**paths, **dict.fromkeys(COLOURS, paths["ortho"])}
+        uses |= dict(zip(COLOURS, _RGB, strict=True))
     for role, files in paths.items():
         try:
-            rasters[role] = stack.enter_context(open_raster(files, role))
+            rasters[role] = stack.enter_context(open_raster(files, role, uses[role]))
         except MapError as error:
             problems += error.problems
     if problems:
-        raise MapError(*problems)
+        raise MapError(*dict.fromkeys(problems))
     return rasters
 
 
@@ -193,7 +266,7 @@ def _place_all(rasters: dict[str, Raster], crs: str | None) -> dict[str, Footing
     return footings
 
 
-def _refuse_empty(layers: Mapping[str, Layer]) -> None:
+def _refuse_empty(layers: Mapping[str, LayerSource]) -> None:
     problems = []
     for role, layer in layers.items():
         if layer.tally.pixels:
@@ -207,7 +280,7 @@ def _refuse_empty(layers: Mapping[str, Layer]) -> None:
         raise MapError(*problems)
 
 
-def _notes(layers: Mapping[str, Layer], covered: Mapping[str, float]) -> tuple[str, ...]:
+def _notes(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> tuple[str, ...]:
     notes: list[str] = []
     for role, layer in layers.items():
         notes += layer.notes()
@@ -216,9 +289,9 @@ def _notes(layers: Mapping[str, Layer], covered: Mapping[str, float]) -> tuple[s
     return tuple(notes)
 
 
-def _summary(path: Path, name: str, grid: MapGrid, classes: ClassTable, layers: Mapping[str, Layer]) -> MapSummary:
-    counts = layers["terrain"].tally.by_class if "terrain" in layers else np.zeros(256, np.int64)
-    total = max(int(counts[1:].sum()), 1)
+def _summary(
+    path: Path, name: str, grid: MapGrid, classes: ClassTable, layers: Mapping[str, LayerSource]
+) -> MapSummary:
     covered = {role: layer.tally.pixels / (grid.rows * grid.cols) for role, layer in layers.items()}
     return MapSummary(
         name=name,
@@ -229,17 +302,32 @@ def _summary(path: Path, name: str, grid: MapGrid, classes: ClassTable, layers: 
         covered=covered,
         height_min_m=layers["height"].tally.low,
         height_max_m=layers["height"].tally.high,
-        class_share={entry.name: float(counts[entry.id] / total) for entry in classes.classes if counts[entry.id]},
+        class_share=_shares(layers["terrain"], classes) if "terrain" in layers else {},
         warnings=_notes(layers, covered),
     )
 
 
-def _facts(summary: MapSummary, layers: Mapping[str, Layer]) -> dict[str, Any]:
+def _shares(source: LayerSource, classes: ClassTable) -> dict[str, float]:
+    """Return the share of each class that occurs among the pixels that have one."""
+    counts = source.tally.by_class
+    total = max(int(counts[1:].sum()), 1)
+    return {entry.name: float(counts[entry.id] / total) for entry in classes.classes if counts[entry.id]}
+
+
+def _own_shares(layers: Mapping[str, LayerSource]) -> dict[str, Any]:
+    """Return the shares of the user's categorical layers, if there are any, by name."""
+    own = {name: source for name, source in layers.items() if name not in PAPER_LAYERS}
+    found = {name: _shares(each, each.layer.classes) for name, each in own.items() if each.layer.classes is not None}
+    return {"class_shares": found} if found else {}
+
+
+def _facts(summary: MapSummary, layers: Mapping[str, LayerSource]) -> dict[str, Any]:
     return {
         "sources": {role: layer.name for role, layer in layers.items()},
         "covered": summary.covered,
         "height_min_m": summary.height_min_m,
         "height_max_m": summary.height_max_m,
         "class_share": summary.class_share,
+        **_own_shares(layers),
         "warnings": list(summary.warnings),
     }

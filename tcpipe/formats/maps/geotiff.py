@@ -3,8 +3,9 @@
 GDAL opens whatever a file's content says, also what is on another disk or another continent. So a user's file is looked at first: its
 beginning names its one driver, what lies beside it must be plain too, and of a VRT GDAL sees only what `vrt` lets through.
 
-A raster is opened *for a role* (height, ortho, terrain) and refused at once, in one line, if it cannot play it: no place on the
-earth, placed by control points only, wrong bands, wrong numbers. Pixel-is-point tags, south-up and rotated affines, scale and offset
+A raster is opened *for a role* (height, ortho, terrain, or a layer of the user's) and refused at once, in one line, if it cannot play
+it: no place on the earth, placed by control points only, wrong bands, wrong numbers.
+Pixel-is-point tags, south-up and rotated affines, scale and offset
 tags, units, palettes, alpha, mask bands, nodata tags and NaN are dealt with here; what leaves is metres, grey from 0 to 255, or raw
 class values, each with a mask.
 """
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import rasterio
@@ -36,7 +37,14 @@ from tcpipe.formats.maps.value_names import value_names
 from tcpipe.formats.maps.vrt import checked_vrt, is_vrt, root_name
 from tcpipe.terrain.layers import LUMA_RGB
 
-ROLES = ("height", "ortho", "terrain")
+Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
+"""What is taken of a raster: heights, an orthophoto or one of its colours, class values, or numbers in a unit of their own."""
+
+USES: dict[str, Use] = {"height": "metres", "ortho": "grey", "terrain": "classes"}
+"""Use by role; a colour's role is its layer."""
+
+_WEIGHTS = {"grey": LUMA_RGB, "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0)}
+"""Of red, green and blue, by use."""
 
 _METRES = {"": 1.0, "m": 1.0, "metre": 1.0, "meter": 1.0, "metres": 1.0, "meters": 1.0}
 _METRES |= {"cm": 0.01, "centimetre": 0.01, "centimeter": 0.01, "mm": 0.001, "dm": 0.1, "km": 1000.0}
@@ -107,6 +115,7 @@ class Tile:
 
     path: Path
     role: str
+    use: Use
     crs: str
     affine: tuple[float, float, float, float, float, float]
     rows: int
@@ -118,10 +127,12 @@ class Tile:
     """Names of values, from the raster attribute table or the category names; empty where there are none."""
     source: Source = field(repr=False)
     dtype: str
-    """Type of the values that are read: the file's for terrain, else float64."""
+    """Type of the values that are read: the file's for classes, else float64."""
     bands: tuple[int, ...]
     scale: tuple[float, float]
-    """Scale and offset to metres."""
+    """Scale and offset to metres, or to the numbers that are meant."""
+    unit: str
+    """Of numbers, as the file says; empty where it does not."""
     opaque: NDArray[np.bool_] | None
     """Which indices of a palette can be seen."""
 
@@ -135,7 +146,7 @@ class TilePool:
     def read(self, tile: Tile, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
         """Return a window inside a tile, and which of its pixels have data.
 
-        Values are float64 metres (height), float64 grey from 0 to 255 (ortho), or raw integers (terrain).
+        Values are float64 metres or numbers, float64 grey or colour from 0 to 255, or raw integers of classes.
 
         Raises
         ------
@@ -151,9 +162,10 @@ class TilePool:
             raise MapError(
                 f"{tile.path}: rows {row0} to {row1}, columns {col0} to {col1} cannot be read; the file is damaged: {_reason(error)}"
             ) from error
-        if tile.role == "terrain":
+        if tile.use == "classes":
             return raw[0], valid if tile.opaque is None else valid & tile.opaque[raw[0]]
-        values = _grey(dataset, tile.bands, raw) if tile.role == "ortho" else raw[0] * tile.scale[0] + tile.scale[1]
+        weights = _WEIGHTS.get(tile.use)
+        values = raw[0] * tile.scale[0] + tile.scale[1] if weights is None else _grey(dataset, tile.bands, raw, weights)
         return values, valid & np.isfinite(values)
 
     def _dataset(self, tile: Tile) -> Any:
@@ -172,10 +184,12 @@ class TilePool:
         self._open.clear()
 
 
-def _grey(dataset: Any, bands: tuple[int, ...], raw: NDArray[Any]) -> NDArray[np.float64]:
+def _grey(
+    dataset: Any, bands: tuple[int, ...], raw: NDArray[Any], weights_rgb: tuple[float, float, float]
+) -> NDArray[np.float64]:
     if dataset.colorinterp[bands[0] - 1] == ColorInterp.palette:
-        return np.asarray(_palette_grey(dataset.colormap(bands[0]))[raw[0]])
-    weights = np.array(LUMA_RGB if len(bands) == 3 else (1.0,)) * (255.0 / np.iinfo(raw.dtype).max)
+        return np.asarray(_palette_grey(dataset.colormap(bands[0]), weights_rgb)[raw[0]])
+    weights = np.array(weights_rgb if len(bands) == 3 else (1.0,)) * (255.0 / np.iinfo(raw.dtype).max)
     return np.asarray(np.tensordot(weights, raw.astype(np.float64), 1))
 
 
@@ -190,36 +204,40 @@ def tile_pool() -> Iterator[TilePool]:
             pool.close()
 
 
-def read_tile(path: Path, role: str) -> Tile:
-    """Return what a raster file is that is to play a role.
+def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
+    """Return what a raster file is that is to play a role; ``use`` is that of `USES` unless another is given.
 
     Raises
     ------
     MapError
         It is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
     """
+    use = use or USES[role]
     with rasterio.Env(**_CONFIG):
         source = _checked(path)
         with _open_as(source) as dataset:
             _refuse_unplaced(dataset, path)
-            bands, notes = _choose_bands(dataset, path, role)
-            scale, more = _scaling(dataset, path, role, bands)
-            palette = role == "terrain" and dataset.colorinterp[bands[0] - 1] == ColorInterp.palette
+            bands, notes = _choose_bands(dataset, path, role, use)
+            scale, more = _scaling(dataset, path, role, use, bands)
+            unit = (dataset.units[bands[0] - 1] or "").strip() if use == "numbers" else ""
+            palette = use == "classes" and dataset.colorinterp[bands[0] - 1] == ColorInterp.palette
             colours = ", ".join(dataset.colorinterp[band - 1].name for band in bands)
             return Tile(
                 path=path,
                 role=role,
+                use=use,
                 crs=dataset.crs.to_wkt() if dataset.crs else "",
                 affine=tuple(dataset.transform)[:6],
                 rows=dataset.height,
                 cols=dataset.width,
-                kind=f"{dataset.dtypes[bands[0] - 1]} ({colours})",
+                kind=f"{dataset.dtypes[bands[0] - 1]} ({colours}{', ' if unit else ''}{unit})",
                 warnings=(*notes, *more),
-                names=value_names(_described(dataset), bands[0]) if role == "terrain" else {},
+                names=value_names(_described(dataset), bands[0]) if use == "classes" else {},
                 source=source,
-                dtype=dataset.dtypes[bands[0] - 1] if role == "terrain" else "float64",
+                dtype=dataset.dtypes[bands[0] - 1] if use == "classes" else "float64",
                 bands=bands,
                 scale=scale,
+                unit=unit,
                 opaque=np.isfinite(_palette_grey(dataset.colormap(bands[0]))) if palette else None,
             )
 
@@ -382,12 +400,12 @@ def _refuse_unplaced(dataset: Any, path: Path) -> None:
         raise MapError(f"{path}: its georeference has pixels without area")
 
 
-def _choose_bands(dataset: Any, path: Path, role: str) -> tuple[tuple[int, ...], list[str]]:
+def _choose_bands(dataset: Any, path: Path, role: str, use: Use) -> tuple[tuple[int, ...], list[str]]:
     colours = {colour: band for band, colour in reversed(list(enumerate(dataset.colorinterp, 1)))}
     plain = [band for band, colour in enumerate(dataset.colorinterp, 1) if colour != ColorInterp.alpha]
     names = ", ".join(colour.name for colour in dataset.colorinterp)
     kinds = {np.dtype(dataset.dtypes[band - 1]) for band in plain}
-    if role == "ortho":
+    if use in _WEIGHTS:
         rgb = [colours.get(colour) for colour in (ColorInterp.red, ColorInterp.green, ColorInterp.blue)]
         palette = dataset.colorinterp[0] == ColorInterp.palette
         if not palette and any(kind not in {np.dtype(np.uint8), np.dtype(np.uint16)} for kind in kinds):
@@ -399,29 +417,34 @@ def _choose_bands(dataset: Any, path: Path, role: str) -> tuple[tuple[int, ...],
                 else []
             )
             return tuple(band for band in rgb if band is not None), more
-        if len(plain) == 1:
+        if len(plain) == 1 and (palette or use == "grey"):
             return (plain[0],), []
         if len(plain) == 3:
             return tuple(plain), [f"{path.name}: bands are not named by colour; taken as red, green, blue"]
-        raise MapError(
-            f"{path}: ortho has {dataset.count} bands ({names}), wanted grey or red, green, blue, and alpha at most"
-        )
+        wanted = "grey or red, green, blue" if use == "grey" else "red, green, blue for --ortho-bands rgb"
+        raise MapError(f"{path}: ortho has {dataset.count} bands ({names}), wanted {wanted}, and alpha at most")
     if len(plain) != 1:
         raise MapError(f"{path}: {role} has {dataset.count} bands ({names}), wanted one")
     kind = kinds.pop()
-    if role == "height" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
-        raise MapError(f"{path}: height is a palette of colours, wanted metres")
-    if role == "height" and kind.kind not in "fiu":
-        raise MapError(f"{path}: height is {kind}, wanted floating point or integer metres")
-    if role == "terrain" and kind.kind not in "iu":
-        raise MapError(f"{path}: terrain is {kind}, wanted integer class values")
+    wanted = "metres" if use == "metres" else "numbers"
+    if use != "classes" and dataset.colorinterp[plain[0] - 1] == ColorInterp.palette:
+        hint = "" if use == "metres" else f"; are they classes? add --categorical {role}"
+        raise MapError(f"{path}: {role} is a palette of colours, wanted {wanted}{hint}")
+    if use != "classes" and kind.kind not in "fiu":
+        raise MapError(f"{path}: {role} is {kind}, wanted floating point or integer {wanted}")
+    if use == "classes" and kind.kind not in "iu":
+        raise MapError(f"{path}: {role} is {kind}, wanted integer class values")
     return (plain[0],), []
 
 
-def _scaling(dataset: Any, path: Path, role: str, bands: tuple[int, ...]) -> tuple[tuple[float, float], list[str]]:
-    """Return scale and offset to metres; for other roles, a note that such tags were not applied."""
+def _scaling(
+    dataset: Any, path: Path, role: str, use: Use, bands: tuple[int, ...]
+) -> tuple[tuple[float, float], list[str]]:
+    """Return scale and offset to metres or numbers; for other uses, a note that such tags were not applied."""
     scale, offset = dataset.scales[bands[0] - 1], dataset.offsets[bands[0] - 1]
-    if role != "height":
+    if use == "numbers":
+        return (scale, offset), []
+    if use != "metres":
         tagged = (scale, offset) != (1.0, 0.0)
         return (1.0, 0.0), [
             f"{path.name}: scale {scale:g} and offset {offset:g} are not applied to {role}"
@@ -462,12 +485,14 @@ def burn_polygons(
     return np.asarray(rasterize(shapes, (rows, cols), transform=rasterio.Affine(*affine), dtype=np.uint8))
 
 
-def _palette_grey(colormap: dict[int, tuple[int, int, int, int]]) -> NDArray[np.float64]:
+def _palette_grey(
+    colormap: dict[int, tuple[int, int, int, int]], weights_rgb: tuple[float, float, float] = LUMA_RGB
+) -> NDArray[np.float64]:
     """Return grey by palette index; NaN where the palette is transparent or has no entry."""
     grey = np.full(65536, np.nan)
     for index, (red, green, blue, alpha) in colormap.items():
         if alpha >= _OPAQUE:
-            grey[index] = np.dot(LUMA_RGB, (red, green, blue))
+            grey[index] = np.dot(weights_rgb, (red, green, blue))
     return grey
 
 

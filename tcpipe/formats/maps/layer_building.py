@@ -14,6 +14,7 @@ from tcpipe.errors import MapError
 from tcpipe.formats.maps.mosaic import Raster
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import Layer
 from tcpipe.terrain.placement import LATTICE_STEP_PX, Footing, source_lattice
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.resampling_kernel import bilinear, majority, mean
@@ -38,18 +39,18 @@ class Tally:
     unnamed: set[int] = field(default_factory=set)
     unnamed_pixels: int = 0
 
-    def count(self, layer: Layer, shard: NDArray[Any]) -> bool:
+    def count(self, layer: LayerSource, shard: NDArray[Any]) -> bool:
         """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
-        if layer.role == "terrain":
+        if layer.layer.kind == "categorical":
             found = np.bincount(shard.reshape(-1), minlength=256)
             self.by_class += found
             self.pixels += int(found[1:].sum())
             return bool(found[1:].any())
-        present = shard[shard != 0] if layer.role == "ortho" else shard[np.isfinite(shard)]
+        present = shard[layer.layer.has_data(shard)]
         self.pixels += present.size
-        if layer.role == "height" and present.size:
+        if layer.layer.stack != "greys" and present.size:
             self.low, self.high = min(self.low, float(present.min())), max(self.high, float(present.max()))
-            if self.high > _HIGHEST_M or self.low < _DEEPEST_M:
+            if layer.layer.kind == "relative" and (self.high > _HIGHEST_M or self.low < _DEEPEST_M):
                 wrong = self.low if self.low < _DEEPEST_M else self.high
                 raise MapError(
                     f"{layer.label}: heights from {self.low:.6g} to {self.high:.6g} are not metres of dry land; say in the file that "
@@ -64,12 +65,12 @@ class Tally:
             self.unnamed.update(int(value) for value in np.unique(values)[: 4 * _LISTED])
 
 
-class Layer(Protocol):
+class LayerSource(Protocol):
     """What becomes a layer of a map."""
 
     @property
-    def role(self) -> str:
-        """``height``, ``ortho`` or ``terrain``."""
+    def layer(self) -> Layer:
+        """The layer that it becomes."""
 
     @property
     def label(self) -> str:
@@ -97,16 +98,13 @@ class Layer(Protocol):
 class RasterLayer:
     """A raster as a layer; ``projection`` is from its CRS to the map's, None where they are the same."""
 
+    layer: Layer
     raster: Raster
     footing: Footing
     projection: Projection | None
-    scheme: ClassScheme
+    scheme: ClassScheme | None
+    """Of a categorical layer."""
     tally: Tally = field(default_factory=Tally)
-
-    @property
-    def role(self) -> str:
-        """The raster's role."""
-        return self.raster.role
 
     @property
     def label(self) -> str:
@@ -120,21 +118,22 @@ class RasterLayer:
 
     def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
         """Resample a part of the map, block by block, so that the raster's window stays small."""
-        shard: NDArray[Any] = np.empty((rows, cols), np.uint8 if self.role == "terrain" else np.float64)
+        shard: NDArray[Any] = np.empty((rows, cols), np.uint8 if self.layer.kind == "categorical" else np.float64)
         block = self._block_px(grid, row0, col0)
         for i in range(0, rows, block):
             for j in range(0, cols, block):
                 self._fill(shard[i : i + block, j : j + block], grid, row0 + i, col0 + j)
-        if self.role == "ortho":
+        if self.layer.stack == "greys":
             return np.where(np.isfinite(shard), np.clip(np.rint(shard), 1.0, 255.0), 0.0).astype(np.uint8)
         return shard
 
     def nothing(self) -> str | None:
         """Say that none of its values is a class."""
-        if not self.tally.unnamed:
+        if not self.tally.unnamed or self.scheme is None:
             return None
+        option = "--classes" if self.layer.name == "terrain" else f"--categorical {self.layer.name}=FILE"
         named = ", ".join(str(value) for value in list(self.scheme.id_by_value)[:_LISTED])
-        return f"{self.label}: none of its values {self._unnamed()} is in the class table (which names {named}); give one with --classes"
+        return f"{self.label}: none of its values {self._unnamed()} is in the class table (which names {named}); give one with {option}"
 
     def notes(self) -> list[str]:
         """Return the raster's warnings, doubts of its datum, and values that are no class."""
@@ -162,7 +161,7 @@ class RasterLayer:
     def _fill(self, part: NDArray[Any], grid: MapGrid, row0: int, col0: int) -> None:
         """Resample one block of the map from the raster."""
         lattice = source_lattice(grid, self.footing, self.projection, row0, part.shape[0], col0, part.shape[1])
-        part[...] = 0 if self.role == "terrain" else np.nan
+        part[...] = 0 if self.layer.kind == "categorical" else np.nan
         flat = lattice.reshape(-1, 2)
         if not np.isfinite(flat).all():
             return
@@ -176,7 +175,7 @@ class RasterLayer:
         ratio = _source_px_per_px(lattice)
         lattice -= low
         parts = math.ceil(ratio) if ratio > _MEAN_FROM else 1
-        if self.role == "terrain":
+        if self.scheme is not None:
             ids = self.scheme.ids(values, valid)
             self.tally.note_unnamed(values[valid & (ids == 0)])
             majority(ids, lattice, LATTICE_STEP_PX, parts, part)

@@ -6,6 +6,9 @@ array        type     meaning
 height       float32  metres above the attribute ``add_offset``; NaN: no data
 ortho        uint8    grey from 1 to 255 (black is stored as 1); 0: no data
 terrain      uint8    class ids of the class table; 0: no data
+ortho_red …  uint8    red, green and blue of an orthophoto kept in colour, as ortho
+any other    float32  a user's continuous layer, in its own unit; NaN: no data
+any other    uint8    a user's categorical layer: class ids of its own table; 0: no data
 x, y         float64  pixel centres in the map's CRS [m]
 spatial_ref  int64    CF grid mapping: the CRS as WKT, and GDAL's GeoTransform
 ===========  =======  ==========================================================================
@@ -28,12 +31,14 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
+from tcpipe.formats.layer_descriptions import described, flags, layers_described
 from tcpipe.formats.maps.class_table import table_from_json, table_to_json
 from tcpipe.formats.seals import CHECKSUMS, prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
 from tcpipe.terrain.classes import ClassScheme, ClassTable
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import PAPER_LAYERS, Layer, missing
 from tcpipe.terrain.overviews import coarser_levels, overview_factors, overview_grid
 
 TILE_PX = 512
@@ -42,7 +47,10 @@ TILE_PX = 512
 SHARD_PX = 2048
 """Side of a shard: the unit that is a file, and that is written at once."""
 
-MAP_VERSION = "1.1"
+MAP_VERSION = "1.2"
+"""1.2: a map may have other layers than the paper's, which its key ``described`` tells of."""
+
+READ_VERSIONS = ("1.1", MAP_VERSION)
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +60,7 @@ class MapFile:
     name: str
     grid: MapGrid
     classes: ClassTable
-    layers: tuple[str, ...]
+    layers: Mapping[str, Layer]
     tile_px: int
     height_reference_m: float
     facts: Mapping[str, Any]
@@ -81,11 +89,12 @@ class MapFile:
             "layers": list(self.layers),
             "overviews": list(self.factors[1:]),
             "class_table": table_to_json(self.classes),
+            **_described(self.layers),
             **self.facts,
         }
 
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
-        """Return a window of a layer as stored: NaN (height) or 0 (ortho, terrain) where there is no data.
+        """Return a window of a layer as stored: NaN or, of bytes, 0 where there is no data.
 
         Raises
         ------
@@ -129,7 +138,7 @@ def open_map(path: Path, *, proved: bool = True) -> MapFile:
     except StoreError as error:
         raise MapError(f"{path}: not a map ({error}); add one with: tcpipe add-map") from error
     found = group.attrs.asdict().get("tcpipe_map")
-    if not isinstance(found, dict) or found.get("version") != MAP_VERSION:
+    if not isinstance(found, dict) or found.get("version") not in READ_VERSIONS:
         version = found.get("version") if isinstance(found, dict) else None
         raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
     factors = tuple(found["factors"])
@@ -139,11 +148,13 @@ def open_map(path: Path, *, proved: bool = True) -> MapFile:
         raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
     if proved:
         _prove(path)
+    classes = table_from_json(found["class_table"])
+    told = {name: found.get("described", {}).get(name, {}) for name in found["layers"]}
     return MapFile(
         name=found["name"],
         grid=MapGrid(**found["grid"]),
-        classes=table_from_json(found["class_table"]),
-        layers=tuple(found["layers"]),
+        classes=classes,
+        layers=layers_described(told, classes.classes, path),
         tile_px=found["tile_px"],
         height_reference_m=found["height_reference_m"],
         facts=found["facts"],
@@ -186,7 +197,7 @@ class MapWriter:
     __slots__ = ("_factors", "_grid", "_group", "_layers", "_levels", "_name", "_scheme", "height_reference_m")
 
     def __init__(
-        self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: tuple[str, ...]
+        self, directory: Path, *, name: str, grid: MapGrid, scheme: ClassScheme, layers: Mapping[str, Layer]
     ) -> None:
         self._name, self._grid, self._scheme, self._layers = name, grid, scheme, layers
         self._factors = overview_factors(grid)
@@ -199,20 +210,20 @@ class MapWriter:
         group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
         grid = overview_grid(self._grid, factor)
         shard_px = max(SHARD_PX // factor, TILE_PX)
-        return {layer: _add_layer(group, layer, grid, self._scheme.table, shard_px) for layer in self._layers}
+        return {name: _add_layer(group, layer, grid, shard_px) for name, layer in self._layers.items()}
 
     def write(self, layer: str, row0: int, col0: int, values: NDArray[Any]) -> None:
-        """Write a shard whose corner is at a multiple of `SHARD_PX`; heights in metres with NaN, the others bytes with 0, as no data."""
-        if layer == "height":
+        """Write a shard whose corner is at a multiple of `SHARD_PX`; floats with NaN, bytes with 0, as no data."""
+        if self._layers[layer].kind == "relative":
             if self.height_reference_m is None and np.isfinite(values).any():
                 self.height_reference_m = float(np.floor(np.nanmin(values)))
             values = values - (self.height_reference_m or 0.0)
         _put(self._levels[1][layer], row0, col0, values)
-        for factor, level in coarser_levels(layer, values, self._factors):
+        for factor, level in coarser_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
 
-    def finish(self, facts: Mapping[str, Any]) -> None:
-        """Write coordinates and attributes."""
+    def finish(self, facts: Mapping[str, Any], layers: Mapping[str, Layer]) -> None:
+        """Write coordinates and attributes; ``layers`` are those of the beginning, with the range that was found."""
         reference_m = self.height_reference_m or 0.0
         for factor, arrays in self._levels.items():
             arrays["height"].attrs.update({"add_offset": reference_m})
@@ -230,7 +241,8 @@ class MapWriter:
                     "grid": {field: getattr(self._grid, field) for field in MapGrid.__slots__},
                     "class_table": table_to_json(self._scheme.table),
                     "id_by_value": {str(value): class_id for value, class_id in self._scheme.id_by_value.items()},
-                    "layers": list(self._layers),
+                    "layers": list(layers),
+                    **_described(layers),
                     "factors": list(self._factors),
                     "tile_px": TILE_PX,
                     "height_reference_m": reference_m,
@@ -276,27 +288,32 @@ def _place(group: Any, grid: MapGrid, title: str) -> None:
     )
 
 
-def _add_layer(group: Any, layer: str, grid: MapGrid, classes: ClassTable, shard_px: int) -> Any:
-    attributes: dict[str, dict[str, Any]] = {
-        "height": {"long_name": "height of the ground", "units": "m", "scale_factor": 1.0},
-        "ortho": {"long_name": "grey of the orthophoto", "units": "1", "scale_factor": 1.0 / 255.0, "_FillValue": 0},
-        "terrain": {
-            "long_name": "terrain class",
-            "flag_values": [entry.id for entry in classes.classes],
-            "flag_meanings": " ".join(entry.name.replace(" ", "_") for entry in classes.classes),
-            "_FillValue": 0,
-        },
-    }
+_LONG_NAMES = {"height": "height of the ground", "ortho": "grey of the orthophoto", "terrain": "terrain class"}
+
+
+def _described(layers: Mapping[str, Layer]) -> dict[str, Any]:
+    """Return what the names of layers alone do not tell, if there is anything, under ``described``."""
+    found = {name: described(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
+    return {"described": found} if found else {}
+
+
+def _add_layer(group: Any, layer: Layer, grid: MapGrid, shard_px: int) -> Any:
+    attributes: dict[str, Any] = {"long_name": _LONG_NAMES.get(layer.name, layer.long_name)}
+    if layer.kind == "categorical":
+        attributes |= {**flags(layer.classes), "_FillValue": 0}
+    else:
+        attributes |= {"units": layer.unit, "scale_factor": layer.step if layer.stack == "greys" else 1.0}
+        attributes |= {"_FillValue": 0} if layer.stack == "greys" else {}
     return add_array(
         group,
-        layer,
+        layer.name,
         shape=(grid.rows, grid.cols),
-        dtype=np.float32 if layer == "height" else np.uint8,
+        dtype=layer.mapped,
         chunks=(TILE_PX, TILE_PX),
         shards=(shard_px, shard_px),
         dimensions=("y", "x"),
-        fill_value=float("nan") if layer == "height" else 0,
-        attributes={**attributes[layer], "grid_mapping": "spatial_ref"},
+        fill_value=missing(layer.mapped),
+        attributes={**attributes, "grid_mapping": "spatial_ref"},
     )
 
 

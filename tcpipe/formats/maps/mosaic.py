@@ -19,7 +19,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.geotiff import Tile, TilePool, read_tile, tile_pool
+from tcpipe.formats.maps.geotiff import Tile, TilePool, Use, read_tile, tile_pool
 
 MAX_FILES = 100_000
 """Of one layer."""
@@ -37,6 +37,7 @@ class Raster:
     label: str
     """What it is called in a message: the path, and how many more there are."""
     role: str
+    unit: str
     crs: str
     affine: tuple[float, float, float, float, float, float]
     rows: int
@@ -72,8 +73,8 @@ class Raster:
 
 
 @contextmanager
-def open_raster(paths: Sequence[Path], role: str) -> Iterator[Raster]:
-    """Open the tiles of a role, in the order in which they are laid, the last on top.
+def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Iterator[Raster]:
+    """Open the tiles of a role, in the order in which they are laid, the last on top; ``use`` as `read_tile`.
 
     Raises
     ------
@@ -88,7 +89,7 @@ def open_raster(paths: Sequence[Path], role: str) -> Iterator[Raster]:
     problems: list[str] = []
     for path in paths:
         try:
-            tiles.append(read_tile(path, role))
+            tiles.append(read_tile(path, role, use))
         except MapError as error:
             problems += error.problems
     if problems:
@@ -100,6 +101,7 @@ def open_raster(paths: Sequence[Path], role: str) -> Iterator[Raster]:
         yield Raster(
             label=_label(paths),
             role=role,
+            unit=tiles[0].unit,
             crs=tiles[0].crs,
             affine=affine,
             rows=int(corners[:, 1].max()),

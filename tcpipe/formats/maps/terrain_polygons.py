@@ -23,6 +23,7 @@ from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
 from tcpipe.terrain.classes import ClassScheme, name_key
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import Layer, paper_layers
 from tcpipe.terrain.projection import Projection, area_of
 
 PROPERTY = "class"
@@ -52,6 +53,7 @@ _DETAILED = 10_000
 class PolygonLayer:
     """Polygons as the terrain layer: in the map's CRS, in the order they are drawn, with their class ids."""
 
+    layer: Layer
     label: str
     name: str
     polygons: NDArray[np.object_]
@@ -59,11 +61,6 @@ class PolygonLayer:
     warnings: tuple[str, ...]
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
-
-    @property
-    def role(self) -> str:
-        """Always ``terrain``."""
-        return "terrain"
 
     def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
         """Return class ids of a part of the map, shape (rows, cols); 0 where no polygon is."""
@@ -133,7 +130,8 @@ def place_polygons(
     doubt = projection.doubt()
     warnings = [f"{name}: {doubt}; its polygons may be off by that"] if doubt else []
     warnings += _overlaps(name, polygons, id_of_each, scheme)
-    return PolygonLayer(label, name, polygons, id_of_each, tuple(warnings), shapely.STRtree(polygons))
+    terrain = paper_layers(["terrain"], scheme.table)["terrain"]
+    return PolygonLayer(terrain, label, name, polygons, id_of_each, tuple(warnings), shapely.STRtree(polygons))
 
 
 def _read_all(paths: Sequence[Path]) -> tuple[list[PolygonFeature], list[str]]:

@@ -256,15 +256,15 @@ def _build(
     jobs: int,
 ) -> dict[str, Any]:
     """Write the dataset into ``directory`` and return its card."""
-    spool = directory / "spool"
-    spool.mkdir()
-    content = gather_content(spool, inputs, recipe, regions, earlier, jobs=jobs)
+    waiting = directory / "spool"
+    waiting.mkdir()
+    content = gather_content(waiting, inputs, recipe, regions, earlier, jobs=jobs)
     logger.info("writing %d samples", len(content.samples))
     with parquet_rows(directory / SAMPLES, SAMPLES_SCHEMA.arrow()) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):
             write(piece)
     shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
-    shutil.rmtree(spool)
+    shutil.rmtree(waiting)
     write_overview(directory / OVERVIEW, maps_overview(content.sources))
     balance = measure_balance(
         read_samples(directory, BALANCE_COLUMNS),
@@ -277,12 +277,13 @@ def _build(
     )
     write_json(directory / DRIVE_NEXT, balance.drive_next)
     files = file_checksums(directory)
-    patches = {layer.name: content.spool.patch_px**2 for layer in content.layers} if file_format == "parquet" else None
+    spool = content.spool
+    patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
     write_json(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches))
     facts = CardFacts(
         inputs=inputs.digest,
         file_format=file_format,
-        layers=content.layers,
+        layers=spool.layers,
         classes=content.sources[0].classes,
         region=None if regions is None else regions_to_json(regions),
         buffer_m=content.drawn.buffer_m,
@@ -314,7 +315,7 @@ def _write_patches(
 ) -> list[dict[str, Any]]:
     """Write the layers; return the shards, where the format has any."""
     samples, spool = content.samples, content.spool
-    pixels = Pixels(content.layers, spool.patch_px, samples.slots(), spool.read)
+    pixels = Pixels(spool.layers, spool.patch_px, samples.slots(), spool.read)
     if file_format == "parquet":
         return write_patches_parquet(directory, pixels, samples.take, samples.splits())
     write_patches_zarr(directory, pixels, samples.ids, compression=compression, threads=threads)
@@ -322,7 +323,7 @@ def _write_patches(
 
 
 def _croissant(
-    files: Mapping[str, tuple[int, str]], recipe: Recipe, inputs: str, patches: Mapping[str, int] | None
+    files: Mapping[str, tuple[int, str]], recipe: Recipe, inputs: str, patches: Mapping[str, tuple[int, str]] | None
 ) -> dict[str, Any]:
     about = recipe.dataset
     return croissant(

@@ -13,7 +13,8 @@ import pyarrow.compute as pc
 
 from tcpipe import __version__
 from tcpipe.cost.budget import pooled
-from tcpipe.formats.dataset_files import KIND, FileFormat, Layer
+from tcpipe.formats.dataset_files import KIND, FileFormat
+from tcpipe.formats.layer_descriptions import described
 from tcpipe.formats.maps.class_table import table_to_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.recipe_toml import plain_recipe
@@ -22,6 +23,7 @@ from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.layers import LAYERS, Layer
 
 VELOCITY_COLUMN = {"ground": "velocity_mps", "fused": "fused_velocity_mps"}
 """Column of samples.parquet that each choice of ``label.velocity`` trains on."""
@@ -39,7 +41,7 @@ class CardFacts:
     inputs: str
     """Hash of everything the dataset is made from; the same inputs make the same dataset."""
     file_format: FileFormat
-    layers: Sequence[Layer]
+    layers: Mapping[str, Layer]
     classes: ClassTable
     region: Mapping[str, Any] | None
     buffer_m: float
@@ -59,7 +61,7 @@ class CardFacts:
 
 def dataset_card(samples: pa.Table, recipe: Recipe, facts: CardFacts) -> dict[str, Any]:
     """Return the card as JSON values; ``samples`` has the `CARD_COLUMNS` of every sample."""
-    about, has_terrain = recipe.dataset, any(layer.name == "terrain" for layer in facts.layers)
+    about, has_terrain = recipe.dataset, "terrain" in facts.layers
     return {
         "kind": KIND,
         "data_model_version": DATA_MODEL_VERSION,
@@ -74,15 +76,13 @@ def dataset_card(samples: pa.Table, recipe: Recipe, facts: CardFacts) -> dict[st
         "format": facts.file_format,
         "patch_m": recipe.sample.patch_m,
         "patch_px": recipe.sample.patch_px,
-        "layers": {
-            layer.name: {"dtype": np.dtype(layer.dtype).name, "nodata": layer.nodata, **layer.attributes}
-            for layer in facts.layers
-        },
+        "layers": {name: described(layer) for name, layer in facts.layers.items()},
         "tensor": {
-            "channels": [layer.name for layer in facts.layers],
+            "channels": [name for name in LAYERS if name in facts.layers],
             "ortho": "O / 255",
             "terrain": f"(C - 1) / ({facts.classes.count} - 1)",
             "height": "min((H - min H) / 1 m, 1)",
+            **{name: _formula(layer) for name, layer in facts.layers.items() if name not in LAYERS},
         },
         "classes": table_to_json(facts.classes) if has_terrain else [],
         "label": {
@@ -109,6 +109,13 @@ def dataset_card(samples: pa.Table, recipe: Recipe, facts: CardFacts) -> dict[st
             path: {"size_bytes": size_bytes, "sha256": sha256} for path, (size_bytes, sha256) in facts.checksums.items()
         },
     }
+
+
+def _formula(layer: Layer) -> str:
+    """Return what becomes of a layer that is not the paper's where it is asked for in the tensor."""
+    if layer.kind == "categorical":
+        return f"(C - 1) / ({layer.high:g} - 1)"
+    return "O / 255" if layer.stack == "greys" else f"(X - {layer.low!r}) / ({layer.high!r} - {layer.low!r})"
 
 
 def measured(samples: pa.Table, *, has_terrain: bool) -> dict[str, Any]:

@@ -13,18 +13,18 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_files import Layer, layers_of
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
 from tcpipe.pipeline.dataset.removal import Removal, removed_by_ground
-from tcpipe.pipeline.dataset.sampling import PatchTable, Spool, sample_all_segments
+from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
 from tcpipe.pipeline.dataset.segments import move_out, pool_segments
 from tcpipe.pipeline.dataset.splitting import Drawn, draw_splits
 from tcpipe.recipe import Recipe
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment
 from tcpipe.splits.ranking import order_ranks
 from tcpipe.splits.regions import Regions
+from tcpipe.stages.sample import Sampled, metres_lost
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import SAMPLES
@@ -37,11 +37,13 @@ logger = logging.getLogger("tcpipe")
 class SampleTable:
     """The samples in the dataset's order, made piece by piece: their segments are mapped from a file, not held.
 
-    Row i is patch ``patch[i]`` of the patches, which is segment ``patches.segment[patch[i]]``; ``assigned`` is in the patches' order.
+    Row i is patch ``patch[i]`` of ``sampled``, whose pixels wait in ``slot`` of the spool; ``assigned`` is in the patches' order.
     """
 
     segments: pa.Table
-    patches: PatchTable
+    sampled: Sampled
+    slot: NDArray[np.int64]
+    has_terrain: bool
     assigned: Assignment
     map_names: tuple[str, ...]
     class_names: NDArray[np.str_]
@@ -54,23 +56,19 @@ class SampleTable:
     def take(self, rows: NDArray[np.int64]) -> pa.Table:
         """Return rows of the samples table (schema SAMPLES)."""
         at = self.patch[rows]
-        segments = self.segments.take(pa.array(self.patches.segment[at]))
-        columns: dict[str, Any] = {name: values[at] for name, values in self.patches.columns.items()}
-        if "terrain_class" in columns:
-            columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
-        absent = {
-            column.name: pa.nulls(len(at), column.dtype)
-            for column in SAMPLES.columns
-            if column.name.startswith("terrain") and column.name not in columns
-        }
+        segments = self.segments.take(pa.array(self.sampled.kept[at]))
+        columns: dict[str, Any] = {name: values[at] for name, values in self.sampled.patches.columns().items()}
+        columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
+        if not self.has_terrain:
+            of_terrain = (column for column in SAMPLES.columns if column.name.startswith("terrain"))
+            columns |= {column.name: pa.nulls(len(at), column.dtype) for column in of_terrain}
         return SAMPLES.table(
             sample_id=segments.column("segment_id"),
             split=self.assigned.split[at].tolist(),
             fold=pa.array(self.assigned.fold[at], pa.int8(), mask=self.assigned.fold[at] == NO_FOLD),
-            map=[self.map_names[index] for index in self.patches.map_index[at]],
+            map=[self.map_names[index] for index in self.sampled.map_index[at]],
             **{name: segments.column(name) for name in segments.column_names if name in SAMPLES.names()},
             **columns,
-            **absent,
         )
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
@@ -80,13 +78,13 @@ class SampleTable:
 
     def ids(self, first: int, last: int) -> list[str]:
         """Return the ids of rows ``first:last``."""
-        rows = pa.array(self.patches.segment[self.patch[first:last]])
+        rows = pa.array(self.sampled.kept[self.patch[first:last]])
         found: list[str] = self.segments.column("segment_id").take(rows).to_pylist()
         return found
 
     def centres_xy_m(self) -> NDArray[np.float64]:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""
-        centres: NDArray[np.float64] = self.patches.footprint_xy_m[self.patch].mean(axis=1)
+        centres: NDArray[np.float64] = self.sampled.footprint_xy_m[self.patch].mean(axis=1)
         return centres
 
     def splits(self) -> NDArray[np.str_]:
@@ -95,7 +93,7 @@ class SampleTable:
 
     def slots(self) -> NDArray[np.int64]:
         """Return where the pixels of every sample wait in the spool, shape (N,)."""
-        return self.patches.slot[self.patch]
+        return self.slot[self.patch]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +101,8 @@ class Content:
     """Samples in the dataset's order, what their layers mean, and where every metre went."""
 
     samples: SampleTable
-    layers: Sequence[Layer]
+    spool: Spool
+    """Where the pixels wait, and what the layers mean."""
     sources: tuple[MapFile, ...]
     drawn: Drawn
     ledger_m: Mapping[str, float]
@@ -112,11 +111,6 @@ class Content:
     removal: Removal
     """What of each class and slope is in samples."""
     warnings: tuple[str, ...]
-
-    @property
-    def spool(self) -> Spool:
-        """Where the pixels wait."""
-        return self.samples.patches.spool
 
 
 def gather_content(
@@ -134,36 +128,44 @@ def gather_content(
     logger.info("sampling %d segments of %d runs", pool.segments.num_rows, len(inputs.runs))
     ranks = _ranks(pool.segments, seed=recipe.split.seed)
     gnss_crs = recipe.read.gnss_crs
-    patches = sample_all_segments(
+    sampled, slot, spool = sample_all_segments(
         pool.segments, ranks, inputs.map_paths, recipe.sample, gnss_crs=gnss_crs, directory=directory, jobs=jobs
     )
     sources = tuple(open_map(path) for path in inputs.map_paths)
-    if len(patches.segment) == 0:
-        raise DatasetError(_nothing_sampled(pool.segments, patches, sources))
-    drawn = draw_splits(pool.segments, patches, sources[0].grid, regions, recipe, earlier=earlier)
+    lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)
+    if len(sampled.kept) == 0:
+        raise DatasetError(_nothing_sampled(pool.segments, lost_m, sources))
+    drawn = draw_splits(pool.segments, sampled, sources[0].grid, regions, recipe, earlier=earlier)
     split = drawn.assigned.split
-    arc_m = floats(pool.segments, "arc_length_m")[patches.segment]
+    arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
     unused_m = {
         Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(),
         Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum(),
     }
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     off = [line for _, lines in registered for line in lines]
-    in_use = patches.segment[(split != "buffer") & (split != EXCLUDED)]
+    in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
     removal = removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
-    order = kept[np.argsort(ranks[patches.segment[kept]], kind="stable")]
+    order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
     return Content(
         samples=SampleTable(
-            pool.segments, patches, drawn.assigned, inputs.map_names, sources[0].classes.names(), order
+            pool.segments,
+            sampled,
+            slot,
+            "terrain" in spool.layers,
+            drawn.assigned,
+            inputs.map_names,
+            sources[0].classes.names(),
+            order,
         ),
-        layers=layers_of(patches.spool.layers, sources[0].classes),
+        spool=spool,
         sources=sources,
         drawn=drawn,
-        ledger_m=move_out(pool.ledger_m, {**patches.lost_m, **unused_m}),
+        ledger_m=move_out(pool.ledger_m, {**lost_m, **unused_m}),
         registrations=[found for found, _ in registered],
         removal=removal,
-        warnings=(*inputs.warnings, *pool.warnings, *off, *patches.warnings, *removal.warnings),
+        warnings=(*inputs.warnings, *pool.warnings, *off, *sampled.warnings, *removal.warnings),
     )
 
 
@@ -180,9 +182,9 @@ def _ranks(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:
     return ranks
 
 
-def _nothing_sampled(segments: pa.Table, patches: PatchTable, sources: Sequence[MapFile]) -> str:
+def _nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], sources: Sequence[MapFile]) -> str:
     """Say where the segments went instead, and where maps and runs lie."""
-    lost = sorted(((metres, name_of(loss)) for loss, metres in patches.lost_m.items() if metres > 0.0), reverse=True)
+    lost = sorted(((metres, name_of(loss)) for loss, metres in lost_m.items() if metres > 0.0), reverse=True)
     where = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for metres, name in lost)
     lon, lat = (float(np.mean(floats(segments, f"start_{axis}_deg"))) for axis in ("lon", "lat"))
     names = f"map{'s' if len(sources) > 1 else ''} {', '.join(source.name for source in sources)}"

@@ -2,30 +2,27 @@
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, overload
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyproj import CRS
 
-from tcpipe.errors import DatasetError, MapError, TcpipeError
+from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled
 from tcpipe.stages.sample_maps import check_alike, sample_on_maps
-from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import PLACED_SEGMENTS
-from tcpipe.terrain.layers import LAYERS
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.layers import Layer, in_order, joint
+from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.sampling_kernel import morton
 from tcpipe.terrain.tiles import TilePool, level_for
 
@@ -38,12 +35,10 @@ _BUCKET_ROWS = 16_384
 _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that a map tile is decoded for few of them."""
 
-_XY, _LONLAT, _MAP = "footprint_xy_m", "footprint_lonlat_deg", "map_index"
+_PLACING = ("map_index", "footprint_xy_m", "footprint_lonlat_deg")
 
 _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
-
-_LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +51,7 @@ class Spool:
     """
 
     directory: Path
-    layers: tuple[str, ...]
+    layers: Mapping[str, Layer]
     slots: int
     patch_px: int
 
@@ -79,36 +74,13 @@ class Spool:
     def read(self, layer: str, slots: NDArray[np.int64]) -> NDArray[Any]:
         """Return the patches in ``slots``, shape (n, px, px); the file is mapped only while they are copied."""
         shape = (self.slots, self.patch_px, self.patch_px)
-        return np.asarray(np.memmap(self._path(layer), _dtype(layer), "r", shape=shape)[slots])
+        return np.asarray(np.memmap(self._path(layer), self.layers[layer].stored, "r", shape=shape)[slots])
 
     def _path(self, layer: str) -> Path:
         return self.directory / layer
 
     def _slot_bytes(self, layer: str) -> int:
-        return self.patch_px**2 * np.dtype(_dtype(layer)).itemsize
-
-
-def _dtype(layer: str) -> type[np.unsignedinteger[Any]]:
-    return np.uint16 if layer == "height" else np.uint8
-
-
-@dataclass(frozen=True, slots=True)
-class PatchTable:
-    """Patches of N of M segments: what each says of its patch, (N,), footprints, (N, 4, 2), and where its pixels wait.
-
-    ``segment`` are the rows of the segments table, rising; ``slot`` those of the spool; ``map_index`` says which map each lies on.
-    ``footprint_xy_m`` is in the CRS of the first map [m].
-    """
-
-    segment: NDArray[np.int64]
-    slot: NDArray[np.int64]
-    map_index: NDArray[np.uint8]
-    columns: Mapping[str, NDArray[Any]]
-    footprint_xy_m: NDArray[np.float64]
-    footprint_lonlat_deg: NDArray[np.float64]
-    spool: Spool
-    lost_m: Mapping[Loss, float]
-    warnings: tuple[str, ...]
+        return self.patch_px**2 * self.layers[layer].stored.itemsize
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,16 +133,6 @@ class _Batches(Sequence[_Batch]):
         return _Batch(rows, self.slot_of[rows], segments, self.map_paths, self.config, self.gnss_crs, self.spool)
 
 
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """A batch's result without its pixels, which are in the spool."""
-
-    segment: NDArray[np.int64]
-    columns: Mapping[str, NDArray[Any]]
-    ledger_m: Mapping[str, float]
-    warnings: tuple[str, ...]
-
-
 def sample_all_segments(
     segments: pa.Table,
     ranks: NDArray[np.uint64],
@@ -180,8 +142,10 @@ def sample_all_segments(
     gnss_crs: str,
     directory: Path,
     jobs: int,
-) -> PatchTable:
-    """Sample every segment from the first map that has data for it; pixels go to files in ``directory``.
+) -> tuple[Sampled, NDArray[np.int64], Spool]:
+    """Sample every segment from the first map that has data for it; pixels go to files in ``directory``, the rest is returned.
+
+    Beside it, in the order of its ``kept``, which rises: the slots of the spool.
 
     Parameters
     ----------
@@ -204,44 +168,40 @@ def sample_all_segments(
     """
     sources = [open_map(path) for path in map_paths]
     check_alike(sources)
-    layers = tuple(layer for layer in LAYERS if layer in sources[0].layers)
-    spool = Spool(directory, layers, segments.num_rows, config.patch_px)
-    spool.create()
     rows = list(_batch_rows(segments))
+    spool = Spool(directory, in_order(joint([source.layers for source in sources])), segments.num_rows, config.patch_px)
+    spool.create()
     placed = segments.select(PLACED_SEGMENTS.names())
     batches = _Batches(rows, _slots(rows, ranks), placed, map_paths, config, gnss_crs, spool)
-    kept = np.zeros(segments.num_rows, np.bool_)
+    lost_by = np.zeros(segments.num_rows, np.uint32)
     columns: dict[str, NDArray[Any]] = {}
-    parts: dict[int, _Part] = {}
+    warnings: dict[int, tuple[str, ...]] = {}
     try:
         with closing(run_all(_sample_batch, batches, jobs=jobs)) as outcomes:
             for outcome in outcomes:
                 part = _sound(outcome.result)
-                kept[part.segment] = True
-                for name, values in part.columns.items():
-                    whole = columns.setdefault(name, np.zeros((len(kept), *values.shape[1:]), values.dtype))
-                    whole[part.segment] = values
-                parts[outcome.index] = replace(part, columns={})
+                lost_by[rows[outcome.index]] = part.lost_by
+                warnings[outcome.index] = part.warnings
+                for name, values in _columns(part).items():
+                    whole = columns.setdefault(name, np.zeros((len(lost_by), *values.shape[1:]), values.dtype))
+                    whole[rows[outcome.index][part.kept]] = values
     finally:
         _held.clear()
-    ended = [parts[index] for index in sorted(parts)]
-    segment = np.flatnonzero(kept)
+    kept = np.flatnonzero(lost_by == 0)
     for name in columns:
-        columns[name] = columns[name][segment]
-    return PatchTable(
-        segment=segment,
-        slot=batches.slot_of[segment],
-        map_index=columns.pop(_MAP, np.empty(0, np.uint8)),
-        footprint_xy_m=columns.pop(_XY, np.empty((0, 4, 2))),
-        footprint_lonlat_deg=columns.pop(_LONLAT, np.empty((0, 4, 2))),
-        columns=columns,
-        spool=spool,
-        lost_m={loss: math.fsum(part.ledger_m.get(name_of(loss), 0.0) for part in ended) for loss in _LOSSES},
-        warnings=tuple(dict.fromkeys(warning for part in ended for warning in part.warnings)),
-    )
+        columns[name] = columns[name][kept]
+    said = dict.fromkeys(warning for index in sorted(warnings) for warning in warnings[index])
+    placing = {name: columns.pop(name) for name in _PLACING}
+    sampled = Sampled(kept=kept, patches=Patches({}, **columns), lost_by=lost_by, warnings=tuple(said), **placing)
+    return sampled, batches.slot_of[kept], spool
 
 
-def _sound(part: _Part | TcpipeError | None) -> _Part:
+def _columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
+    """Return what is said of the patches, an array each."""
+    return {**sampled.patches.columns(), **{name: getattr(sampled, name) for name in _PLACING}}
+
+
+def _sound(part: Sampled | TcpipeError | None) -> Sampled:
     """Return what a batch gave; raise what was wrong with it."""
     if part is None:
         raise DatasetError("a worker process died while sampling (killed, or out of memory); try fewer --jobs")
@@ -268,27 +228,17 @@ def _slots(batches: Sequence[NDArray[np.int64]], ranks: NDArray[np.uint64]) -> N
     return slots
 
 
-def _sample_batch(batch: _Batch) -> _Part | TcpipeError:
+def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     """Sample one batch; its pixels go to its slots of the spool."""
     try:
         held = [_held_map(path, batch.config) for path in batch.map_paths]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
-        parts = [
-            {
-                **_columns(part),
-                _XY: _in_first_plane(part, source, sources[0]),
-                _MAP: np.full(len(rows), number, np.uint8),
-            }
-            for number, (rows, part, source) in enumerate(zip(sampled.rows, sampled.sampled, sources, strict=True))
-        ]
     except TcpipeError as error:
         return error
-    for rows, part in zip(sampled.rows, sampled.sampled, strict=True):
-        for layer in batch.spool.layers:
-            batch.spool.write(layer, batch.slots[rows], getattr(part.patches, layer))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    return _Part(batch.rows[np.concatenate(sampled.rows)], columns, sampled.ledger_m, sampled.warnings)
+    for layer in batch.spool.layers:
+        batch.spool.write(layer, batch.slots[sampled.kept], sampled.patches.pixels[layer])
+    return replace(sampled, patches=replace(sampled.patches, pixels={}))
 
 
 def _held_map(path: Path, config: SampleConfig) -> _HeldMap:
@@ -301,26 +251,3 @@ def _held_map(path: Path, config: SampleConfig) -> _HeldMap:
     if len(_held) > _HELD_MAPS:
         _held.popitem(last=False)
     return held
-
-
-def _in_first_plane(sampled: Sampled, source: MapFile, first: MapFile) -> NDArray[np.float64]:
-    """Return footprints in the CRS of the first map [m], in which splits are drawn and distances measured."""
-    if source.grid.crs == first.grid.crs:
-        return sampled.footprint_xy_m
-    crs = parse_crs(first.grid.crs, where=f"map {first.name}")
-    placed = Projection(CRS.from_epsg(4326), crs, area_of(crs, first.grid.bounds_m)).forward(
-        sampled.footprint_lonlat_deg
-    )
-    if not np.isfinite(placed).all():
-        raise MapError(f"map {source.name}: lies too far from map {first.name} for one dataset; build one from each")
-    return placed
-
-
-def _columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
-    """Return what the patches say of themselves, one array a column of samples.parquet, and their footprints."""
-    patches = sampled.patches
-    found = {entry.name: getattr(patches, entry.name) for entry in fields(patches)}
-    columns = {name: values for name, values in found.items() if name not in (*LAYERS, "index")}
-    if patches.terrain is None:
-        columns = {name: values for name, values in columns.items() if not name.startswith("terrain")}
-    return {**columns, _LONLAT: sampled.footprint_lonlat_deg}

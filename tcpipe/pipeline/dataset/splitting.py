@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import DatasetError
-from tcpipe.pipeline.dataset.sampling import PatchTable
 from tcpipe.recipe import Recipe
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
 from tcpipe.splits.audit import HeldOut, audit_leakage
 from tcpipe.splits.ranking import hash_ranks
 from tcpipe.splits.regions import Regions, project_regions
+from tcpipe.stages.sample import Sampled
 from tcpipe.tables.columns import integers
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
@@ -42,7 +42,7 @@ class Drawn:
 
 def draw_splits(
     segments: pa.Table,
-    patches: PatchTable,
+    sampled: Sampled,
     grid: MapGrid,
     regions: Regions | None,
     recipe: Recipe,
@@ -55,8 +55,8 @@ def draw_splits(
     ----------
     segments
         All segments that were sampled.
-    patches
-        Their patches.
+    sampled
+        What became of them.
     grid
         The map's grid, for its CRS.
     regions
@@ -76,15 +76,15 @@ def draw_splits(
     buffer_m = math.sqrt(2.0) * chord_m if rules.buffer_m is None else rules.buffer_m
     starts_ns = integers(segments, "start_ns")
     run, run_names = _runs(segments, starts_ns)
-    run, starts_ns = run[patches.segment], starts_ns[patches.segment]
-    ids = segments.column("segment_id").take(pa.array(patches.segment))
+    run, starts_ns = run[sampled.kept], starts_ns[sampled.kept]
+    ids = segments.column("segment_id").take(pa.array(sampled.kept))
     kept = None if earlier is None else _kept(ids, earlier)
     assigned = assign_splits(
         np.concatenate([hash_ranks(part.to_pylist(), seed=rules.seed, purpose="test") for part in ids.chunks]),
         run,
         run_names,
-        patches.footprint_xy_m,
-        None if regions is None else _in_plane(regions, grid, patches.footprint_lonlat_deg),
+        sampled.footprint_xy_m,
+        None if regions is None else _in_plane(regions, grid, sampled.footprint_lonlat_deg),
         holdout=rules.holdout,
         test_fraction=rules.test_fraction,
         block_m=rules.block_m,
@@ -95,8 +95,8 @@ def draw_splits(
     )
     split = assigned.split
     if regions is not None and not np.isin(split, ("train", "test")).any():
-        raise DatasetError(_nothing_inside(regions, patches.footprint_lonlat_deg, split))
-    audit = audit_leakage(split, run, starts_ns, patches.footprint_xy_m, chord_m=chord_m)
+        raise DatasetError(_nothing_inside(regions, sampled.footprint_lonlat_deg, split))
+    audit = audit_leakage(split, run, starts_ns, sampled.footprint_xy_m, chord_m=chord_m)
     counts = None
     if kept is not None and earlier is not None:
         found = int((kept.split != "").sum())

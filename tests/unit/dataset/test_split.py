@@ -12,7 +12,8 @@ from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.terrain.layers import LAYERS, paper_tensor
+from tcpipe.terrain.classes import ClassTable, TerrainClass
+from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, paper_layers
 
 
 @pytest.fixture(scope="module")
@@ -224,10 +225,16 @@ def test_every_stored_value_becomes_what_the_layers_say(count):
         "height": np.arange(65536, dtype=np.uint16).reshape(-1, 16, 16),
     }
     rows, mirrored = rng.permutation(256), rng.random(256) < 0.5
-    wanted = paper_tensor(*(pixels[layer] for layer in LAYERS), count)[rows]
+    one = np.float32
+    grey = pixels["ortho"].astype(one) / one(255)
+    classes = np.maximum(pixels["terrain"].astype(one) - one(1), one(0)) / one(max(count - 1, 1))
+    heights = np.minimum(pixels["height"].astype(one) * one(0.0005), one(1))
+    heights[pixels["height"] == 65535] = 0
+    wanted = np.stack([grey, classes, heights], axis=-1)[rows]
     wanted[mirrored] = wanted[mirrored, ::-1]
-    np.testing.assert_array_equal(tensor_form(LAYERS, LAYERS, count).form(pixels, rows, mirrored), wanted)
-    apart = tensor_form(("height", "ortho", "terrain"), LAYERS, count).form(pixels, rows, mirrored)
+    known = paper_layers(LAYERS, ClassTable((TerrainClass(count, "last", traversable=True),)))
+    np.testing.assert_array_equal(tensor_form(LAYERS, known).form(pixels, rows, mirrored), wanted)
+    apart = tensor_form(("height", "ortho", "terrain"), known).form(pixels, rows, mirrored)
     np.testing.assert_array_equal(apart, wanted[..., [2, 0, 1]])
 
 
@@ -241,7 +248,7 @@ def test_pixels_without_data_are_0_in_every_channel():
     for layer, values in stored.items():
         pixels[layer][0, 1] = values[1]
     for channels in (LAYERS, ("ortho", "height", "terrain")):
-        found = tensor_form(channels, LAYERS, 7).form(pixels, np.array([0]))
+        found = tensor_form(channels, PAPER_LAYERS).form(pixels, np.array([0]))
         assert not found[0, 0].any()
         order = [LAYERS.index(channel) for channel in channels]
         np.testing.assert_array_equal(found[0, 1, 0], np.array([1, 1, 0.2], np.float32)[order])

@@ -80,7 +80,7 @@ def test_what_differs_is_named_and_needs_force(site, store, tmp_path):
     )
     assert "height has another content (h2.tif)" in refused(store, "m", **{**site, "height": other})[0]
     assert add(store, "m", height=other, force=True).status == "done"
-    assert open_map(store / "maps/m.zarr").layers == ("height",)
+    assert list(open_map(store / "maps/m.zarr").layers) == ["height"]
 
 
 def test_what_lies_beside_a_raster_belongs_to_it(site, store, tmp_path):
@@ -216,7 +216,7 @@ def test_a_picture_of_the_map_before_is_told_and_drawn_anew(site, store, tmp_pat
         killed.setattr(maps, "write_quick_look", lambda *_: pytest.fail("killed"))
         with pytest.raises(pytest.fail.Exception):
             add(store, "m", height=other, force=True)
-    assert open_map(store / "maps/m.zarr").layers == ("height",)
+    assert list(open_map(store / "maps/m.zarr").layers) == ["height"]
     assert (store / "maps/m.png").read_bytes() == old
     assert verify(store).problems == (
         f"{store / 'maps/m.png'}: does not show m.zarr as it is; the add-map that made the map draws it anew",

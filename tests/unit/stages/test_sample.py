@@ -7,7 +7,7 @@ from map_worlds import ArrayMap, random_map, segment_table, segments_from
 
 from tcpipe.errors import TableError
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import sample_segments
+from tcpipe.stages.sample import metres_lost, sample_segments
 from tcpipe.tables.bits import Loss
 from tcpipe.terrain.grid import MapGrid
 
@@ -41,16 +41,15 @@ def test_every_loss_has_its_reason_and_its_metres():
     wanted = [0, Loss.OUTSIDE_MAP, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE, Loss.POSITION_UNCERTAIN]
     assert got.lost_by.tolist() == wanted
     assert got.kept.tolist() == [0]
-    assert got.patches.height.shape == (1, 40, 40)
+    assert got.patches.pixels["height"].shape == (1, 40, 40)
     assert got.footprint_lonlat_deg.shape == (1, 4, 2)
     metres = {
-        "kept": 1.004,
-        "outside_map": 2.008,
-        "nodata": 1.004,
-        "not_traversable": 1.004,
-        "position_uncertain": 1.004,
+        Loss.OUTSIDE_MAP: 2.008,
+        Loss.NODATA: 1.004,
+        Loss.NOT_TRAVERSABLE: 1.004,
+        Loss.POSITION_UNCERTAIN: 1.004,
     }
-    assert got.ledger_m == pytest.approx(metres)
+    assert metres_lost(segments.column("arc_length_m").to_numpy(), got.lost_by) == pytest.approx(metres)
 
 
 def test_a_recipe_may_allow_some_invalid_pixels():
@@ -74,7 +73,7 @@ def test_segments_of_a_run_without_gnss_are_outside_every_map():
 
 def test_no_segments_give_no_patches():
     got = sample(drive([(500_001.0, 5_199_995.0)]).slice(0, 0), random_map())
-    assert got.patches.height.shape == (0, 40, 40)
+    assert got.patches.pixels["height"].shape == (0, 40, 40)
     assert got.footprint_lonlat_deg.shape == (0, 4, 2)
 
 
@@ -102,7 +101,7 @@ def test_a_wider_patch_is_centred_on_the_chord():
     segments = drive([(500_004.0, 5_199_993.0)])
     one, two = (sample(segments, random_map(), patch_m=m, patch_px=px) for m, px in ((1.0, 40), (2.0, 80)))
     np.testing.assert_allclose(two.footprint_xy_m.mean(axis=1), one.footprint_xy_m.mean(axis=1), atol=1e-6)
-    np.testing.assert_array_equal(two.patches.terrain[0, 20:60, 20:60], one.patches.terrain[0])
+    np.testing.assert_array_equal(two.patches.pixels["terrain"][0, 20:60, 20:60], one.patches.pixels["terrain"][0])
 
 
 def test_class_names_and_maps_without_classes():
@@ -110,12 +109,12 @@ def test_class_names_and_maps_without_classes():
     source.arrays["terrain"][:] = 5
     segments = drive([(500_002.0, 5_199_990.0)])
     got = sample(segments, source)
-    assert got.terrain_name.tolist() == ["mud"]
+    assert got.patches.terrain_class.tolist() == [5]
     assert got.patches.terrain_purity.tolist() == [1.0]
     bare = ArrayMap(source.grid, {"height": source.arrays["height"]})
     got = sample(segments, bare)
     assert got.kept.tolist() == [0]
-    assert got.terrain_name is None
+    assert list(got.patches.pixels) == ["height"]
 
 
 def test_pitches_that_do_not_fit_the_map_are_said():

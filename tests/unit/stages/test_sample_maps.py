@@ -6,7 +6,7 @@ from map_worlds import ArrayMap, random_map, segments_from
 
 from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
-from tcpipe.stages.sample import sample_segments
+from tcpipe.stages.sample import metres_lost, sample_segments
 from tcpipe.stages.sample_maps import sample_on_maps
 from tcpipe.tables.bits import Loss
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
@@ -32,23 +32,32 @@ def sample(segments, *maps, **config):
     return sample_on_maps(segments, maps, SampleConfig(**config), gnss_crs="EPSG:4326")
 
 
+def by_map(sampled):
+    """Rows and pixels of what each of two maps has."""
+    here = [sampled.map_index == number for number in (0, 1)]
+    pixels = [{name: layer[mine] for name, layer in sampled.patches.pixels.items()} for mine in here]
+    return [sampled.kept[mine] for mine in here], pixels
+
+
 def test_the_first_map_that_has_data_is_taken():
     west, east = map_at(500_000.0, "west", 1), map_at(500_006.0, "east", 2)
     segments = lane(np.arange(0.5, 24.0, 0.5), 6.0)
     both = sample(segments, west, east)
     alone = [sample_segments(segments, each, SampleConfig(), gnss_crs="EPSG:4326") for each in (west, east)]
-    np.testing.assert_array_equal(both.rows[0], alone[0].kept)
-    np.testing.assert_array_equal(both.rows[1], np.setdiff1d(alone[1].kept, alone[0].kept))
-    np.testing.assert_array_equal(both.sampled[0].patches.height, alone[0].patches.height)
-    rest = np.isin(alone[1].kept, both.rows[1])
-    np.testing.assert_array_equal(both.sampled[1].patches.ortho, alone[1].patches.ortho[rest])
-    assert len(both.rows[0]) > 20
-    assert len(both.rows[1]) > 10
+    rows, pixels = by_map(both)
+    np.testing.assert_array_equal(rows[0], alone[0].kept)
+    np.testing.assert_array_equal(rows[1], np.setdiff1d(alone[1].kept, alone[0].kept))
+    np.testing.assert_array_equal(pixels[0]["height"], alone[0].patches.pixels["height"])
+    rest = np.isin(alone[1].kept, rows[1])
+    np.testing.assert_array_equal(pixels[1]["ortho"], alone[1].patches.pixels["ortho"][rest])
+    assert len(rows[0]) > 20
+    assert len(rows[1]) > 10
     turned = sample(segments, east, west)
-    np.testing.assert_array_equal(turned.rows[0], alone[1].kept)
-    everywhere = [np.sort(np.concatenate(each.rows)).tolist() for each in (both, turned)]
+    np.testing.assert_array_equal(by_map(turned)[0][0], alone[1].kept)
+    everywhere = [np.sort(each.kept).tolist() for each in (both, turned)]
     assert everywhere[0] == everywhere[1] == np.flatnonzero(both.lost_by == 0).tolist()
-    assert sum(both.ledger_m.values()) == pytest.approx(1.004 * segments.num_rows)
+    lost_m = metres_lost(segments.column("arc_length_m").to_numpy(), both.lost_by)
+    assert sum(lost_m.values()) == pytest.approx(1.004 * (segments.num_rows - len(both.kept)))
 
 
 def test_a_hole_in_one_map_is_filled_by_the_next_and_named_if_it_is_not():
@@ -56,7 +65,7 @@ def test_a_hole_in_one_map_is_filled_by_the_next_and_named_if_it_is_not():
     first.arrays["height"][:, 60:220] = np.nan  # from 3 m to 11 m
     segments = lane([1.0, 5.0, 8.0, 15.0, 30.0], 6.0)
     got = sample(segments, first, second)
-    assert [rows.tolist() for rows in got.rows] == [[0], [2, 3]]
+    assert [rows.tolist() for rows in by_map(got)[0]] == [[0], [2, 3]]
     assert got.lost_by.tolist() == [0, Loss.NODATA, 0, 0, Loss.OUTSIDE_MAP]
 
 
@@ -65,7 +74,7 @@ def test_what_the_first_map_shows_not_traversable_stays_so():
     first.arrays["terrain"][:] = 1
     got = sample(lane([2.0], 6.0), first, second)
     assert got.lost_by.tolist() == [Loss.NOT_TRAVERSABLE]
-    assert got.sampled[1].kept.size == 0
+    assert got.kept.size == 0
 
 
 def test_maps_that_are_not_alike_are_refused():

@@ -5,6 +5,7 @@ import pytest
 from map_worlds import ArrayMap
 
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import PAPER_LAYERS
 from tcpipe.terrain.overviews import coarser_levels, factor_for, overview_factors, overview_grid
 from tcpipe.terrain.patches import patch_frames
 from tcpipe.terrain.sampling import sample_patches
@@ -51,11 +52,11 @@ def test_heights_and_grey_are_means_and_missing_where_a_part_is_missing():
     rng = np.random.default_rng(0)
     height = rng.normal(0.0, 1.0, (37, 50))
     height[rng.random(height.shape) < 0.01] = np.nan
-    for factor, level in coarser_levels("height", height, (1, 2, 4, 8)):
+    for factor, level in coarser_levels(PAPER_LAYERS["height"], height, (1, 2, 4, 8)):
         np.testing.assert_allclose(level, blocks(height, factor).mean(-1), atol=1e-12)
     grey = rng.integers(1, 256, (37, 50)).astype(np.uint8)
     grey[5, 9] = 0
-    found = dict(coarser_levels("ortho", grey, (1, 2, 4)))
+    found = dict(coarser_levels(PAPER_LAYERS["ortho"], grey, (1, 2, 4)))
     assert sorted(found) == [2, 4]
     for factor, level in found.items():
         wanted = blocks(grey.astype(float), factor).mean(-1)
@@ -68,12 +69,12 @@ def test_heights_and_grey_are_means_and_missing_where_a_part_is_missing():
 def test_classes_are_the_commonest_of_all_pixels_not_of_halves():
     rng = np.random.default_rng(1)
     ids = rng.integers(0, 4, (43, 66)).astype(np.uint8)
-    for factor, level in coarser_levels("terrain", ids, (1, 2, 4, 8)):
+    for factor, level in coarser_levels(PAPER_LAYERS["terrain"], ids, (1, 2, 4, 8)):
         votes = np.stack([(blocks(ids, factor) == k).sum(-1) for k in range(4)], -1)
         np.testing.assert_array_equal(level, votes.argmax(-1))  # ties go to the lower id
     halves = np.kron(np.array([[1, 2], [3, 3]]), np.array([[1, 1], [1, 1]])).astype(np.uint8)
     halves[0, 0] = halves[0, 2] = halves[1, 1] = 3
-    assert dict(coarser_levels("terrain", halves, (1, 2, 4)))[4].tolist() == [[3]]
+    assert dict(coarser_levels(PAPER_LAYERS["terrain"], halves, (1, 2, 4)))[4].tolist() == [[3]]
 
 
 @pytest.mark.parametrize(
@@ -88,7 +89,10 @@ class Levels(ArrayMap):
     """A map in memory with overviews."""
 
     def at(self, factor):
-        arrays = {name: dict(coarser_levels(name, layer, self.factors))[factor] for name, layer in self.arrays.items()}
+        arrays = {
+            name: dict(coarser_levels(PAPER_LAYERS[name], layer, self.factors))[factor]
+            for name, layer in self.arrays.items()
+        }
         return ArrayMap(overview_grid(self.grid, factor), arrays, self.tile_px, self.height_reference_m)
 
 
@@ -117,11 +121,11 @@ def test_a_patch_coarser_than_the_map_shows_means_not_every_nth_pixel():
         px = start[:, None, None, 0] + along * step[..., 0] - left * step[..., 1]
         py = start[:, None, None, 1] + along * step[..., 1] + left * step[..., 0]
         wanted = 0.1 * (px - 500_000.0) + 0.05 * (py - 5_200_000.0)
-        height = got.height_min_m[:, None, None] + 0.0005 * got.height
+        height = got.height_min_m[:, None, None] + 0.0005 * got.pixels["height"]
         return (
             np.abs(height - wanted).max(),
-            np.abs(got.ortho - 120.0).max(),
-            (got.terrain == 4).mean(),
+            np.abs(got.pixels["ortho"] - 120.0).max(),
+            (got.pixels["terrain"] == 4).mean(),
             np.abs(got.slope_rad - np.arctan(0.1 * np.cos(angle) + 0.05 * np.sin(angle))).max(),
         )
 

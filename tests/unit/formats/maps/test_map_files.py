@@ -16,6 +16,7 @@ from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
 from tcpipe.formats.seals import write_checksums
 from tcpipe.terrain.classes import PAPER_SCHEME
 from tcpipe.terrain.grid import MapGrid
+from tcpipe.terrain.layers import paper_layers
 
 WORLD = World("EPSG:31256", -68_000.0, 215_000.0, side_m=20.0)
 
@@ -58,7 +59,7 @@ def test_gdal_opens_each_layer_in_its_place(path):
 
 def test_an_open_map_knows_what_it_is(path):
     source = open_map(path)
-    assert (source.name, source.layers, source.classes.count) == ("garden", ("height", "ortho", "terrain"), 7)
+    assert (source.name, tuple(source.layers), source.classes.count) == ("garden", ("height", "ortho", "terrain"), 7)
     assert source.facts["sources"] == {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif"}
     assert source.read("height", 3, 5, 7, 11).shape == (2, 4)
     summary = json.loads(json.dumps(source.summary()))
@@ -90,12 +91,13 @@ def test_overviews_across_shards_have_no_seam(tmp_path):
     grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.03, 2100, 2100)
     rng = np.random.default_rng(0)
     height, ids = rng.normal(600.0, 1.0, (2100, 2100)), rng.integers(1, 8, (2100, 2100)).astype(np.uint8)
-    writer = MapWriter(tmp_path / "m.zarr", name="m", grid=grid, scheme=PAPER_SCHEME, layers=("height", "terrain"))
+    layers = paper_layers(("height", "terrain"), PAPER_SCHEME.table)
+    writer = MapWriter(tmp_path / "m.zarr", name="m", grid=grid, scheme=PAPER_SCHEME, layers=layers)
     for row in (0, SHARD_PX):
         for col in (0, SHARD_PX):
             for layer, values in (("height", height), ("terrain", ids)):
                 writer.write(layer, row, col, values[row : row + SHARD_PX, col : col + SHARD_PX])
-    writer.finish({})
+    writer.finish({}, layers)
     write_checksums(tmp_path / "m.zarr")
     for factor in (2, 32):
         level, side = open_map(tmp_path / "m.zarr").at(factor), 2100 // factor
