@@ -154,10 +154,7 @@ def _yaw_rate_samples(
 
 
 def _speed_source(measurements: Measurements) -> BodyVelocities | None:
-    for source in (measurements.wheels, measurements.visual):
-        if source is not None and source.stamp_ns.size:
-            return source
-    return None
+    return next((source for source in measurements.odometries().values() if source.stamp_ns.size), None)
 
 
 def _yaw(measurements: Measurements, path: _Path, start_ns: int, bias_std: float) -> tuple[float, float, str]:

@@ -104,6 +104,16 @@ class Measurements:
     visual: BodyVelocities | None = None
     nonholonomic_std_mps: float = 0.15
 
+    def sensors(self) -> dict[str, Positions | InertialMeasurements | BodyVelocities]:
+        """Return the sensors that are there, by role."""
+        every = {GNSS: self.gnss, IMU: self.imu, WHEELS: self.wheels, VISUAL: self.visual}
+        return {role: sensor for role, sensor in every.items() if sensor is not None}
+
+    def odometries(self) -> dict[str, BodyVelocities]:
+        """Return the odometries that are there, by role; the wheels' first."""
+        every = {WHEELS: self.wheels, VISUAL: self.visual}
+        return {role: odometry for role, odometry in every.items() if odometry is not None}
+
 
 @dataclass(frozen=True, slots=True)
 class InitialState:

@@ -37,8 +37,7 @@ _UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
 
 def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
     """Return the odometries with a yaw rate, for where there is no gyroscope: the wheels, which skid, then visual odometry."""
-    sources = (measurements.wheels, measurements.visual)
-    return [source for source in sources if source is not None and np.isfinite(source.yaw_rate_radps).any()]
+    return [source for source in measurements.odometries().values() if np.isfinite(source.yaw_rate_radps).any()]
 
 
 def turn_scale_std(measurements: Measurements) -> float:
@@ -130,7 +129,7 @@ def _held_density(measurements: Measurements) -> _Density:
 
     Where two odometries differ, the one that shows the least of it is right: wheels that dig in show much.
     """
-    sources = [s for s in (measurements.wheels, measurements.visual) if s is not None and s.stamp_ns.size > 2]
+    sources = [source for source in measurements.odometries().values() if source.stamp_ns.size > 2]
     slope = [slopes(s.stamp_ns, s.velocity_mps[:, 0], _ACCELERATION_WINDOW_S) for s in sources]
     unknown = _unseen_density(None if sources else measurements.gnss)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import Measurements, part
+from tcpipe.fusion.measurements import IMU, Measurements, part
 from tcpipe.fusion.signals import in_gap, median_period_ns
 
 _PAUSE_NS = 5_000_000_000
@@ -63,6 +63,5 @@ def track_stamps(stretch: Stretch, *, period_ns: int, max_gap_ns: int) -> NDArra
 
 
 def _stamps(measurements: Measurements, *, with_imu: bool) -> NDArray[np.int64]:
-    sources = [measurements.gnss, measurements.wheels, measurements.visual]
-    stamps = [source.stamp_ns for source in (*sources, measurements.imu if with_imu else None) if source is not None]
+    stamps = [sensor.stamp_ns for role, sensor in measurements.sensors().items() if with_imu or role != IMU]
     return np.unique(np.concatenate(stamps)) if stamps else np.empty(0, np.int64)

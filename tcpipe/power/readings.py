@@ -112,12 +112,10 @@ def _incomplete(rails: list[RailReadings]) -> list[str]:
     missing = []
     for name in dict.fromkeys(rail.name for rail in rails):
         parts = [rail for rail in rails if rail.name == name]
-        for what, values in (
-            ("voltage", [rail.voltage_volt for rail in parts]),
-            ("current", [rail.current_amp for rail in parts]),
-        ):
-            if not any(np.isfinite(value).any() for value in values):
-                missing.append(f"{name}: it carries no {what}")
+        if not any(np.isfinite(part.voltage_volt).any() for part in parts):
+            missing.append(f"{name}: it carries no voltage")
+        if not any(np.isfinite(part.current_amp).any() for part in parts):
+            missing.append(f"{name}: it carries no current")
     return missing
 
 
@@ -176,19 +174,12 @@ def _sign(
         return 0, [f'{why}; {cure}; if it truly rolled downhill throughout: "{told}"'], ""
     if sign > 0:
         why = f"power: the current counts as positive when drawn, against the ROS convention: {share} is positive"
-        return (
-            1,
-            [f'{why}; settle it with read.current_sign = "drawn_positive"'],
-            "drawn_positive (mean)",
-        )
+        return 1, [f'{why}; settle it with read.current_sign = "drawn_positive"'], "drawn_positive (mean)"
     if sign < 0:
         return -1, [], "drawn_negative (mean, as ROS has it)"
     why = f"power: the current's sign is unclear (net {share}): taken as negative when drawn, as ROS has it"
-    return (
-        -1,
-        [f'{why}; settle it with read.current_sign = "drawn_positive" or "drawn_negative"'],
-        "drawn_negative (ROS)",
-    )
+    cure = 'settle it with read.current_sign = "drawn_positive" or "drawn_negative"'
+    return -1, [f"{why}; {cure}"], "drawn_negative (ROS)"
 
 
 def _weight_s(time_s: Floats) -> Floats:

@@ -56,16 +56,12 @@ def wheel_column(wheels: BodyVelocities | None, at_ns: NDArray[np.int64], *, max
 def command_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64]) -> Arrays:
     """Return the last command at each stamp; NaN before the first and without commands."""
     table = streams.tables.get("command")
-    names = {
-        "commanded_velocity_mps": "forward_velocity_mps",
-        "commanded_yaw_rate_radps": "yaw_rate_radps",
-    }
+    names = {"commanded_velocity_mps": "forward_velocity_mps", "commanded_yaw_rate_radps": "yaw_rate_radps"}
     if table is None:
         return {name: np.full(at_ns.size, np.nan) for name in names}
     table = rows_where(table, "epoch", epoch)
-    order = np.argsort(integers(table, "stamp_ns"), kind="stable")
-    stamp = integers(table, "stamp_ns")[order]
-    return {name: hold_last(stamp, floats(table, source)[order], at_ns) for name, source in names.items()}
+    stamp_ns = integers(table, "stamp_ns")
+    return {name: hold_last(stamp_ns, floats(table, source), at_ns) for name, source in names.items()}
 
 
 def power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *, max_gap_ns: int) -> Arrays:

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InitialState
+from tcpipe.fusion.measurements import GNSS, IMU, InitialState
 from tcpipe.fusion.stretches import Stretch
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
@@ -23,14 +23,13 @@ _LOCAL = "the track lies in a local frame that starts at 0, 0, 0 and cannot be p
 def stretch_facts(stretch: Stretch, initial: InitialState, found: Trajectory) -> StretchFacts:
     """Return the facts of one stretch: the filter's, and where it lies and began."""
     m = stretch.measurements
-    used = {GNSS: m.gnss, IMU: m.imu, WHEELS: m.wheels, VISUAL: m.visual}
     return replace(
         found.facts,
         epoch=stretch.epoch,
         start_ns=stretch.start_ns,
         end_ns=stretch.end_ns,
         rows=int(found.stamp_ns.size),
-        sensors=tuple(role for role, source in used.items() if source is not None),
+        sensors=tuple(m.sensors()),
         gyro_noise_radps=None if m.imu is None else m.imu.gyro_std_radps,
         accelerometer_noise_mps2=None if m.imu is None else m.imu.accelerometer_std_mps2,
         initial_yaw_rad=float(rpy_from_quat(initial.quat_xyzw)[2]),

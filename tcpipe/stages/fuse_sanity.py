@@ -42,7 +42,7 @@ def without_lost_gnss(
     """
     total = sum(stretch.measurements.get(GNSS, 0) for stretch in stretches)
     refused = sum(stretch.rejected.get(GNSS, 0) for stretch in stretches)
-    others = any(m.wheels is not None or m.visual is not None for m in inputs.measurements.values())
+    others = any(m.odometries() for m in inputs.measurements.values())
     if not others or refused <= _MOST_REFUSED * total:
         return None
     why = f"{refused} of its {total} fixes contradict all other sensors (another clock, drive or receiver?)"
@@ -77,17 +77,14 @@ def longest_epoch(inputs: FusionInputs) -> int:
 
 
 def _rows(measurements: Measurements) -> int:
-    sources = (measurements.gnss, measurements.imu, measurements.wheels, measurements.visual)
-    return sum(source.stamp_ns.size for source in sources if source is not None)
+    return sum(sensor.stamp_ns.size for sensor in measurements.sensors().values())
 
 
 def _command(streams: Streams, epoch: int) -> CommandedSpeed | None:
     if "command" not in streams.tables:
         return None
-    table = streams.tables["command"]
-    table = rows_where(table, "epoch", epoch)
-    order = np.argsort(integers(table, "stamp_ns"), kind="stable")
-    return CommandedSpeed(integers(table, "stamp_ns")[order], floats(table, "forward_velocity_mps")[order])
+    table = rows_where(streams.tables["command"], "epoch", epoch)
+    return CommandedSpeed(integers(table, "stamp_ns"), floats(table, "forward_velocity_mps"))
 
 
 def _felt(streams: Streams) -> float:

@@ -134,24 +134,23 @@ def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) ->
 
 def _signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterable[Signals]:
     """Yield what can be compared in a window: whose stamps against whose, by what, target and regressors on the grid."""
-    odometries = [(role, source) for role, source in ((WHEELS, m.wheels), (VISUAL, m.visual)) if source is not None]
-    twists = {role: twist_on_grid(source, at_ns) for role, source in odometries}
+    twists = {role: twist_on_grid(source, at_ns) for role, source in m.odometries().items()}
     gyro = (
         None if m.imu is None else averaged(on_grid(m.imu.stamp_ns, m.imu.angular_velocity_radps, at_ns), _ODOMETRY_S)
     )
     if gyro is not None:
-        for role, _ in odometries:
+        for role in twists:
             yield role, IMU, "yaw rate", averaged(twists[role], _ODOMETRY_S)[:, 1], gyro
-    if len(odometries) == 2:
-        speeds = {role: _quick(averaged(np.abs(twists[role][:, :1]), _ODOMETRY_S)) for role, _ in odometries}
+    if len(twists) == 2:
+        speeds = {role: _quick(averaged(np.abs(of[:, :1]), _ODOMETRY_S)) for role, of in twists.items()}
         yield VISUAL, WHEELS, "speed", speeds[VISUAL][:, 0], speeds[WHEELS]
-    if m.gnss is not None and odometries:
-        role = odometries[0][0]
+    if m.gnss is not None and twists:
+        role = next(iter(twists))
         seen = averaged(averaged(_antenna_speed(twists[role], m.gnss.lever_arm_m), FIXES_S), FIXES_S)
         fixes = np.abs(fix_velocity(m.gnss, at_ns))
         yield GNSS, role, "speed", _quick(fixes[:, None])[:, 0], _quick(seen)
-    if power is not None and odometries:
-        role = odometries[0][0]
+    if power is not None and twists:
+        role = next(iter(twists))
         yield POWER, role, "power of speed, acceleration and turning", *_power(power, twists[role], at_ns)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from tcpipe.fusion.checks.distances import Distances
 from tcpipe.fusion.checks.lags import Floats
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.measurements import GNSS, IMU, Measurements
 
 _FEWEST_ROWS = 20
 _APART = 0.5
@@ -18,8 +18,8 @@ def frozen_sensors(m: Measurements, found: Distances) -> dict[str, str]:
     why = {}
     if m.gnss is not None and _one_value(m.gnss.position_enu_m) and _contradicted(GNSS, found):
         why[GNSS] = f"all of its {m.gnss.stamp_ns.size} fixes are the same place while the robot drives"
-    for role, source in ((WHEELS, m.wheels), (VISUAL, m.visual)):
-        if source is not None and _contradicted(role, found) and _one_value(source.velocity_mps):
+    for role, source in m.odometries().items():
+        if _contradicted(role, found) and _one_value(source.velocity_mps):
             speed = source.velocity_mps[0, 0]
             why[role] = (
                 f"its velocity is {speed:g} m/s on all of its {source.stamp_ns.size} messages, whatever the robot does"

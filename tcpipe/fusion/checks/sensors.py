@@ -98,11 +98,7 @@ def check_sensors(
     at_ns = liveliest_ns(measurements)
     if at_ns is None:
         return checks
-    twists = {
-        role: twist_on_grid(source, at_ns)
-        for role, source in ((WHEELS, measurements.wheels), (VISUAL, measurements.visual))
-        if source is not None
-    }
+    twists = {role: twist_on_grid(source, at_ns) for role, source in measurements.odometries().items()}
     found = find_distances(measurements.gnss, _with_command(twists, command, at_ns), at_ns)
     frozen = frozen_sensors(measurements, found)
     checks.refusals += [Refusal(role, why) for role, why in frozen.items()]

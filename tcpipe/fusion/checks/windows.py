@@ -26,7 +26,7 @@ def windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
         return
     count = max(1, round((span[1] - span[0]) / length_ns))
     edges = np.linspace(*span, count + 1).astype(np.int64)
-    stamps = [source.stamp_ns for source in (m.gnss, m.imu, m.wheels, m.visual) if source is not None]
+    stamps = [sensor.stamp_ns for sensor in m.sensors().values()]
     heard = np.unique(np.concatenate([np.searchsorted(edges, stamp, side="right") - 1 for stamp in stamps]))
     for window in np.unique(np.clip(np.concatenate((heard - 1, heard, heard + 1)), 0, count - 1)):
         yield grid_ns(int(edges[window]), int(edges[window + 1]))
@@ -34,8 +34,7 @@ def windows_ns(m: Measurements, length_ns: int) -> Iterator[Ints]:
 
 def span_ns(m: Measurements) -> tuple[int, int] | None:
     """Return first and last stamp of a set's measurements; None where no sensor has two."""
-    stamps = [source.stamp_ns for source in (m.gnss, m.imu, m.wheels, m.visual) if source is not None]
-    stamps = [stamp for stamp in stamps if stamp.size > 1]
+    stamps = [sensor.stamp_ns for sensor in m.sensors().values() if sensor.stamp_ns.size > 1]
     return (min(int(s[0]) for s in stamps), max(int(s[-1]) for s in stamps)) if stamps else None
 
 
