@@ -36,6 +36,7 @@ from tcpipe.formats.seals import CHECKSUMS, checksums_to_json, prove_files, read
 from tcpipe.tables.findings import EnergyBudget, Findings, RunFacts
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
+    READ_VERSIONS,
     GatedTrack,
     LabelledSegments,
     Sensor,
@@ -189,7 +190,7 @@ class Store:
                 except StoreError as error:
                     damaged[path] = error.problems[0]
                     continue
-                if run.version == DATA_MODEL_VERSION:
+                if run.version in READ_VERSIONS:
                     finished.append(run)
                 else:
                     others[name] = run
@@ -338,7 +339,7 @@ class Store:
             except StoreError:
                 return None
             shared = metadata_of(table)
-            if shared.get("key") != key or shared.get("data_model_version") != DATA_MODEL_VERSION:
+            if shared.get("key") != key or shared.get("data_model_version") not in READ_VERSIONS:
                 return None
             sensor = shared["sensor"]
             sensors[path.stem] = Sensor(
@@ -382,9 +383,9 @@ class Store:
 def _ingestion(path: Path) -> RunDirectory:
     """Read an ingestion; `StoreError` if its manifest is not as it was written, or another's, or a file is gone."""
     name = path / "manifest.json"
-    found = read_sealed(name, _MANIFEST, ours=lambda found: found.get("data_model_version") == DATA_MODEL_VERSION)
+    found = read_sealed(name, _MANIFEST, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
     run = RunDirectory(path.parent.name, path.name, path, found)
-    if run.version == DATA_MODEL_VERSION:
+    if run.version in READ_VERSIONS:
         if (found["run_id"], found["recipe_id"]) != (run.run_id, run.recipe_id):
             raise StoreError(
                 f"{name}: is of {found['run_id']}/{found['recipe_id']}, but lies in {run.run_id}/{run.recipe_id}"

@@ -24,6 +24,7 @@ from tcpipe.cli.export import export
 from tcpipe.cli.ingest import ingest
 from tcpipe.cli.init import init
 from tcpipe.cli.inspect import inspect
+from tcpipe.cli.migrate import migrate
 from tcpipe.cli.output import say_failure
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
@@ -79,6 +80,7 @@ for command in (
     export,
     explain,
     verify,
+    migrate,
     diff,
     schemas,
     simulate,

@@ -27,7 +27,7 @@ from tcpipe.formats.seals import prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.terrain.layers import Layer, in_order, missing
 
 FileFormat = Literal["zarr", "parquet"]
@@ -220,7 +220,7 @@ def read_card(directory: Path, *, proved: bool = True) -> dict[str, Any]:
 
 
 def _is_current(card: Mapping[str, Any]) -> bool:
-    return card.get("kind") == KIND and card.get("data_model_version") == DATA_MODEL_VERSION
+    return card.get("kind") == KIND and card.get("data_model_version") in READ_VERSIONS
 
 
 def read_current_card(directory: Path) -> dict[str, Any]:

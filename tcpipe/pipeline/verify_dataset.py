@@ -35,7 +35,7 @@ from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.store import is_named_after
 from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import EnergyBudget
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer
 
@@ -48,7 +48,7 @@ def verify_dataset(directory: Path) -> Iterator[Finding]:
     for path in (directory / CARD, directory / REPORT):
         problem = broken_seal(path)
         yield problem or ("files", 1)
-    if card.get("data_model_version") != DATA_MODEL_VERSION:
+    if card.get("data_model_version") not in READ_VERSIONS:
         yield (
             f"{directory / CARD}: of data model {card.get('data_model_version')}, this version knows {DATA_MODEL_VERSION}; "
             "verify it with the version that wrote it, or build it again"

@@ -20,7 +20,7 @@ from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, STREAMS
+from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, READ_VERSIONS, REJECTIONS, STREAMS
 
 Finding = tuple[str, int] | str
 
@@ -143,7 +143,7 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
     yield "runs", 1
     where = directory / _MANIFEST
     manifest = read_sealed(where)
-    if manifest["data_model_version"] != DATA_MODEL_VERSION:
+    if manifest["data_model_version"] not in READ_VERSIONS:
         yield (
             f"{where}: of data model {manifest['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
             "ingest the log again, then remove this directory"

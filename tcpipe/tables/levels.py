@@ -30,8 +30,14 @@ from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
 
-DATA_MODEL_VERSION = "1.0"
-"""Version of every table and manifest below; its history stands in docs/reference/data-model.md."""
+DATA_MODEL_VERSION = "1.1"
+"""Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
+
+READ_VERSIONS = ("1.0", DATA_MODEL_VERSION)
+"""Versions that are read as they are; `tcpipe migrate` brings the older ones to the last."""
+
+TABLES_VERSION = "1.0"
+"""Version in which a table last changed."""
 
 _METADATA_KEY = b"tcpipe"
 
@@ -523,7 +529,7 @@ def with_findings(info: TrackInfo, warnings: tuple[str, ...], facts: RunFacts) -
 
 def with_metadata(table: pa.Table, metadata: Mapping[str, Any]) -> pa.Table:
     """Return the table with ``metadata`` (JSON values) in its schema, under the key ``tcpipe``."""
-    text = json.dumps({"data_model_version": DATA_MODEL_VERSION, **metadata}, sort_keys=True)
+    text = json.dumps({"data_model_version": TABLES_VERSION, **metadata}, sort_keys=True)
     return table.replace_schema_metadata({_METADATA_KEY: text.encode()})
 
 

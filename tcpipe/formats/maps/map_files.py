@@ -38,7 +38,7 @@ from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
 from tcpipe.terrain.classes import ClassScheme, ClassTable
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import PAPER_LAYERS, Layer, missing
+from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, missing
 from tcpipe.terrain.overviews import coarser_levels, overview_factors, overview_grid
 
 TILE_PX = 512
@@ -47,10 +47,8 @@ TILE_PX = 512
 SHARD_PX = 2048
 """Side of a shard: the unit that is a file, and that is written at once."""
 
-MAP_VERSION = "1.2"
-"""1.2: a map may have other layers than the paper's, which its key ``described`` tells of."""
-
-READ_VERSIONS = ("1.1", MAP_VERSION)
+PAPER_VERSION, MAP_VERSION = "1.1", "1.2"
+"""1.2: a map has other layers than the paper's, which its key ``described`` tells of; one without is of 1.1 as before."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +136,7 @@ def open_map(path: Path, *, proved: bool = True) -> MapFile:
     except StoreError as error:
         raise MapError(f"{path}: not a map ({error}); add one with: tcpipe add-map") from error
     found = group.attrs.asdict().get("tcpipe_map")
-    if not isinstance(found, dict) or found.get("version") not in READ_VERSIONS:
+    if not isinstance(found, dict) or found.get("version") not in {PAPER_VERSION, MAP_VERSION}:
         version = found.get("version") if isinstance(found, dict) else None
         raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
     factors = tuple(found["factors"])
@@ -236,7 +234,7 @@ class MapWriter:
         self._group.attrs.update(
             {
                 "tcpipe_map": {
-                    "version": MAP_VERSION,
+                    "version": PAPER_VERSION if set(layers) <= set(LAYERS) else MAP_VERSION,
                     "name": self._name,
                     "grid": {field: getattr(self._grid, field) for field in MapGrid.__slots__},
                     "class_table": table_to_json(self._scheme.table),

@@ -29,7 +29,7 @@ from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import TABLES_VERSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ def choose_inputs(
     sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
     fingerprint = digest(
         {
-            "versions": [__version__, DATA_MODEL_VERSION],
+            "versions": [__version__, TABLES_VERSION],
             "recipe": plain_recipe(recipe),
             "runs": sources,
             "maps": list(zip(names, map_sha256, strict=True)),

@@ -16,7 +16,7 @@ from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
 from tcpipe.store import Ingestions, RunDirectory, Store
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +145,7 @@ def _missing(store: Store, others: Sequence[RunDirectory], total: int) -> list[s
     """Return a line for each reason why runs that belong in have no ingestion that could be used."""
     by_recipe, by_version = dict[str, str](), dict[str, str]()
     for run in others:
-        if run.version == DATA_MODEL_VERSION:
+        if run.version in READ_VERSIONS:
             by_recipe[run.run_id] = run.recipe_id
         else:
             by_version[run.run_id] = run.version
