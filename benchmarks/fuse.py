@@ -27,8 +27,8 @@ import numpy as np
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.standing import standing_intervals
-from tcpipe.fusion.ukf15 import PROCESS_VARIANCE, Source, filter_forward
-from tcpipe.fusion.ukf15_events import ANTENNA, SELECT
+from tcpipe.fusion.ukf15 import PROCESS_VARIANCE, SensorRows, filter_forward
+from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
@@ -42,7 +42,7 @@ RATES_HZ = {"imu": 200, "wheel_odometry": 50, "visual_odometry": 30, "gnss": 10}
 EIGEN = ("/usr/include/eigen3", "/usr/local/include/eigen3")
 
 
-def sources(seconds: float, lever_m: tuple[float, float, float]) -> list[Source]:
+def sources(seconds: float, lever_m: tuple[float, float, float]) -> list[SensorRows]:
     """Events of a robot at rest; what is measured does not change what a step costs."""
     rng = np.random.default_rng(0)
     found = []
@@ -57,7 +57,7 @@ def sources(seconds: float, lever_m: tuple[float, float, float]) -> list[Source]
         stamp_ns = np.arange(1, int(seconds * hz) + 1, dtype=np.int64) * (1_000_000_000 // hz)
         z = rng.normal(0.0, std, (stamp_ns.size, len(entries))) + (lever_m if kind == ANTENNA else 0.0)
         lever = lever_m if kind == ANTENNA else (0.0, 0.0, 0.0)
-        found.append(Source(role, kind, entries, stamp_ns, z, np.full(z.shape, std**2), lever))
+        found.append(SensorRows(role, kind, entries, stamp_ns, z, np.full(z.shape, std**2), lever))
     return found
 
 

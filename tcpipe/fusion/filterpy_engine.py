@@ -15,32 +15,11 @@ import numpy as np
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 from numpy.typing import NDArray
 
-from tcpipe.fusion.ukf15_events import (
-    ACCELERATION,
-    ACCEPTED,
-    ANGLES,
-    ANTENNA,
-    PITCH,
-    POSITION,
-    RECOVERED,
-    REJECTED,
-    ROLL,
-    SELECT,
-    SENSOR_VELOCITY,
-    STATES,
-    TURN,
-    VELOCITY,
-    YAW,
-    Belief,
-    Events,
-    Outputs,
-    Sources,
-    X,
-)
-from tcpipe.fusion.ukf15_kernel import GRAVITY_MPS2, MAX_OPENED_RAD, MAX_STEP_S, locked_out, opened_state
+from tcpipe.fusion import ukf15_kernel as kernel
+from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
 from tcpipe.geometry.angles import wrap_to_pi
 
-_ANGLE_ENTRIES = (ROLL, PITCH, YAW)
+_ANGLE_ENTRIES = (kernel.ROLL, kernel.PITCH, kernel.YAW)
 _Array = NDArray[np.float64]
 
 
@@ -90,7 +69,7 @@ def map_from_body(roll_rad: float, pitch_rad: float, yaw_rad: float) -> _Array:
 
 def process(x: _Array, dt: float) -> _Array:
     """Return the state after ``dt`` [s] of constant body acceleration and angular velocity, shape (15,)."""
-    roll, pitch, yaw = x[ANGLES]
+    roll, pitch, yaw = x[kernel.ANGLES]
     euler_rates = np.array(
         [
             [1.0, math.sin(roll) * math.tan(pitch), math.cos(roll) * math.tan(pitch)],
@@ -99,69 +78,78 @@ def process(x: _Array, dt: float) -> _Array:
         ]
     )
     moved = x.copy()
-    moved[POSITION] += map_from_body(roll, pitch, yaw) @ (x[VELOCITY] * dt + 0.5 * x[ACCELERATION] * dt**2)
-    moved[ANGLES] += euler_rates @ x[TURN] * dt
-    moved[VELOCITY] += x[ACCELERATION] * dt
+    moved[kernel.POSITION] += map_from_body(roll, pitch, yaw) @ (
+        x[kernel.VELOCITY] * dt + 0.5 * x[kernel.ACCELERATION] * dt**2
+    )
+    moved[kernel.ANGLES] += euler_rates @ x[kernel.TURN] * dt
+    moved[kernel.VELOCITY] += x[kernel.ACCELERATION] * dt
     return moved
 
 
 def observe(x: _Array, kind: int, entries: NDArray[np.int64], lever_m: _Array) -> _Array:
     """Return what a source of this kind shows in state ``x``, shape (m,)."""
-    velocity = x[VELOCITY] + np.cross(x[TURN], lever_m)
-    if kind == SELECT:
+    velocity = x[kernel.VELOCITY] + np.cross(x[kernel.TURN], lever_m)
+    if kind == kernel.SELECT:
         seen = x
-    elif kind == ANTENNA:
-        seen = x[POSITION] + map_from_body(*x[ANGLES]) @ lever_m
-    elif kind == SENSOR_VELOCITY:
+    elif kind == kernel.ANTENNA:
+        seen = x[kernel.POSITION] + map_from_body(*x[kernel.ANGLES]) @ lever_m
+    elif kind == kernel.SENSOR_VELOCITY:
         seen = velocity
     else:
-        up = map_from_body(*x[ANGLES]).T @ np.array([0.0, 0.0, GRAVITY_MPS2])
-        seen = x[ACCELERATION] + np.cross(x[TURN], velocity) + up
+        up = map_from_body(*x[kernel.ANGLES]).T @ np.array([0.0, 0.0, kernel.GRAVITY_MPS2])
+        seen = x[kernel.ACCELERATION] + np.cross(x[kernel.TURN], velocity) + up
     return np.asarray(seen[entries])
 
 
 def _new_filter(belief: Belief) -> UnscentedKalmanFilter:
-    points = MerweScaledSigmaPoints(STATES, alpha=1.0, beta=2.0, kappa=0.0)
+    points = MerweScaledSigmaPoints(kernel.STATES, alpha=1.0, beta=2.0, kappa=0.0)
     mean, difference = _circular(_ANGLE_ENTRIES)
     ukf = UnscentedKalmanFilter(
-        dim_x=STATES, dim_z=1, dt=0.0, hx=observe, fx=process, points=points, x_mean_fn=mean, residual_x=difference
+        dim_x=kernel.STATES,
+        dim_z=1,
+        dt=0.0,
+        hx=observe,
+        fx=process,
+        points=points,
+        x_mean_fn=mean,
+        residual_x=difference,
     )
-    ukf.x, ukf.P = belief.x[:STATES].copy(), belief.P[:, :STATES].copy()
+    ukf.x, ukf.P = belief.x[: kernel.STATES].copy(), belief.P[:, : kernel.STATES].copy()
     return ukf
 
 
 def _advance(ukf: UnscentedKalmanFilter, q: _Array, dt: float) -> None:
-    steps = max(1, math.ceil(dt / MAX_STEP_S - 1e-9)) if dt > 0.0 else 0
+    steps = max(1, math.ceil(dt / kernel.MAX_STEP_S - 1e-9)) if dt > 0.0 else 0
     for _ in range(steps):
         ukf.Q = np.diag(q) * (dt / steps)
         ukf.predict(dt=dt / steps)
-        ukf.x[ANGLES] = wrap_to_pi(ukf.x[ANGLES])
+        ukf.x[kernel.ANGLES] = wrap_to_pi(ukf.x[kernel.ANGLES])
 
 
 def _update(ukf: UnscentedKalmanFilter, measured: _Measurement, gate: float) -> float:
     """Fuse one measurement unless its normalised innovation squared, which is returned, exceeds the gate."""
     kind, entries, lever_m, z, variance = measured
     ukf.sigmas_f = ukf.points_fn.sigma_points(ukf.x, ukf.P)
-    angles = tuple(k for k, state in enumerate(entries) if kind == SELECT and state in _ANGLE_ENTRIES)
+    angles = tuple(k for k, state in enumerate(entries) if kind == kernel.SELECT and state in _ANGLE_ENTRIES)
     ukf.z_mean, ukf.residual_z = _circular(angles)
     before = ukf.x.copy(), ukf.P.copy()
     ukf.update(z, R=np.diag(variance), kind=kind, entries=entries, lever_m=lever_m)
     nis = float(ukf.y @ np.linalg.solve(ukf.S, ukf.y))
     if not nis <= gate:
         ukf.x, ukf.P = before
-    ukf.x[ANGLES] = wrap_to_pi(ukf.x[ANGLES])
+    ukf.x[kernel.ANGLES] = wrap_to_pi(ukf.x[kernel.ANGLES])
     return nis
 
 
 def _open_up(ukf: UnscentedKalmanFilter, measured: _Measurement) -> None:
     innovation = measured.z - observe(ukf.x, measured.kind, measured.entries, measured.lever_m)
     for at, entry in enumerate(measured.entries):
-        state = opened_state(measured.kind, entry)
+        state = kernel.opened_state(measured.kind, entry)
         if state in _ANGLE_ENTRIES:
-            innovation[at] = min(abs(float(wrap_to_pi(innovation[at]))), MAX_OPENED_RAD)
+            innovation[at] = min(abs(float(wrap_to_pi(innovation[at]))), kernel.MAX_OPENED_RAD)
         ukf.P[state, state] += innovation[at] ** 2
-        if state == X:
-            ukf.P[YAW, YAW] += MAX_OPENED_RAD**2
+        if state == kernel.X:
+            ukf.P[kernel.YAW, kernel.YAW] += kernel.MAX_OPENED_RAD**2
 
 
 def run(belief: Belief, q: NDArray[np.float64], events: Events, sources: Sources, outputs: Outputs) -> int:
@@ -179,7 +167,7 @@ def run(belief: Belief, q: NDArray[np.float64], events: Events, sources: Sources
             outputs.outcome[e] = ACCEPTED if accepted else REJECTED
             refused[s, 1] = refused[s, 1] if refused[s, 0] else now_s
             refused[s, 0] = 0.0 if accepted else refused[s, 0] + 1.0
-            if locked_out(*refused[s], now_s):
+            if kernel.locked_out(*refused[s], now_s):
                 _open_up(ukf, measured)
                 _update(ukf, measured, math.inf)
                 outputs.outcome[e], refused[s, 0] = RECOVERED, 0.0
@@ -187,5 +175,5 @@ def run(belief: Belief, q: NDArray[np.float64], events: Events, sources: Sources
         _advance(ukf, q, output_s - clock_s)
         clock_s = max(clock_s, output_s)
         outputs.x[k], outputs.variance[k] = ukf.x, np.diag(ukf.P)
-    belief.x[:STATES], belief.P[:, :STATES], belief.clock_s[0] = ukf.x, ukf.P, clock_s
+    belief.x[: kernel.STATES], belief.P[:, : kernel.STATES], belief.clock_s[0] = ukf.x, ukf.P, clock_s
     return 0

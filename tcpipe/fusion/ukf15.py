@@ -24,48 +24,18 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion import ukf15_kernel
+from tcpipe.fusion import ukf15_kernel as kernel
 from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, InitialState, Measurements
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
-from tcpipe.fusion.ukf15_events import (
-    ACCELERATION,
-    ACCEPTED,
-    ANGLES,
-    ANTENNA,
-    AX,
-    AY,
-    AZ,
-    NOT_RUN,
-    PITCH,
-    POSITION,
-    RECOVERED,
-    REJECTED,
-    ROLL,
-    SELECT,
-    SENSOR_VELOCITY,
-    SPECIFIC_FORCE,
-    STATES,
-    TURN,
-    VELOCITY,
-    VX,
-    VY,
-    VZ,
-    WX,
-    WY,
-    WZ,
-    YAW,
-    Belief,
-    Events,
-    Outputs,
-    Sources,
-    X,
-    Y,
-    Z,
-)
-from tcpipe.fusion.ukf15_kernel import MAX_OPENED_RAD, ROW
+from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
 from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.tables.findings import StretchFacts
+
+_PLACE, _TURNING, _ACCELERATING = (
+    tuple(range(kernel.STATES)[of]) for of in (kernel.POSITION, kernel.TURN, kernel.ACCELERATION)
+)
+"""Entries of the state, as a source names what it measures."""
 
 PROCESS_VARIANCE = np.array([1e-4] * 3 + [1e-4] * 3 + [1e-2] * 3 + [1.0] * 3 + [2.0] * 3)
 """Variance that each state gains in a second, shape (15,): angular velocity changes by 1 rad/s, acceleration by 1.4 m/s², in a second
@@ -167,17 +137,17 @@ def run_ukf15(
     found = filter_forward(
         sources, gates, x=x, P=P, q=PROCESS_VARIANCE, start_ns=start_ns, output_ns=output_ns, engine=engine
     )
-    quat = quat_from_rpy(*found.x[:, ANGLES].T)
+    quat = quat_from_rpy(*found.x[:, kernel.ANGLES].T)
     std = np.sqrt(found.variance)
     return Trajectory(
         stamp_ns=output_ns,
-        position_enu_m=found.x[:, POSITION],
+        position_enu_m=found.x[:, kernel.POSITION],
         quat_xyzw=quat,
-        velocity_enu_mps=rotate(quat, found.x[:, VELOCITY]),
-        angular_velocity_radps=found.x[:, TURN],
-        position_std_m=std[:, POSITION],
-        yaw_std_rad=std[:, YAW],
-        forward_velocity_std_mps=std[:, VX],
+        velocity_enu_mps=rotate(quat, found.x[:, kernel.VELOCITY]),
+        angular_velocity_radps=found.x[:, kernel.TURN],
+        position_std_m=std[:, kernel.POSITION],
+        yaw_std_rad=std[:, kernel.YAW],
+        forward_velocity_std_mps=std[:, kernel.VX],
         rejections=_rejections(sources, gates, found),
         displacement_std_m=np.full((output_ns.size, len(DISPLACEMENT_LAGS_S)), np.nan),
         facts=_facts(sources, found),
@@ -218,9 +188,11 @@ def filter_forward(
     -------
     Forward
     """
-    belief = Belief(np.zeros(ROW), np.zeros((STATES, ROW)), np.zeros(1), np.zeros((len(sources), 2)))
-    belief.x[:STATES], belief.P[:, :STATES] = x, P
-    states, variances = np.empty((output_ns.size, STATES)), np.empty((output_ns.size, STATES))
+    belief = Belief(
+        np.zeros(kernel.ROW), np.zeros((kernel.STATES, kernel.ROW)), np.zeros(1), np.zeros((len(sources), 2))
+    )
+    belief.x[: kernel.STATES], belief.P[:, : kernel.STATES] = x, P
+    states, variances = np.empty((output_ns.size, kernel.STATES)), np.empty((output_ns.size, kernel.STATES))
     nis = [np.full(source.stamp_ns.size, np.nan) for source in sources]
     outcome = [np.full(source.stamp_ns.size, NOT_RUN, np.int8) for source in sources]
     packed = _packed(sources, gates)
@@ -239,12 +211,12 @@ def filter_forward(
             for at, part in enumerate(np.split(_unsorted(written, order), cuts)):
                 all_of[at][rows[at]] = part
         reached = until
-    return Forward(states, variances, (belief.x[:STATES], belief.P[:, :STATES]), nis, outcome, repairs)
+    return Forward(states, variances, (belief.x[: kernel.STATES], belief.P[:, : kernel.STATES]), nis, outcome, repairs)
 
 
 def _run_of(engine: Literal["compiled", "filterpy"]) -> Callable[..., int]:
     if engine == "compiled":
-        compiled: Callable[..., int] = ukf15_kernel.run
+        compiled: Callable[..., int] = kernel.run
         return compiled
     from tcpipe.fusion import filterpy_engine  # noqa: PLC0415  it takes more than a second to load
 
@@ -274,7 +246,7 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
     )
     start_ns = min(int(source.stamp_ns[0]) for source in sensors if source.stamp_ns.size)
     std = measurements.nonholonomic_std_mps
-    ground = _held(_GROUND, {VY: std, VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
+    ground = _held(_GROUND, {kernel.VY: std, kernel.VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
     return [*sensors, ground, *_priors(sensors, start_ns, end_ns)]
 
 
@@ -282,18 +254,20 @@ def _imu_sources(measurements: Measurements, initial: InitialState) -> list[Sens
     imu = measurements.imu
     if imu is None:
         return []
-    shape = imu.angular_velocity_radps.shape
     turn = imu.angular_velocity_radps - initial.gyro_bias_radps
-    sources = [SensorRows(IMU, SELECT, (WX, WY, WZ), imu.stamp_ns, turn, np.broadcast_to(imu.gyro_std_radps**2, shape))]
+    variance = np.broadcast_to(imu.gyro_std_radps**2, turn.shape)
+    sources = [SensorRows(IMU, kernel.SELECT, _TURNING, imu.stamp_ns, turn, variance)]
     if imu.accelerometer_usable:
-        variance = np.broadcast_to(imu.accelerometer_std_mps2**2, shape)
+        variance = np.broadcast_to(imu.accelerometer_std_mps2**2, turn.shape)
         force = imu.specific_force_mps2
-        sources.append(SensorRows(IMU, SPECIFIC_FORCE, (0, 1, 2), imu.stamp_ns, force, variance, imu.lever_arm_m))
+        sources.append(
+            SensorRows(IMU, kernel.SPECIFIC_FORCE, (0, 1, 2), imu.stamp_ns, force, variance, imu.lever_arm_m)
+        )
     known = np.isfinite(imu.quat_xyzw).all(axis=1)
     if known.any():
         tilt = rpy_from_quat(imu.quat_xyzw[known])[:, :2]
         variance = np.broadcast_to(TILT_STD_RAD**2, tilt.shape)
-        sources.append(SensorRows(IMU, SELECT, (ROLL, PITCH), imu.stamp_ns[known], tilt, variance))
+        sources.append(SensorRows(IMU, kernel.SELECT, (kernel.ROLL, kernel.PITCH), imu.stamp_ns[known], tilt, variance))
     return sources
 
 
@@ -302,8 +276,8 @@ def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_ra
     if odometry is None:
         return []
     lever = odometry.lever_arm_m
-    kind = SENSOR_VELOCITY if any(lever) else SELECT
-    first = 0 if any(lever) else VX
+    kind = kernel.SENSOR_VELOCITY if any(lever) else kernel.SELECT
+    first = 0 if any(lever) else kernel.VX
     known = np.isfinite(odometry.velocity_mps)
     per_second = 1e9 / float(np.median(np.diff(odometry.stamp_ns))) if odometry.stamp_ns.size > 1 else 1.0
     every_variance = odometry.variance_m2ps2 + per_second * np.square(SCALE_STD * odometry.velocity_mps)
@@ -319,7 +293,7 @@ def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_ra
         z = odometry.yaw_rate_radps[rows, None]
         scale_std = SKID_STD if role == WHEELS else SCALE_STD
         variance = odometry.yaw_rate_var[rows, None] + per_second * np.square(scale_std * z)
-        sources.append(SensorRows(role, SELECT, (WZ,), odometry.stamp_ns[rows], z, variance))
+        sources.append(SensorRows(role, kernel.SELECT, (kernel.WZ,), odometry.stamp_ns[rows], z, variance))
     return sources
 
 
@@ -327,23 +301,23 @@ def _gnss_sources(measurements: Measurements) -> list[SensorRows]:
     gnss = measurements.gnss
     if gnss is None:
         return []
-    kind = ANTENNA if any(gnss.lever_arm_m) else SELECT
-    return [SensorRows(GNSS, kind, (X, Y, Z), gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
+    kind = kernel.ANTENNA if any(gnss.lever_arm_m) else kernel.SELECT
+    return [SensorRows(GNSS, kind, _PLACE, gnss.stamp_ns, gnss.position_enu_m, gnss.variance_m2, gnss.lever_arm_m)]
 
 
 def _held(role: str, stds: Mapping[int, float], start_ns: int, end_ns: int, period_ns: int) -> SensorRows:
     """Return states that are zero to within their standard deviations, said again and again."""
     stamps = np.arange(start_ns + period_ns, end_ns + 1, period_ns, dtype=np.int64)
     z = np.zeros((stamps.size, len(stds)))
-    return SensorRows(role, SELECT, tuple(stds), stamps, z, z + np.square(list(stds.values())))
+    return SensorRows(role, kernel.SELECT, tuple(stds), stamps, z, z + np.square(list(stds.values())))
 
 
 def _priors(sensors: Sequence[SensorRows], start_ns: int, end_ns: int) -> list[SensorRows]:
-    selected = {entry for source in sensors if source.kind == SELECT for entry in source.entries}
-    force = any(source.kind == SPECIFIC_FORCE for source in sensors)
-    calm = {state: std for state, std in zip((WX, WY, WZ), _CALM_STD_RADPS, strict=True) if state not in selected}
-    calm |= {} if force else dict.fromkeys((AX, AY, AZ), _CALM_STD_MPS2)
-    level = {} if force or ROLL in selected else dict.fromkeys((ROLL, PITCH), _LEVEL_STD_RAD)
+    selected = {entry for source in sensors if source.kind == kernel.SELECT for entry in source.entries}
+    force = any(source.kind == kernel.SPECIFIC_FORCE for source in sensors)
+    calm = {state: std for state, std in zip(_TURNING, _CALM_STD_RADPS, strict=True) if state not in selected}
+    calm |= {} if force else dict.fromkeys(_ACCELERATING, _CALM_STD_MPS2)
+    level = {} if force or kernel.ROLL in selected else dict.fromkeys((kernel.ROLL, kernel.PITCH), _LEVEL_STD_RAD)
     return [
         _held(_PRIOR, stds, start_ns, end_ns, period_ns)
         for stds, period_ns in ((calm, _GROUND_PERIOD_NS), (level, _LEVEL_PERIOD_NS))
@@ -358,13 +332,13 @@ def _gate(source: SensorRows, probability: float) -> float:
 
 
 def _initial_belief(initial: InitialState) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    x, std = np.zeros(STATES), np.empty(STATES)
-    x[POSITION], std[POSITION] = initial.position_enu_m, initial.position_std_m
-    x[ANGLES] = rpy_from_quat(initial.quat_xyzw)
+    x, std = np.zeros(kernel.STATES), np.empty(kernel.STATES)
+    x[kernel.POSITION], std[kernel.POSITION] = initial.position_enu_m, initial.position_std_m
+    x[kernel.ANGLES] = rpy_from_quat(initial.quat_xyzw)
     attitude_std = (initial.tilt_std_rad, initial.tilt_std_rad, initial.yaw_std_rad)
-    std[ANGLES] = np.minimum(attitude_std, MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
-    x[VELOCITY] = rotate(inverse(initial.quat_xyzw), initial.velocity_enu_mps)
-    std[VELOCITY], std[TURN], std[ACCELERATION] = initial.velocity_std_mps, 0.1, 0.5
+    std[kernel.ANGLES] = np.minimum(attitude_std, kernel.MAX_OPENED_RAD)  # sigma points lie at sqrt(15) deviations
+    x[kernel.VELOCITY] = rotate(inverse(initial.quat_xyzw), initial.velocity_enu_mps)
+    std[kernel.VELOCITY], std[kernel.TURN], std[kernel.ACCELERATION] = initial.velocity_std_mps, 0.1, 0.5
     return x, np.diag(std**2)
 
 

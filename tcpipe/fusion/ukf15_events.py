@@ -1,4 +1,4 @@
-"""What the 15-state filter takes and gives, as its kernel does: the state's entries, kinds of measurement, events, outcomes."""
+"""What the 15-state filter takes and gives, as its kernel does: belief, sources, events, outcomes."""
 
 from __future__ import annotations
 
@@ -6,21 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-
-STATES = 15
-"""Length of the state."""
-X, Y, Z, ROLL, PITCH, YAW, VX, VY, VZ, WX, WY, WZ, AX, AY, AZ = range(STATES)
-"""Where each entry stands in the state: position, angles, velocity, angular velocity, acceleration."""
-POSITION, ANGLES, VELOCITY, TURN, ACCELERATION = (slice(first, first + 3) for first in (X, ROLL, VX, WX, AX))
-
-SELECT = 0
-"""z_k = x[index_k]."""
-ANTENNA = 1
-"""z = position + R(roll, pitch, yaw)·lever, entries index_k of the three."""
-SPECIFIC_FORCE = 2
-"""z = acceleration + w × v + w × (w × lever) + Rᵀ·g, entries index_k of the three."""
-SENSOR_VELOCITY = 3
-"""z = v + w × lever, in the body's axes, entries index_k of the three."""
 
 NOT_RUN = 0
 """Outcome of a measurement that was not reached."""

@@ -27,35 +27,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import kernel
-from tcpipe.fusion.ukf15_events import (
-    ACCEPTED,
-    ANTENNA,
-    AX,
-    AY,
-    AZ,
-    PITCH,
-    RECOVERED,
-    REJECTED,
-    ROLL,
-    SELECT,
-    SENSOR_VELOCITY,
-    SPECIFIC_FORCE,
-    STATES,
-    VX,
-    VY,
-    VZ,
-    WX,
-    WY,
-    WZ,
-    YAW,
-    Belief,
-    Events,
-    Outputs,
-    Sources,
-    X,
-    Y,
-    Z,
-)
+from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
+
+STATES = 15
+"""Length of the state."""
+X, Y, Z, ROLL, PITCH, YAW, VX, VY, VZ, WX, WY, WZ, AX, AY, AZ = range(STATES)
+"""Where each entry stands in the state: position, angles, velocity, angular velocity, acceleration."""
+POSITION, ANGLES, VELOCITY, TURN, ACCELERATION = (slice(first, first + 3) for first in (X, ROLL, VX, WX, AX))
+
+SELECT = 0
+"""z_k = x[index_k]."""
+ANTENNA = 1
+"""z = position + R(roll, pitch, yaw)·lever, entries index_k of the three."""
+SPECIFIC_FORCE = 2
+"""z = acceleration + w × v + w × (w × lever) + Rᵀ·g, entries index_k of the three."""
+SENSOR_VELOCITY = 3
+"""z = v + w × lever, in the body's axes, entries index_k of the three."""
 
 GRAVITY_MPS2 = 9.80665
 """Standard gravity."""

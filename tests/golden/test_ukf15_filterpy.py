@@ -4,19 +4,8 @@ import numpy as np
 import pytest
 
 from tcpipe.fusion import filterpy_engine, ukf15_kernel
-from tcpipe.fusion.ukf15_events import (
-    ACCEPTED,
-    ANTENNA,
-    RECOVERED,
-    REJECTED,
-    SELECT,
-    SENSOR_VELOCITY,
-    SPECIFIC_FORCE,
-    Belief,
-    Events,
-    Outputs,
-    Sources,
-)
+from tcpipe.fusion.ukf15_events import ACCEPTED, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
+from tcpipe.fusion.ukf15_kernel import ANTENNA, SELECT, SENSOR_VELOCITY, SPECIFIC_FORCE
 
 Q = np.array([0.05, 0.05, 0.06, 0.03, 0.03, 0.06, 0.025, 0.025, 0.04, 0.01, 0.01, 0.02, 0.3, 0.3, 0.3])
 ENGINES = (ukf15_kernel.run, filterpy_engine.run)

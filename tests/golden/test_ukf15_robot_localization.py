@@ -8,9 +8,8 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from shared_data import shared_data
 
-from tcpipe.fusion.ukf15 import Source, filter_forward
-from tcpipe.fusion.ukf15_events import AX, AY, AZ, PITCH, ROLL, SELECT, VX, VY, VZ, WX, WY, WZ, YAW
-from tcpipe.fusion.ukf15_kernel import GRAVITY_MPS2
+from tcpipe.fusion.ukf15 import SensorRows, filter_forward
+from tcpipe.fusion.ukf15_kernel import AX, AY, AZ, GRAVITY_MPS2, PITCH, ROLL, SELECT, VX, VY, VZ, WX, WY, WZ, YAW
 from tcpipe.geometry.rotation import inverse, product, quat_from_rpy, rotate, rpy_from_quat
 
 VELOCITY, TURN, ACCELERATION = (VX, VY, VZ), (WX, WY, WZ), (AX, AY, AZ)
@@ -38,7 +37,7 @@ def _odometry(reader, entries):
         stamp_ns.append(_stamp_ns(message))
         z.append(np.array([*_xyz(twist.linear), *_xyz(twist.angular)])[columns])
         variance.append(np.diag(message.twist.covariance.reshape(6, 6))[columns])
-    return Source("wheel_odometry", SELECT, tuple(entries), np.array(stamp_ns), np.array(z), np.array(variance))
+    return SensorRows("wheel_odometry", SELECT, tuple(entries), np.array(stamp_ns), np.array(z), np.array(variance))
 
 
 def _imu(reader, base_from_imu, turn_entries):
@@ -66,9 +65,9 @@ def _imu(reader, base_from_imu, turn_entries):
     turn = rotate(base_from_imu, turn)
     columns = [entry - TURN[0] for entry in turn_entries]
     return (
-        Source("imu", SELECT, (ROLL, PITCH, YAW), stamp_ns, attitude, variances[:, 0]),
-        Source("imu", SELECT, tuple(turn_entries), stamp_ns, turn[:, columns], variances[:, 1][:, columns]),
-        Source("imu", SELECT, ACCELERATION, stamp_ns, acceleration, variances[:, 2]),
+        SensorRows("imu", SELECT, (ROLL, PITCH, YAW), stamp_ns, attitude, variances[:, 0]),
+        SensorRows("imu", SELECT, tuple(turn_entries), stamp_ns, turn[:, columns], variances[:, 1][:, columns]),
+        SensorRows("imu", SELECT, ACCELERATION, stamp_ns, acceleration, variances[:, 2]),
     )
 
 

@@ -8,7 +8,7 @@ from rough_drive import drive, initial, measured
 
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.ukf15 import run_ukf15, sources_of
-from tcpipe.fusion.ukf15_events import SELECT
+from tcpipe.fusion.ukf15_kernel import SELECT
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import inverse, rotate, rpy_from_matrix, rpy_from_quat
 
