@@ -21,16 +21,16 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
-_FEWEST = 20
-_LEAST_SLOPE = 0.02
-_FEWEST_DOWNHILL = 10
-_STEPS = 50
-_HUBER = 1.345
-_NORMAL = 1.4826
-_OUTLIER = 4.0
-_FINEST = 0.02
-_PLAUSIBLE_RESISTANCE = (0.0, 1.5)
-_START = 0.15
+_FEWEST = 20  # segments to fit on
+_LEAST_SLOPE = 0.02  # standard deviation of the rises: on flatter ground weight and rolling cannot be told apart
+_FEWEST_DOWNHILL = 10  # segments that drive the robot: fewer tell no recovery
+_STEPS = 50  # of Gauss-Newton at most
+_HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)
+_NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal variate
+_OUTLIER = 4.0  # robust standard deviations
+_FINEST = 0.02  # of the power: no such model is better
+_PLAUSIBLE_RESISTANCE = (0.0, 1.5)  # coefficient of rolling resistance: tracks in deep sand stay below
+_START = 0.15  # of that coefficient: a skid-steered robot on grass
 
 
 @dataclass(frozen=True, slots=True)

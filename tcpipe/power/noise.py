@@ -21,9 +21,9 @@ Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
 _NS = 1e-9
-_NODES = 256
-_CHUNK = 1000
-_SETTLED_S = 0.2
+_NODES = 256  # cells of a span and the samples around it; four times as many change a deviation by 7 % at 20 Hz, at 2 Hz by nothing
+_CHUNK = 1000  # spans at a time: some MB
+_SETTLED_S = 0.2  # after a stop and before a start the motors still draw
 
 
 @dataclass(frozen=True, slots=True)

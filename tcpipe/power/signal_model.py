@@ -30,18 +30,18 @@ _NS = 1e-9
 _ROUGH_TAU = (0.1, 1.0 / 3.0, 1.0, 3.0, 9.0, 27.0)
 """Correlation times tried, in sampling periods; what changes within less than one looks like independent errors, unless these are known."""
 _SMOOTH_TAU = (1.0, 3.0, 9.0, 27.0)
-_SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
-_LONGEST_S = 5.0
-_FEWEST = 20
-_LOCAL_NS = 2_000_000_000
-_PRIOR_SAMPLES = 4.0
-_CALM_S, _CALM_SAMPLES = 1.5, 8
+_SPACINGS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32)  # of second differences, in samples: about two an octave
+_LONGEST_S = 5.0  # of a spacing: what changes more slowly a segment of a second or two follows exactly
+_FEWEST = 20  # second differences at a spacing: their mean square is known to a third
+_LOCAL_NS = 2_000_000_000  # a drive changes within seconds, and a current's scatter wants some samples
+_PRIOR_SAMPLES = 4.0  # that the whole record counts for beside those near a segment
+_CALM_S, _CALM_SAMPLES = 1.5, 8  # shorter than a halt, longer than what vibration correlates over
 _FEWEST_STILL = 8
 _MOST_OF_CALMEST = 2.0
 """What scatters by more than this, against the calmest stretches, while a robot stands is more than the error of samples."""
 _MEDIAN_OF_SQUARE = 0.4549
 """Of a normal variate of unit variance."""
-_NODES = 24
+_NODES = 24  # of the overlap of two periods
 
 
 @dataclass(frozen=True, slots=True)

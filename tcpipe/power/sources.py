@@ -199,10 +199,10 @@ def _against_current(current: Floats) -> str | None:
     return None
 
 
-_LARGEST_VOLT = 1000.0
-LARGEST_AMP = 1000.0
-_MIN_ROWS_TO_JUDGE = 20
-_UNAMBIGUOUS = 0.8
+_LARGEST_VOLT = 1000.0  # the median of no robot's battery: millivolts
+LARGEST_AMP = 1000.0  # no drive draws more: milliamperes, or a number that wrapped
+_MIN_ROWS_TO_JUDGE = 20  # fewer may be equal by chance, rounded as they are
+_UNAMBIGUOUS = 0.8  # of the charge moved flows one way
 
 
 def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:
