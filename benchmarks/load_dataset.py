@@ -105,9 +105,9 @@ def decode(split):
 def decode_by_zarr(path, rows):
     """Decode all layers with zarr itself, ``rows`` at a call: a chunk, or a whole shard, which it decodes in one batch."""
     group = zarr.open_group(str(path), mode="r")
-    for layer in ("height", "ortho", "terrain"):
-        for first in range(0, len(group[layer]), rows):
-            group[layer][first : first + rows]
+    for name, array in group.arrays():
+        for first in range(0, len(array) if name != "sample_id" else 0, rows):
+            array[first : first + rows]
 
 
 def epoch(batches):

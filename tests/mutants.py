@@ -209,11 +209,13 @@ def main() -> None:
         if not mine:
             continue
         cpu_s = 10 + int(4 * warm_up(tests))
-        survivors = [mutant for mutant in mine if run_tests(tests, mutant, cpu_s) not in NOTICED]
-        print(f"{room}: {len(mine) - len(survivors)} of {len(mine)} noticed", flush=True)
-        for mutant in survivors:
-            print(f"  {mutant.told()}", flush=True)
-        lived += len(survivors)
+        survivors = 0
+        for mutant in mine:
+            if run_tests(tests, mutant, cpu_s) not in NOTICED:
+                survivors += 1
+                print(f"  {mutant.told()}", flush=True)
+        print(f"{room}: {len(mine) - survivors} of {len(mine)} noticed", flush=True)
+        lived += survivors
     share = 1 - lived / max(len(mutants), 1)
     print(f"{share:.1%} of {len(mutants)} noticed, in {time.monotonic() - began:.0f} s")
     sys.exit(share < ENOUGH)
