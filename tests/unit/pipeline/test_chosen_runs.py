@@ -13,6 +13,7 @@ from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
 @pytest.fixture
@@ -59,12 +60,14 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     make_outdated(store, "a")
     assert runs(store, tmp_path) == ["b", "c"]
     assert open_dataset(tmp_path / "out").card["problems"] == [
-        "1 of 3 runs have no ingestion of data model 1.0 (they have 0.9): a; ingest their logs again: tcpipe ingest /logs/a.mcap"
+        f"1 of 3 runs have no ingestion of data model {DATA_MODEL_VERSION} (they have 0.9): a; "
+        "ingest their logs again: tcpipe ingest /logs/a.mcap"
     ]
     found = inspect(store.root, recipe=Recipe())
     assert (found["outdated"], found["unfinished"]) == ({"a": "0.9"}, [])
     with pytest.raises(
-        StoreError, match=r"runs/a: holds no finished ingestion of data model 1\.0; ingest its log again"
+        StoreError,
+        match=rf"runs/a: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again",
     ):
         report(store.root / "runs" / "a")
 
@@ -72,6 +75,7 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
 def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
     make_outdated(store, "a", "b", "c")
     with pytest.raises(
-        DatasetError, match=r"3 runs in the store, all of data model 0\.9, wanted 1\.0; ingest their logs"
+        DatasetError,
+        match=rf"3 runs in the store, all of data model 0\.9, wanted {DATA_MODEL_VERSION}; ingest their logs",
     ):
         runs(store, tmp_path)
