@@ -60,8 +60,10 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     make_outdated(store, "a")
     assert runs(store, tmp_path) == ["b", "c"]
     assert open_dataset(tmp_path / "out").card["problems"] == [
-        f"1 of 3 runs have no ingestion of data model {DATA_MODEL_VERSION} (they have 0.9): a; "
-        "ingest their logs again: tcpipe ingest /logs/a.mcap"
+        (
+            f"1 of 3 runs have no ingestion of data model {DATA_MODEL_VERSION} (they have 0.9): a; "
+            "ingest their logs again: tcpipe ingest /logs/a.mcap"
+        )
     ]
     found = inspect(store.root, recipe=Recipe())
     assert (found["outdated"], found["unfinished"]) == ({"a": "0.9"}, [])
