@@ -84,14 +84,18 @@ def add_map(
 
     if strays:
         raise UsageError(f"{strays[0]}: belongs to no option; is a pattern without quotes? wanted --height 'dem/*.tif'")
+    files = _by_name("--layer", layers, "the tiles of one layer are a pattern: NAME='tiles/*.tif'")
+    tables = _by_name("--categorical", categorical, "wanted one class table a layer")
+    if bare := [layer for layer, file in files.items() if not (layer and file)]:
+        raise UsageError(f"--layer {bare[0]}: wanted NAME=FILE")
     with progress(f"map {name}", 1, quiet=quiet):
         added = run(
             name,
             height=height,
             ortho=ortho,
             terrain=terrain,
-            layers=_layers(layers),
-            categorical=_categorical(categorical),
+            layers=files,
+            categorical={name: table or None for name, table in tables.items()},
             ortho_bands=ortho_bands,
             classes=classes,
             crs=crs,
@@ -104,27 +108,11 @@ def add_map(
         say_lines(added)
 
 
-def _layers(given: tuple[str, ...]) -> dict[str, str]:
-    """Return the file, or the pattern, of each layer, from NAME=FILE."""
-    files: dict[str, str] = {}
-    for text in given:
-        name, sign, file = text.partition("=")
-        if not (sign and name and file):
-            raise UsageError(f"--layer {text}: wanted NAME=FILE")
-        if name in files:
-            raise UsageError(
-                f"--layer {name}: is given twice; the tiles of one layer are a pattern: {name}='tiles/*.tif'"
-            )
-        files[name] = file
-    return files
-
-
-def _categorical(given: tuple[str, ...]) -> dict[str, str | None]:
-    """Return the class table of each categorical layer, from NAME or NAME=FILE; None where the raster names its values."""
-    tables: dict[str, str | None] = {}
-    for text in given:
-        name, _, file = text.partition("=")
-        if name in tables:
-            raise UsageError(f"--categorical {name}: is given twice; wanted one class table a layer")
-        tables[name] = file or None
-    return tables
+def _by_name(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:
+    """Return what stands behind the equals sign by what stands before it, from NAME=FILE; empty where there is none."""
+    found: dict[str, str] = {}
+    for name, _, file in (text.partition("=") for text in given):
+        if name in found:
+            raise UsageError(f"{option} {name}: is given twice; {hint}")
+        found[name] = file
+    return found

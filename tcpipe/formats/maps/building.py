@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +17,7 @@ from tcpipe.formats.maps.map_files import SHARD_PX, MapFile, MapWriter, open_map
 from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
 from tcpipe.formats.seals import write_checksums
-from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, ClassTable, named_scheme, own_scheme
+from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, named_scheme, own_scheme
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import (
     COLOURS,
@@ -40,21 +40,24 @@ _RGB: tuple[Use, ...] = ("red", "green", "blue")
 
 @dataclass(frozen=True, slots=True)
 class MapSummary:
-    """What `build_map` made.
+    """What `build_map` made: files, share of the grid's pixels with data, share of each class among pixels with one, by layer."""
 
-    ``covered`` is the share of the grid's pixels with data, by layer; ``class_share`` the share of each class among pixels with one.
-    """
-
-    name: str
-    path: Path
     grid: MapGrid
-    classes: ClassTable
-    layers: tuple[str, ...]
-    covered: dict[str, float]
+    sources: Mapping[str, str]
+    covered: Mapping[str, float]
     height_min_m: float
     height_max_m: float
-    class_share: dict[str, float]
+    class_share: Mapping[str, float]
+    """Of terrain."""
+    class_shares: Mapping[str, Mapping[str, float]]
+    """Of the user's own layers."""
     warnings: tuple[str, ...]
+
+    def facts(self) -> dict[str, Any]:
+        """Return what the map keeps of it, as JSON values."""
+        found = {name: value for name, value in asdict(self).items() if value or name != "class_shares"}
+        del found["grid"]
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +157,8 @@ def build_map(
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
-            summary = _summary(out_path, name, grid, scheme.table, layers)
-            facts = {**_facts(summary, layers), "classes_from": origin, "inputs": dict(inputs or {})}
+            summary = _summary(grid, layers)
+            facts = {**summary.facts(), "classes_from": origin, "inputs": dict(inputs or {})}
             writer.finish(facts, {role: _ranged(source) for role, source in layers.items()})
             write_checksums(half)
             if look is not None:
@@ -289,45 +292,24 @@ def _notes(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> t
     return tuple(notes)
 
 
-def _summary(
-    path: Path, name: str, grid: MapGrid, classes: ClassTable, layers: Mapping[str, LayerSource]
-) -> MapSummary:
+def _summary(grid: MapGrid, layers: Mapping[str, LayerSource]) -> MapSummary:
     covered = {role: layer.tally.pixels / (grid.rows * grid.cols) for role, layer in layers.items()}
+    shares = {name: found for name, layer in layers.items() if (found := _shares(layer))}
     return MapSummary(
-        name=name,
-        path=path,
         grid=grid,
-        classes=classes,
-        layers=tuple(layers),
+        sources={role: layer.name for role, layer in layers.items()},
         covered=covered,
         height_min_m=layers["height"].tally.low,
         height_max_m=layers["height"].tally.high,
-        class_share=_shares(layers["terrain"], classes) if "terrain" in layers else {},
+        class_share=shares.pop("terrain", {}),
+        class_shares=shares,
         warnings=_notes(layers, covered),
     )
 
 
-def _shares(source: LayerSource, classes: ClassTable) -> dict[str, float]:
-    """Return the share of each class that occurs among the pixels that have one."""
-    counts = source.tally.by_class
+def _shares(source: LayerSource) -> dict[str, float]:
+    """Return the share of each class that occurs among the pixels that have one; nothing of a layer without classes."""
+    counts, classes = source.tally.by_class, source.layer.classes
     total = max(int(counts[1:].sum()), 1)
-    return {entry.name: float(counts[entry.id] / total) for entry in classes.classes if counts[entry.id]}
-
-
-def _own_shares(layers: Mapping[str, LayerSource]) -> dict[str, Any]:
-    """Return the shares of the user's categorical layers, if there are any, by name."""
-    own = {name: source for name, source in layers.items() if name not in PAPER_LAYERS}
-    found = {name: _shares(each, each.layer.classes) for name, each in own.items() if each.layer.classes is not None}
-    return {"class_shares": found} if found else {}
-
-
-def _facts(summary: MapSummary, layers: Mapping[str, LayerSource]) -> dict[str, Any]:
-    return {
-        "sources": {role: layer.name for role, layer in layers.items()},
-        "covered": summary.covered,
-        "height_min_m": summary.height_min_m,
-        "height_max_m": summary.height_max_m,
-        "class_share": summary.class_share,
-        **_own_shares(layers),
-        "warnings": list(summary.warnings),
-    }
+    entries = () if classes is None else classes.classes
+    return {entry.name: float(counts[entry.id] / total) for entry in entries if counts[entry.id]}
