@@ -53,12 +53,6 @@ class MapSummary:
     """Of the user's own layers."""
     warnings: tuple[str, ...]
 
-    def facts(self) -> dict[str, Any]:
-        """Return what the map keeps of it, as JSON values."""
-        found = {name: value for name, value in asdict(self).items() if value or name != "class_shares"}
-        del found["grid"]
-        return found
-
 
 @dataclass(frozen=True, slots=True)
 class MoreLayers:
@@ -158,7 +152,7 @@ def build_map(
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
             summary = _summary(grid, layers)
-            facts = {**summary.facts(), "classes_from": origin, "inputs": dict(inputs or {})}
+            facts = {**_facts(summary), "classes_from": origin, "inputs": dict(inputs or {})}
             writer.finish(facts, {role: _ranged(source) for role, source in layers.items()})
             write_checksums(half)
             if look is not None:
@@ -305,6 +299,13 @@ def _summary(grid: MapGrid, layers: Mapping[str, LayerSource]) -> MapSummary:
         class_shares=shares,
         warnings=_notes(layers, covered),
     )
+
+
+def _facts(summary: MapSummary) -> dict[str, Any]:
+    """Return what the map keeps of its summary, as JSON values."""
+    found = {name: value for name, value in asdict(summary).items() if value or name != "class_shares"}
+    del found["grid"]
+    return found
 
 
 def _shares(source: LayerSource) -> dict[str, float]:
