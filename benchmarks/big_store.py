@@ -1,6 +1,5 @@
 """A store of the paper's size without logs: its simulated map, and runs whose segments meander over it."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +8,7 @@ from pyproj import Geod, Transformer
 from tcpipe import __version__
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.scenarios import scenario
@@ -101,26 +101,26 @@ def _add_run(store: Store, number: int, rows: int) -> None:
     table = LABELLED_SEGMENTS.table(**given, **rest)
     info = TrackInfo(run_id, "husky", Datum(lon[0], lat[0], 600.0), 20.0, "smoother")
     recipe = Recipe()
-    identity = recipe_id(recipe, "husky")
-    store.write_run_json(run_id, {"source": {"paths": [f"{run_id}.mcap"], "size_bytes": 1, "sha256": run_id}})
+    ledger_m = {"kept": float(floats(table, "arc_length_m").sum())}
+    store.write_run_json(run_id, RunJson(LogOrigin((f"{run_id}.mcap",), run_id, 1)))
+    manifest = Manifest(
+        run_id=run_id,
+        recipe_id=recipe_id(recipe, "husky"),
+        data_model_version=DATA_MODEL_VERSION,
+        tcpipe_version=__version__,
+        ingest_key=ingest_key(recipe),
+        recipe=recipe.ingest,
+        robot="husky",
+        tags={},
+        counts=Counts(rows),
+        ledger_m=ledger_m,
+        warnings=(),
+        damage=(),
+        info=info,
+    )
     store.write_run(
-        run_id,
-        identity,
+        manifest,
         track=Track(TRACK.empty(), REJECTIONS.empty(), info),
         gated=GatedTrack(GATED_TRACK.empty(), info),
-        labelled=LabelledSegments(table, info, {"kept": float(floats(table, "arc_length_m").sum())}),
-        manifest={
-            "data_model_version": DATA_MODEL_VERSION,
-            "tcpipe_version": __version__,
-            "ingest_key": ingest_key(recipe),
-            "recipe": asdict(recipe),
-            "recipe_id": identity,
-            "run_id": run_id,
-            "robot": "husky",
-            "robot_requested": None,
-            "tags": {},
-            "counts": {"segments": rows},
-            "warnings": [],
-            "damage": [],
-        },
+        labelled=LabelledSegments(table, info, ledger_m),
     )

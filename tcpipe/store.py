@@ -20,7 +20,7 @@ import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,17 +32,25 @@ from tcpipe.formats.json_files import digest, plain, typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.places import local_output
 from tcpipe.formats.record_files import put_record, read_record, read_records, record_name
-from tcpipe.formats.seals import CHECKSUMS, checksums_to_json, prove_files, read_sealed, write_checksums, write_sealed
-from tcpipe.tables.findings import EnergyBudget, Findings, RunFacts
+from tcpipe.formats.run_documents import Manifest, ManifestHead, RunJson, StreamInfo
+from tcpipe.formats.seals import (
+    CHECKSUMS,
+    Checksum,
+    file_checksums,
+    prove_files,
+    read_sealed,
+    read_sealed_as,
+    write_checksums,
+    write_sealed,
+)
+from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     READ_VERSIONS,
     GatedTrack,
     LabelledSegments,
-    Sensor,
     Streams,
     Track,
-    TrackInfo,
     metadata_of,
     with_metadata,
 )
@@ -51,11 +59,6 @@ logger = logging.getLogger("tcpipe")
 
 RUN_FILES = ("track.parquet", "segments.parquet", "rejections.parquet")
 
-_MANIFEST = {
-    "run_id": str, "recipe_id": str, "ingest_key": str, "tcpipe_version": str, "robot": str, "tags": dict, "recipe": dict,
-    "counts": {"segments": int}, "ledger_m": dict, "warnings": [str], "damage": [str], "info": dict, "checksums": dict,
-}  # fmt: skip
-_RUN = {"source": {"paths": [str], "sha256": str}}
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _SIGNS = ("runs/*/run.json", "maps/*.zarr", "records/logs/*/*.json", "records/failed/*.json")
 """Of these a store has at least one."""
@@ -73,28 +76,13 @@ class RunDirectory:
     run_id: str
     recipe_id: str
     path: Path
-    manifest: Mapping[str, Any]
-
-    @property
-    def robot(self) -> str:
-        """The robot profile the run was ingested as."""
-        return str(self.manifest["robot"])
-
-    @property
-    def version(self) -> str:
-        """The data model it was written in."""
-        return str(self.manifest.get("data_model_version"))
+    manifest: Manifest
 
     @property
     def energy_budget(self) -> EnergyBudget | None:
         """The noise floor of its labels' energy; None without energies."""
-        label = self.info.findings.facts.label
+        label = self.manifest.info.findings.facts.label
         return None if label is None else label.energy_budget
-
-    @property
-    def info(self) -> TrackInfo:
-        """What belongs to the whole track, with what every stage noticed."""
-        return typed(self.manifest["info"], TrackInfo, self.path / "manifest.json")
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
@@ -104,7 +92,7 @@ class RunDirectory:
 
     def prove(self, *names: str) -> None:
         """Compare files with what the manifest has of them; `StoreError` names the first that is not as it was written."""
-        prove_files(self.path, self.manifest["checksums"], names)
+        prove_files(self.path, plain(self.manifest.checksums), names)
 
     def segments(self) -> pa.Table:
         """Read the labelled segments (schema LABELLED_SEGMENTS)."""
@@ -112,11 +100,11 @@ class RunDirectory:
 
     def labelled_segments(self) -> LabelledSegments:
         """Read the labelled segments as a checked level, with the run's info and ledger."""
-        return LabelledSegments(self.segments(), self.info, self.manifest["ledger_m"])
+        return LabelledSegments(self.segments(), self.manifest.info, self.manifest.ledger_m)
 
     def track(self) -> GatedTrack:
         """Read the gated track as a checked level."""
-        return GatedTrack(self.table("track"), self.info)
+        return GatedTrack(self.table("track"), self.manifest.info)
 
     def rejections(self) -> pa.Table:
         """Read the measurements that the filter refused (schema REJECTIONS)."""
@@ -129,7 +117,7 @@ class Ingestions:
 
     finished: tuple[RunDirectory, ...]
     """Those of this data-model version, by run and recipe."""
-    outdated: Mapping[str, RunDirectory]
+    outdated: Mapping[str, ManifestHead]
     """By run, of those that are finished in other data-model versions only: the last."""
     damaged: Mapping[Path, str]
     """By directory of an ingestion: what is not as it was written."""
@@ -178,7 +166,7 @@ class Store:
     def ingestions(self, run_id: str | None = None) -> Ingestions:
         """Return what there is of all runs, or of one; every manifest is read once, and proved."""
         superseded = self.superseded() if run_id is None else {}
-        finished, others, damaged = list[RunDirectory](), dict[str, RunDirectory](), dict[Path, str]()
+        finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[Path, str]()
         for name in [run_id] if run_id is not None else self.run_ids():
             if name in superseded:
                 continue
@@ -186,16 +174,16 @@ class Store:
                 if path.name == "streams" or path.name.startswith(TEMPORARY_PREFIX):
                     continue
                 try:
-                    run = _ingestion(path)
+                    found = _ingestion(path)
                 except StoreError as error:
                     damaged[path] = error.problems[0]
                     continue
-                if run.version in READ_VERSIONS:
-                    finished.append(run)
+                if isinstance(found, RunDirectory):
+                    finished.append(found)
                 else:
-                    others[name] = run
+                    others[name] = found
         current = {run.run_id for run in finished}
-        outdated = {name: run for name, run in others.items() if name not in current}
+        outdated = {name: head for name, head in others.items() if name not in current}
         return Ingestions(tuple(finished), outdated, damaged, superseded)
 
     def superseded(self) -> dict[str, str]:
@@ -236,7 +224,7 @@ class Store:
     def _runs_of(self, sha256: str) -> Iterator[str]:
         for path in sorted(self.runs_path.glob(f"*-{sha256[:_NAME_HEX]}*")):
             known, end = self.known_run(path.name), f"-{sha256[:_NAME_HEX]}"
-            if path.name.endswith(end) if known is None else known["source"]["sha256"] == sha256:
+            if path.name.endswith(end) if known is None else known.source.sha256 == sha256:
                 yield path.name
 
     def _free_name(self, stem: str, sha256: str) -> str:
@@ -255,7 +243,7 @@ class Store:
         """Return the run of a recording, among `run_ids_by_hash`; None where there is none."""
         for run_id in among.get(sha256[:_NAME_HEX], ()):
             known = self.known_run(run_id)
-            if known is not None and known["source"]["sha256"] == sha256:
+            if known is not None and known.source.sha256 == sha256:
                 return run_id
         return None
 
@@ -268,17 +256,17 @@ class Store:
             if path.exists():
                 write_sealed(path, {**read_sealed(path), "tags": dict(tags)})
 
-    def run_json(self, run_id: str) -> dict[str, Any] | None:
+    def run_json(self, run_id: str) -> RunJson | None:
         """Return what is known of a run's log, or None; `StoreError` if it is not as it was written, or another run's."""
         path = self.runs_path / run_id / "run.json"
         if not path.exists():
             return None
-        found = read_sealed(path, _RUN)
-        if not is_named_after(run_id, found["source"]["sha256"]):
-            raise StoreError(f"{path}: is of another run: its log's sha256 begins with {found['source']['sha256'][:8]}")
+        found = read_sealed_as(path, RunJson)
+        if not is_named_after(run_id, found.source.sha256):
+            raise StoreError(f"{path}: is of another run: its log's sha256 begins with {found.source.sha256[:8]}")
         return found
 
-    def known_run(self, run_id: str) -> dict[str, Any] | None:
+    def known_run(self, run_id: str) -> RunJson | None:
         """Return `run_json`; None also where it is not as it was written, which is said: the run is to be made again."""
         try:
             return self.run_json(run_id)
@@ -286,7 +274,7 @@ class Store:
             logger.warning("%s; the run is made again when its log is ingested", error.problems[0])
             return None
 
-    def write_run_json(self, run_id: str, values: Mapping[str, Any]) -> None:
+    def write_run_json(self, run_id: str, values: RunJson) -> None:
         """Write what is known of a run's log."""
         write_sealed(self.runs_path / run_id / "run.json", values)
 
@@ -309,17 +297,11 @@ class Store:
 
     def write_streams(self, run_id: str, streams: Streams, *, key: str) -> None:
         """Write L1 whole or not at all; ``key`` names the read settings they were made with."""
-        shared = {
-            "key": key,
-            "robot": streams.robot,
-            "gnss_crs": streams.gnss_crs,
-            "power_averaged": streams.power_averaged,
-            "findings": plain(streams.findings),
-        }
         with atomic_directory(self.runs_path / run_id / "streams") as directory:
             for role, table in streams.tables.items():
-                sensor = asdict(streams.sensors[role])
-                write_table(with_metadata(table, {**shared, "sensor": sensor}), directory / f"{role}.parquet")
+                read_with = key, streams.robot, streams.gnss_crs, streams.power_averaged
+                told = StreamInfo(*read_with, findings=streams.findings, sensor=streams.sensors[role])
+                write_table(with_metadata(table, plain(told)), directory / f"{role}.parquet")
             write_checksums(directory)
 
     def read_streams(self, run_id: str, *, key: str) -> Streams | None:
@@ -330,69 +312,51 @@ class Store:
             prove_files(directory, listed, {*listed, *(path.name for path in directory.glob("*.parquet"))})
         except StoreError:
             return None
-        tables: dict[str, pa.Table] = {}
-        sensors: dict[str, Sensor] = {}
-        shared: dict[str, Any] = {}
-        for path in sorted(directory.glob("*.parquet")):
-            try:
-                table = read_table(path)
-            except StoreError:
-                return None
-            shared = metadata_of(table)
-            if shared.get("key") != key or shared.get("data_model_version") not in READ_VERSIONS:
-                return None
-            sensor = shared["sensor"]
-            sensors[path.stem] = Sensor(
-                **{**sensor, "xyz_m": tuple(sensor["xyz_m"]), "quat_xyzw": tuple(sensor["quat_xyzw"])}
-            )
-            tables[path.stem] = table.replace_schema_metadata(None)
-        if not tables:
-            return None
+        tables, of = dict[str, pa.Table](), dict[str, StreamInfo]()
         try:
-            findings = typed(shared["findings"], Findings[RunFacts], directory)
-            return Streams(tables, sensors, shared["robot"], shared["gnss_crs"], shared["power_averaged"], findings)
+            for path in sorted(directory.glob("*.parquet")):
+                table = read_table(path)
+                of[path.stem] = told = typed(metadata_of(table), StreamInfo, path)
+                if told.key != key or told.data_model_version not in READ_VERSIONS:
+                    return None
+                tables[path.stem] = table.replace_schema_metadata(None)
+            if not tables:
+                return None
+            sensors = {role: each.sensor for role, each in of.items()}
+            return Streams(tables, sensors, told.robot, told.gnss_crs, told.power_averaged, told.findings)
         except (TableError, StoreError):
             return None
 
-    def write_run(
-        self,
-        run_id: str,
-        recipe_id: str,
-        *,
-        track: Track,
-        gated: GatedTrack,
-        labelled: LabelledSegments,
-        manifest: Mapping[str, Any],
-    ) -> Path:
-        """Write one ingestion; the directory appears by one rename."""
-        path = self.runs_path / run_id / recipe_id
-        info = plain(labelled.info)
+    def write_run(self, manifest: Manifest, *, track: Track, gated: GatedTrack, labelled: LabelledSegments) -> Path:
+        """Write one ingestion, its checksums added to the manifest; the directory appears by one rename."""
+        path = self.runs_path / manifest.run_id / manifest.recipe_id
+        told = {
+            "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": plain(manifest.info.datum), "robot": manifest.robot,
+        }  # fmt: skip
+        tables = {"track": gated.table, "segments": labelled.table, "rejections": track.rejections}
         with atomic_directory(path) as directory:
-            for name, table in (
-                ("track", gated.table),
-                ("segments", labelled.table),
-                ("rejections", track.rejections),
-            ):
-                datum = {"run_id": run_id, "recipe_id": recipe_id, "datum": info["datum"], "robot": info["robot"]}
-                write_table(with_metadata(table, datum), directory / f"{name}.parquet")
-            written = {"info": info, "ledger_m": dict(labelled.ledger_m), "checksums": checksums_to_json(directory)}
-            write_sealed(directory / "manifest.json", {**manifest, **written})
+            for name, table in tables.items():
+                write_table(with_metadata(table, told), directory / f"{name}.parquet")
+            checksums = {path: Checksum(*of) for path, of in file_checksums(directory).items()}
+            write_sealed(directory / "manifest.json", replace(manifest, checksums=checksums))
         return path
 
 
-def _ingestion(path: Path) -> RunDirectory:
-    """Read an ingestion; `StoreError` if its manifest is not as it was written, or another's, or a file is gone."""
+def _ingestion(path: Path) -> RunDirectory | ManifestHead:
+    """Read an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone."""
     name = path / "manifest.json"
-    found = read_sealed(name, _MANIFEST, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
-    run = RunDirectory(path.parent.name, path.name, path, found)
-    if run.version in READ_VERSIONS:
-        if (found["run_id"], found["recipe_id"]) != (run.run_id, run.recipe_id):
-            raise StoreError(
-                f"{name}: is of {found['run_id']}/{found['recipe_id']}, but lies in {run.run_id}/{run.recipe_id}"
-            )
-        gone = [file for file in RUN_FILES if not (path / file).is_file()]
-        if gone:
-            raise StoreError(f"{path / gone[0]}: is gone; ingest the log again")
+    document = read_sealed(name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
+    if document.get("data_model_version") not in READ_VERSIONS:
+        return typed(document, ManifestHead, name)
+    manifest = typed(document, Manifest, name)
+    run = RunDirectory(path.parent.name, path.name, path, manifest)
+    if (manifest.run_id, manifest.recipe_id) != (run.run_id, run.recipe_id):
+        raise StoreError(
+            f"{name}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {run.run_id}/{run.recipe_id}"
+        )
+    gone = [file for file in RUN_FILES if not (path / file).is_file()]
+    if gone:
+        raise StoreError(f"{path / gone[0]}: is gone; ingest the log again")
     return run
 
 

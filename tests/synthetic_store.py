@@ -1,6 +1,5 @@
 """A small store for tests of datasets: an analytic map and runs whose segments are laid out on it, without any log."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from map_worlds import World
 from tcpipe import __version__
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 from tcpipe.tables.levels import (
@@ -91,32 +91,28 @@ def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, se
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
     ledger_m = ledger_m or {"kept": metres, "standing": 0.0, "accelerating": 2.5}
     store.write_run_json(
-        run_id,
-        {
-            "source": {"paths": [f"/logs/{run_id}.mcap"], "size_bytes": 1, "sha256": sha256 or run_id},
-            "sensors": sensors or {},
-        },
+        run_id, RunJson(LogOrigin((f"/logs/{run_id}.mcap",), sha256 or run_id, 1), robot=None, sensors=sensors or {})
+    )
+    manifest = Manifest(
+        run_id=run_id,
+        recipe_id=identity,
+        data_model_version=DATA_MODEL_VERSION,
+        tcpipe_version=__version__,
+        ingest_key=ingest_key(recipe),
+        recipe=recipe.ingest,
+        robot=robot,
+        tags={},
+        counts=Counts(table.num_rows),
+        ledger_m=ledger_m,
+        warnings=(),
+        damage=(),
+        info=info,
     )
     store.write_run(
-        run_id,
-        identity,
+        manifest,
         track=Track(TRACK.empty(), REJECTIONS.empty(), info),
         gated=GatedTrack(GATED_TRACK.empty() if track is None else track, info),
         labelled=LabelledSegments(table, info, ledger_m),
-        manifest={
-            "data_model_version": DATA_MODEL_VERSION,
-            "tcpipe_version": __version__,
-            "ingest_key": ingest_key(recipe),
-            "recipe": asdict(recipe.ingest),
-            "recipe_id": identity,
-            "run_id": run_id,
-            "robot": robot,
-            "robot_requested": None,
-            "tags": {},
-            "counts": {"segments": table.num_rows},
-            "warnings": [],
-            "damage": [],
-        },
     )
 
 

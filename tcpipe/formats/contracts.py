@@ -6,19 +6,23 @@ from typing import Any
 
 import pyarrow as pa
 
-from tcpipe.formats.json_files import DIALECT, to_json
+from tcpipe.formats.json_files import DIALECT, schema_of, to_json
 from tcpipe.formats.recipe_toml import recipe_schema
+from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.tables.bits import name_of
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
 
+DOCUMENTS = {"run": RunJson, "manifest": Manifest}
+"""The JSON documents that others read, by the name of their schema."""
+
 
 def contracts() -> dict[str, str]:
-    """Return file name → JSON Schema text, for every table (one row as an object) and the recipe."""
+    """Return file name → JSON Schema text, for every table (one row as an object), the recipe and every document."""
     tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
     found = {f"{table.name}.schema.json": to_json(_table_schema(table)) for table in tables}
     found["recipe.schema.json"] = to_json({"$schema": DIALECT, **recipe_schema()})
-    return found
+    return found | {f"{name}.schema.json": schema_of(cls) for name, cls in DOCUMENTS.items()}
 
 
 def _table_schema(table: TableSchema) -> dict[str, Any]:

@@ -30,7 +30,7 @@ def plain(value: Any) -> Any:
     """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
     if is_dataclass(value) and not isinstance(value, type):
         told = ((of.name, getattr(value, of.name), "json" in of.metadata) for of in fields(value))
-        value = {name: item for name, item, left_out in told if item is not None or not left_out}
+        value = {name: item for name, item, left_out in told if not (left_out and item in (None, {}, []))}
     elif isinstance(value, Enum):
         value = value.value
     elif hasattr(value, "tolist"):  # numpy scalars and arrays

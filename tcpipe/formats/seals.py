@@ -10,11 +10,14 @@ import hashlib
 import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import digest, misfit, parse_json, plain, read_document, write_json
+from tcpipe.formats.json_files import digest, misfit, parse_json, plain, read_document, typed, write_json
+
+T = TypeVar("T")
 
 SEAL = "document_sha256"
 """Key of a sealed document that holds the sha256 (hex) of its canonical JSON without this key."""
@@ -31,13 +34,21 @@ _PAGE_SEAL = "<!-- sha256 of the lines above: {} -->\n"
 _PNG_START = b"\x89PNG\r\n\x1a\n"
 
 
-def write_sealed(path: Path, value: Mapping[str, Any]) -> None:
+@dataclass(frozen=True, slots=True)
+class Checksum:
+    """What a sealed document has of a file."""
+
+    size_bytes: int
+    sha256: str
+
+
+def write_sealed(path: Path, value: object) -> None:
     """Write a JSON object with a seal, whole or not at all."""
     write_json(path, sealed(value))
 
 
-def sealed(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a JSON object with its seal."""
+def sealed(value: object) -> dict[str, Any]:
+    """Return a dataclass or a mapping as a JSON object with its seal."""
     bare = {key: item for key, item in plain(value).items() if key != SEAL}
     return {**bare, SEAL: digest(bare)}
 
@@ -73,6 +84,11 @@ def read_sealed(
     if wrong:
         raise StoreError(f"{path}: is not what this version writes: {wrong}")
     return found
+
+
+def read_sealed_as(path: Path, cls: type[T]) -> T:
+    """Read and prove a sealed JSON object, as a dataclass; `StoreError` as `read_sealed`."""
+    return typed(read_sealed(path), cls, path)
 
 
 def prove_files(directory: Path, checksums: Mapping[str, Any], names: Iterable[str]) -> None:

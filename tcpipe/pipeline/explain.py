@@ -81,8 +81,8 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     recipe = parse_recipe(card["recipe"], where=str(directory / "dataset.json"))
     run = _run(opened, directory, card, sample)
     told = run.manifest
-    read_with = read_key(recipe, told["robot_requested"], definitions=told.get("message_definitions", ""))
-    streams = opened.read_streams(run.run_id, key=f"{read_with}-{told['tcpipe_version']}")
+    read_with = read_key(recipe, told.robot_requested, definitions=told.message_definitions)
+    streams = opened.read_streams(run.run_id, key=f"{read_with}-{told.tcpipe_version}")
     source = open_map(opened.map_path(sample["map"]))
     window = sample["start_ns"], sample["end_ns"]
     made = _made_again(sample, run, streams, source, recipe)
@@ -102,7 +102,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
         "recipe_differs_in": _changed_keys(recipe),
         "versions": {
             "dataset": card["tcpipe_version"],
-            "run": run.manifest["tcpipe_version"],
+            "run": run.manifest.tcpipe_version,
             "here": __version__,
             "data_model": card["data_model_version"],
         },
@@ -152,14 +152,14 @@ def _run(store: Store, directory: Path, card: Mapping[str, Any], sample: Mapping
 
 
 def _log(store: Store, run: RunDirectory) -> dict[str, Any]:
-    known = store.run_json(run.run_id) or {}
+    known = store.run_json(run.run_id)
     return {
         "run_id": run.run_id,
-        "robot": run.robot,
-        "paths": known.get("source", {}).get("paths", []),
-        "sha256": known.get("source", {}).get("sha256"),
-        "damage": known.get("damage", []),
-        "tags": dict(run.manifest.get("tags", {})),
+        "robot": run.manifest.robot,
+        "paths": list(known.source.paths) if known else [],
+        "sha256": known.source.sha256 if known else None,
+        "damage": list(known.damage) if known else [],
+        "tags": dict(run.manifest.tags),
     }
 
 
@@ -292,7 +292,7 @@ def _differences(
 
 def _reasons(card: Mapping[str, Any], sample: Mapping[str, Any], run: RunDirectory, source: MapFile) -> Iterator[str]:
     """Yield what is not as it was when the dataset was built, which may be why."""
-    versions = {card["tcpipe_version"], run.manifest["tcpipe_version"], __version__}
+    versions = {card["tcpipe_version"], run.manifest.tcpipe_version, __version__}
     if len(versions) > 1:
         yield f"made by tcpipe {', '.join(sorted(versions - {__version__}))}, this is {__version__}"
     for entry in card["maps"]:

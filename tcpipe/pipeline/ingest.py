@@ -9,21 +9,23 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, TcpipeError, UsageError, plain_line
 from tcpipe.execution import run_all
-from tcpipe.formats.json_files import digest, plain
-from tcpipe.formats.logs.joined import open_logs
+from tcpipe.formats.json_files import digest
+from tcpipe.formats.logs.joined import JoinedLog, open_logs
+from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, plain_recipe, read_key, recipe_id
+from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, read_key, recipe_id
 from tcpipe.formats.record_files import record_name
 from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
 from tcpipe.pipeline.known_trouble import Trouble, failure_name, failure_record
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
@@ -368,43 +370,39 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         task, log = opened or _opened(task, stack)
         logger.info("%s: reading", source.name)
         streams, damage, remarks = _streams(store, run_id, log, task)
-        known = {"sha256": sha256, "damage": damage, "remarks": remarks, "tags": _tags(store, run_id, task)}
-        known["message_definitions"] = task.definitions
-        store.write_run_json(run_id, _run_json(log, streams, source, known))
+        known = _run_json(task, log, streams, sha256)
+        known = replace(known, damage=damage, remarks=remarks, tags=_tags(store, run_id, task))
+        store.write_run_json(run_id, known)
         run = _fuse_and_label(store, run_id, streams, known, task)
     return _result(source, "done", run, sha256, same_as=same_as)
 
 
-def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, Any]:
+def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, Log | JoinedLog]:
     """Return the task with the log's files on this machine, and the log, both until ``stack`` ends."""
     source = stack.enter_context(on_this_machine(task.source))
-    log = stack.enter_context(open_logs(source.paths, message_definitions=task.message_definitions))
+    log = open_logs(source.paths, message_definitions=task.message_definitions)
+    stack.enter_context(log)
     return replace(task, source=source), log
 
 
-def _fuse_and_label(
-    store: Store, run_id: str, streams: Streams, known: Mapping[str, Any], task: IngestTask
-) -> RunDirectory:
+def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> RunDirectory:
     track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id, name=task.source.name)
-    identity = recipe_id(task.recipe, streams.robot)
-    names = {"run_id": run_id, "recipe_id": identity, "tags": known["tags"], "damage": known["damage"]}
-    manifest = {**_manifest(task, streams, track, labelled), **names}
-    path = store.write_run(run_id, identity, track=track, gated=gated, labelled=labelled, manifest=manifest)
+    manifest = _manifest(task, known, streams, track, labelled)
+    path = store.write_run(manifest, track=track, gated=gated, labelled=labelled)
     return next(run for run in store.recipes_of(run_id) if run.path == path)
 
 
 def _tags(store: Store, run_id: str, task: IngestTask) -> dict[str, str]:
     """Return the run's tags: those it has, and those given."""
     known = store.known_run(run_id)
-    before = known.get("tags", {}) if known else next((run.manifest["tags"] for run in store.recipes_of(run_id)), {})
+    before = known.tags if known else next((run.manifest.tags for run in store.recipes_of(run_id)), {})
     return {**before, **task.tags}
 
 
 def _retagged(store: Store, run_id: str, task: IngestTask) -> Status:
     """Set the tags of a run that is there already; "done" where that changed something."""
-    before = (store.known_run(run_id) or {}).get("tags", {})
-    tags = _tags(store, run_id, task)
-    if tags == before:
+    known, tags = store.known_run(run_id), _tags(store, run_id, task)
+    if tags == (known.tags if known else {}):
         return "unchanged"
     store.tag_run(run_id, tags)
     return "done"
@@ -412,8 +410,8 @@ def _retagged(store: Store, run_id: str, task: IngestTask) -> Status:
 
 def _twin(store: Store, run_id: str, source: LogSource) -> str | None:
     """Return where else the same recording was ingested from, if it was."""
-    before = (store.known_run(run_id) or {}).get("source", {}).get("paths")
-    return None if before is None or before == list(source.origins) else " + ".join(before)
+    known = store.known_run(run_id)
+    return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
 
 
 def run_stages(
@@ -440,89 +438,83 @@ def run_stages(
     return track, gated, labelled
 
 
-def _streams(store: Store, run_id: str, log: Any, task: IngestTask) -> tuple[Streams, list[str], list[str]]:
+def _streams(
+    store: Store, run_id: str, log: Log | JoinedLog, task: IngestTask
+) -> tuple[Streams, tuple[str, ...], tuple[str, ...]]:
     """Return L1, from the store when it was made with the same read settings, the log's damage, and remarks on it."""
     from tcpipe.stages.read import read_run  # noqa: PLC0415
 
     key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
     known = store.known_run(run_id)
-    same = known is not None and known.get("message_definitions", "") == task.definitions
+    same = known is not None and known.message_definitions == task.definitions
     cached = store.read_streams(run_id, key=key) if same and not task.force else None
     if cached is not None and known is not None:
-        return cached, list(known["damage"]), list(known.get("remarks", ()))
+        return cached, known.damage, known.remarks
     streams = read_run(log, task.recipe.read, robot=task.robot, known=profiles_of(task.recipe))
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
     store.write_streams(run_id, streams, key=key)
-    return streams, [str(damage) for damage in log.damage if damage.is_loss], log.remarks
+    return streams, tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.remarks)
 
 
 def _finished(store: Store, run_id: str, task: IngestTask) -> RunDirectory | None:
     key = ingest_key(task.recipe)
     for run in store.recipes_of(run_id):
-        manifest = run.manifest
-        same_robot = manifest["robot_requested"] == task.robot or (task.robot and manifest["robot"] == task.robot)
-        same_definitions = manifest.get("message_definitions", "") == task.definitions
-        same_version = manifest["tcpipe_version"] == __version__
-        if manifest["ingest_key"] == key and same_version and same_robot and same_definitions:
+        made = run.manifest
+        same_robot = made.robot_requested == task.robot or (task.robot and made.robot == task.robot)
+        same_version = made.tcpipe_version == __version__
+        if made.ingest_key == key and same_version and same_robot and made.message_definitions == task.definitions:
             return run
     return None
 
 
-def _run_json(log: Any, streams: Streams, source: LogSource, known: Mapping[str, Any]) -> dict[str, Any]:
-    paths = list(source.origins)
-    return {
-        "source": {"paths": paths, "size_bytes": log.size_bytes, "sha256": known["sha256"]},
-        "robot": streams.robot,
-        "tags": known["tags"],
-        "topics": [
-            {"name": topic.name, "type": topic.type_name, "messages": topic.message_count}
-            for topic in log.topics.values()
-        ],
-        "sensors": {role: asdict(sensor) for role, sensor in streams.sensors.items()},
-        "damage": known["damage"],
-        "remarks": known["remarks"],
-        "message_definitions": known["message_definitions"],
-        "findings": plain(streams.findings),
-    }
+def _run_json(task: IngestTask, log: Log | JoinedLog, streams: Streams, sha256: str) -> RunJson:
+    return RunJson(
+        source=LogOrigin(task.source.origins, sha256, log.size_bytes),
+        robot=streams.robot,
+        topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
+        sensors=streams.sensors,
+        message_definitions=task.definitions,
+        findings=streams.findings,
+    )
 
 
-def _manifest(task: IngestTask, streams: Streams, track: Track, labelled: LabelledSegments) -> dict[str, Any]:
-    warnings = (*streams.findings.warnings, *labelled.info.findings.warnings)
-    return {
-        "data_model_version": DATA_MODEL_VERSION,
-        "tcpipe_version": __version__,
-        "ingest_key": ingest_key(task.recipe),
-        "recipe": plain_recipe(task.recipe.ingest),
-        "robot": streams.robot,
-        "robot_requested": task.robot,
-        "message_definitions": task.definitions,
-        "counts": {
-            **{f"{role}_messages": table.num_rows for role, table in streams.tables.items()},
-            "track_rows": track.table.num_rows,
-            "rejections": track.rejections.num_rows,
-            "segments": labelled.table.num_rows,
-        },
-        "warnings": list(dict.fromkeys(warnings)),
-    }
+def _manifest(task: IngestTask, known: RunJson, streams: Streams, track: Track, labelled: LabelledSegments) -> Manifest:
+    info = labelled.info
+    rows = {f"{role}_messages": table.num_rows for role, table in streams.tables.items()}
+    return Manifest(
+        run_id=info.run_id,
+        recipe_id=recipe_id(task.recipe, streams.robot),
+        data_model_version=DATA_MODEL_VERSION,
+        tcpipe_version=__version__,
+        ingest_key=ingest_key(task.recipe),
+        recipe=task.recipe.ingest,
+        robot=streams.robot,
+        tags=known.tags,
+        counts=Counts(labelled.table.num_rows, track.table.num_rows, track.rejections.num_rows, **rows),
+        ledger_m=labelled.ledger_m,
+        warnings=tuple(dict.fromkeys(info.findings.warnings)),
+        damage=known.damage,
+        info=info,
+        robot_requested=task.robot,
+        message_definitions=task.definitions,
+    )
 
 
 def _result(source: LogSource, status: Status, run: RunDirectory, sha256: str, *, same_as: str | None) -> IngestResult:
-    manifest = run.manifest
-    ledger = manifest["ledger_m"]
-    damage = tuple(manifest["damage"])
+    made = run.manifest
     return IngestResult(
         log=source.name,
-        status="damaged" if damage and status == "done" else status,
+        status="damaged" if made.damage and status == "done" else status,
         run_id=run.run_id,
         recipe_id=run.recipe_id,
-        robot=run.robot,
-        segments=manifest["counts"]["segments"],
-        distance_m=sum(ledger.values()),
-        kept_m=ledger.get("kept", 0.0),
+        robot=made.robot,
+        segments=made.counts.segments,
+        distance_m=sum(made.ledger_m.values()),
+        kept_m=made.ledger_m.get("kept", 0.0),
         energy_budget=run.energy_budget,
-        warnings=tuple(manifest["warnings"]),
-        damage=damage,
+        warnings=made.warnings,
+        damage=made.damage,
         same_as=same_as,
         sha256=sha256,
     )

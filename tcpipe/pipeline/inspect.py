@@ -95,21 +95,21 @@ def _one_of(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
 
 def _run(path: Path, store: Store, runs: list[RunDirectory]) -> dict[str, Any]:
     run_id = runs[0].run_id
-    known = store.run_json(run_id) or {}
+    known = store.run_json(run_id)
     return {
         "kind": "run",
         "path": str(path),
         "run_id": run_id,
-        "source": known.get("source", {}),
-        "tags": known.get("tags", {}),
-        "remarks": known.get("remarks", []),
+        "source": plain(known.source) if known else {},
+        "tags": dict(known.tags) if known else {},
+        "remarks": list(known.remarks) if known else [],
         "recipes": [
             {
                 **_line(run),
-                "counts": run.manifest["counts"],
-                "ledger_m": run.manifest["ledger_m"],
-                "warnings": run.manifest["warnings"],
-                "damage": run.manifest["damage"],
+                "counts": plain(run.manifest.counts),
+                "ledger_m": dict(run.manifest.ledger_m),
+                "warnings": list(run.manifest.warnings),
+                "damage": list(run.manifest.damage),
             }
             for run in runs
         ],
@@ -118,7 +118,7 @@ def _run(path: Path, store: Store, runs: list[RunDirectory]) -> dict[str, Any]:
 
 def _store(store: Store) -> dict[str, Any]:
     found = store.ingestions()
-    runs, outdated = found.finished, {run_id: run.version for run_id, run in found.outdated.items()}
+    runs, outdated = found.finished, {run_id: str(head.data_model_version) for run_id, head in found.outdated.items()}
     damaged = {str(path): line for path, line in found.damaged.items()}
     seen = {*outdated, *found.superseded, *(run.run_id for run in runs), *(path.parent.name for path in found.damaged)}
     return {
@@ -126,8 +126,7 @@ def _store(store: Store) -> dict[str, Any]:
         "path": str(store.root),
         "maps": store.maps(),
         "runs": [
-            {**_line(run), "warnings": len(run.manifest["warnings"]), "damage": len(run.manifest["damage"])}
-            for run in runs
+            {**_line(run), "warnings": len(run.manifest.warnings), "damage": len(run.manifest.damage)} for run in runs
         ],
         "outdated": outdated,
         "damaged_runs": damaged,
@@ -140,7 +139,7 @@ def _line(run: RunDirectory) -> dict[str, Any]:
     return {
         "run_id": run.run_id,
         "recipe_id": run.recipe_id,
-        "robot": run.robot,
-        "segments": run.manifest["counts"]["segments"],
-        "distance_m": sum(run.manifest["ledger_m"].values()),
+        "robot": run.manifest.robot,
+        "segments": run.manifest.counts.segments,
+        "distance_m": sum(run.manifest.ledger_m.values()),
     }

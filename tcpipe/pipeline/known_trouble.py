@@ -120,10 +120,9 @@ def _known(store: Store) -> list[Trouble]:
     """Return all trouble that was told, and the damage of runs that were made before that was remembered."""
     known = [trouble_of(kind, record) for kind in ("failed", "damaged") for record in store.records(kind)]
     for run in store.runs():
-        source = (store.run_json(run.run_id) or {}).get("source", {})
-        if run.manifest["damage"] and source:
-            lines, log = tuple(run.manifest["damage"]), tuple(source["paths"])
-            known.append(Trouble("damaged", source["sha256"], lines, log, run.run_id))
+        about = store.run_json(run.run_id)
+        if run.manifest.damage and about:
+            known.append(Trouble("damaged", about.source.sha256, run.manifest.damage, about.source.paths, run.run_id))
     return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
 
 

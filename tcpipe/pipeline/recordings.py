@@ -90,7 +90,7 @@ def _at_that_time(
 ) -> Iterator[tuple[RunDirectory, _Way]]:
     """Yield the runs of the same robot that were recorded at the same time."""
     for other, theirs in kept:
-        if other.robot == run.robot and len(mine.start_ns) and len(theirs.start_ns):
+        if other.manifest.robot == run.manifest.robot and len(mine.start_ns) and len(theirs.start_ns):
             apart_ns = max(mine.start_ns[0], theirs.start_ns[0]) - min(mine.end_ns[-1], theirs.end_ns[-1])
             if apart_ns <= _SAME_TIME_NS:
                 yield other, theirs

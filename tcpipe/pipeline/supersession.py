@@ -6,7 +6,6 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -63,10 +62,10 @@ def remember_earlier(store: Store) -> None:
     if not (store.records_path / "logs").is_dir():
         for run_id in store.run_ids():
             with suppress(StoreError):  # told where it matters
-                origin: Mapping[str, Any] = (store.run_json(run_id) or {}).get("source", {})
-                if "paths" in origin:
-                    log = LogSource(tuple(map(Path, origin["paths"])), (), urls=tuple(origin["paths"]))
-                    store.remember(f"{log.lineage}/{run_id[-8:]}", log.sighting(origin["sha256"]))
+                if (known := store.run_json(run_id)) is not None:
+                    origin = known.source
+                    log = LogSource(tuple(map(Path, origin.paths)), (), urls=origin.paths)
+                    store.remember(f"{log.lineage}/{run_id[-8:]}", log.sighting(origin.sha256))
         (store.records_path / "logs").mkdir(
             parents=True, exist_ok=True
         )  # what a killed first ingest leaves is of no earlier version
@@ -74,11 +73,11 @@ def remember_earlier(store: Store) -> None:
 
 def _elsewhere(store: Store, run_id: str, source: LogSource) -> str:
     """Return where else a run's recording lies, "" where it is gone."""
-    sha256 = (store.run_json(run_id) or {})["source"]["sha256"]
+    known = store.run_json(run_id)
     for directory in sorted((store.records_path / "logs").glob("*")):
         lineage = f"logs/{directory.name}"
         for sighting in store.records(lineage) if lineage != source.lineage else ():
-            if sighting["sha256"] == sha256 and sighting["size_and_time"] and is_there(sighting):
+            if known and sighting["sha256"] == known.source.sha256 and sighting["size_and_time"] and is_there(sighting):
                 return " + ".join(sighting["log"])
     return ""
 

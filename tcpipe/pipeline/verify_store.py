@@ -12,9 +12,11 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
+from tcpipe.formats.json_files import plain, typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.run_documents import Manifest
 from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal, read_sealed
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.report.overview import shows_map
@@ -142,16 +144,19 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
     where = directory / _MANIFEST
-    manifest = read_sealed(where)
-    if manifest["data_model_version"] not in READ_VERSIONS:
+    document = read_sealed(where)
+    if document["data_model_version"] not in READ_VERSIONS:
         yield (
-            f"{where}: of data model {manifest['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
+            f"{where}: of data model {document['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
             "ingest the log again, then remove this directory"
         )
         return
-    yield from broken_checksums(directory, manifest["checksums"])
-    yield "files", len(manifest["checksums"]) + 1
-    yield from _unlisted(directory, {*manifest["checksums"], _MANIFEST, _REPORT})
+    manifest, recipe = typed(document, Manifest, where), document["recipe"]
+    if manifest.ingest_key != ingest_key(recipe) or directory.name != recipe_id(recipe, manifest.robot):
+        yield f"{where}: its recipe is not the one that the directory is named after"
+    yield from broken_checksums(directory, plain(manifest.checksums))
+    yield "files", len(manifest.checksums) + 1
+    yield from _unlisted(directory, {*manifest.checksums, _MANIFEST, _REPORT})
     if (directory / _REPORT).exists():
         yield broken_seal(directory / _REPORT) or ("files", 1)
     tables = {}
@@ -167,29 +172,26 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
     yield from (f"{directory / 'segments.parquet'}: {problem}" for problem in _wrong_joins(directory, manifest, tables))
 
 
-def _disagreements(directory: Path, manifest: Mapping[str, Any], tables: Mapping[str, pa.Table]) -> Iterator[str]:
+def _disagreements(directory: Path, manifest: Manifest, tables: Mapping[str, pa.Table]) -> Iterator[str]:
     """Yield what the manifest says otherwise than its directory and its tables."""
     for name, count in _COUNTS.items():
-        said = manifest["counts"].get(count, tables[name].num_rows)
-        if said != tables[name].num_rows:
+        said = getattr(manifest.counts, count)
+        if said not in (None, tables[name].num_rows):
             yield f"{count} is {said}, but {name}.parquet has {tables[name].num_rows} rows"
-    covered_m, kept_m = math.fsum(floats(tables["segments"], "arc_length_m")), manifest["ledger_m"].get(KEPT, 0.0)
+    covered_m, kept_m = math.fsum(floats(tables["segments"], "arc_length_m")), manifest.ledger_m.get(KEPT, 0.0)
     if not math.isclose(covered_m, kept_m, rel_tol=1e-9, abs_tol=1e-6):
         yield f"the ledger keeps {kept_m:.3f} m, the segments cover {covered_m:.3f} m"
-    recipe = manifest["recipe"]
-    if manifest["ingest_key"] != ingest_key(recipe) or directory.name != recipe_id(recipe, manifest["robot"]):
-        yield "its recipe is not the one that the directory is named after"
-    if manifest["run_id"] != directory.parent.name:
-        yield f"is of run {manifest['run_id']}, but lies in {directory.parent.name}"
+    if manifest.run_id != directory.parent.name:
+        yield f"is of run {manifest.run_id}, but lies in {directory.parent.name}"
 
 
-def _wrong_joins(directory: Path, manifest: Mapping[str, Any], tables: Mapping[str, pa.Table]) -> Iterator[str]:
+def _wrong_joins(directory: Path, manifest: Manifest, tables: Mapping[str, pa.Table]) -> Iterator[str]:
     """Yield what is wrong between segments and their run and track."""
     segments, run_id = tables["segments"], directory.parent.name
     start_ns, end_ns = (integers(segments, f"{end}_ns") for end in ("start", "end"))
     if segments.column("segment_id").to_pylist() != [f"{run_id}-{stamp}" for stamp in start_ns.tolist()]:
         yield "its segment ids are not the run's id and their start stamps"
-    for column, wanted in (("run_id", run_id), ("robot", manifest["robot"])):
+    for column, wanted in (("run_id", run_id), ("robot", manifest.robot)):
         others = set(segments.column(column).unique().to_pylist()) - {wanted}
         if others:
             yield f"holds segments of {column} {', '.join(sorted(others))}; wanted {wanted}"

@@ -15,6 +15,7 @@ from annotated_types import Ge, Le, Lt
 
 from tcpipe.recipe.checking import settle
 from tcpipe.robots.profiles import PowerSource, Robot
+from tcpipe.tables.findings import LEFT_OUT
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
@@ -279,8 +280,8 @@ class IngestSections:
     gate: GateConfig
     segment: SegmentConfig
     label: LabelConfig
-    robots: dict[str, Robot] = field(default_factory=dict)
-    power_sources: list[PowerSource] = field(default_factory=list)
+    robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
+    power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from pyproj import Transformer
 
 from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.run_documents import RunJson
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import DROPPED, KEPT, histograms, ledger_bars, over_distance, path_on_map
 from tcpipe.report.overview import map_overview
@@ -20,6 +21,7 @@ from tcpipe.report.quality import quality_sections
 from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.store import RunDirectory, Store
 from tcpipe.tables.bits import DropReason, Quality, name_of
+from tcpipe.tables.findings import PhysicsFacts
 
 _MOSTLY = 0.5
 
@@ -38,12 +40,12 @@ _COLOURS = {
 def run_report(store: Store, run: RunDirectory) -> str:
     """Return the HTML page of a run of the store; a map of the store that lies under the run is its background."""
     track, segments, manifest = run.track().table, run.segments(), run.manifest
-    source = store.run_json(run.run_id)
-    ledger = manifest["ledger_m"]
-    total = sum(ledger.values())
+    label = manifest.info.findings.facts.label
+    known = store.run_json(run.run_id)
+    ledger, total = manifest.ledger_m, sum(manifest.ledger_m.values())
     return render_page(
         title=f"Run {run.run_id}",
-        lead=f"Robot {run.robot}, recipe {run.recipe_id}, {_source_line(source)}",
+        lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {_source_line(known)}",
         numbers=[
             Number(f"{total:.0f} m", "driven"),
             Number(f"{segments.num_rows}", "segments"),
@@ -51,23 +53,20 @@ def run_report(store: Store, run: RunDirectory) -> str:
             Number(_mean(segments, "power_watt", "W"), "mean power w"),
             Number(_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
         ],
-        warnings=[*manifest["damage"], *manifest["warnings"]],
+        warnings=[*manifest.damage, *manifest.warnings],
         sections=[
             *_track_sections(store, run, track),
-            *_segment_sections(
-                segments, ledger, manifest["info"]["findings"]["facts"].get("label", {}).get("physics", {})
-            ),
+            *_segment_sections(segments, ledger, label.physics if label else None),
             *budget_sections(run.energy_budget),
-            *sensor_sections(source, manifest, run.rejections()),
+            *sensor_sections(known, manifest, run.rejections()),
         ],
     )
 
 
-def _source_line(source: Mapping[str, Any] | None) -> str:
-    if source is None:
+def _source_line(known: RunJson | None) -> str:
+    if known is None:
         return "source unknown"
-    size = source["source"]["size_bytes"] / 1e6
-    return f"from {', '.join(source['source']['paths'])} ({size:.1f} MB)"
+    return f"from {', '.join(known.source.paths)} ({known.source.size_bytes / 1e6:.1f} MB)"
 
 
 def _column(table: pa.Table, name: str) -> NDArray[Any]:
@@ -131,7 +130,7 @@ _Under = tuple[MapFile, NDArray[np.uint8], NDArray[Any], NDArray[Any]]
 
 def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under | None, list[tuple[str, str]]]:
     """Return the first map that holds most of the track, its picture and the track in its CRS, and the maps that cannot be read."""
-    gnss_crs = run.manifest["recipe"]["read"]["gnss_crs"]
+    gnss_crs = run.manifest.recipe.read.gnss_crs
     lon, lat = _column(track, "lon_deg"), _column(track, "lat_deg")
     lost: list[tuple[str, str]] = []
     for name in store.maps() if run.track().info.datum is not None else ():
@@ -145,22 +144,22 @@ def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under
     return None, lost
 
 
-def _physics_sections(segments: pa.Table, physics: Mapping[str, Any]) -> list[Section]:
+def _physics_sections(segments: pa.Table, physics: PhysicsFacts | None) -> list[Section]:
     """Return what rolling resistance and grade leave unexplained; nothing where they could not be fitted."""
-    if not physics.get("fitted"):
+    if physics is None or not physics.fitted:
         return []
     left = _column(segments, "power_watt").astype(float) - _column(segments, "physics_power_watt").astype(float)
-    resistance = physics["rolling_resistance"]
+    resistance = physics.rolling_resistance
     grade = "" if resistance is None else f", rolling resistance {resistance:.3f}"
     text = (
-        f"Power minus what rolling resistance and grade alone, fitted on this run, predict ({physics['segments']} segments{grade}): "
-        f"terrain, turning and errors. {physics['outliers']} segments are further than four standard deviations of "
-        f"{physics['residual_watt']:.0f} W."
+        f"Power minus what rolling resistance and grade alone, fitted on this run, predict ({physics.segments} segments{grade}): "
+        f"terrain, turning and errors. {physics.outliers} segments are further than four standard deviations of "
+        f"{physics.residual_watt:.0f} W."
     )
     return [Section("What physics leaves unexplained", text, histograms({"w - physics [W]": left}))]
 
 
-def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: Mapping[str, Any]) -> list[Section]:
+def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: PhysicsFacts | None) -> list[Section]:
     sections = [
         Section("Where every metre went", "Kept and dropped add up to the odometer.", ledger_bars(ledger)),
     ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Protocol
 
 import pyarrow as pa
@@ -17,7 +17,7 @@ class LogReader(Protocol):
     def topics(self) -> Mapping[str, Topic]:
         """Every topic by name, as the log's index tells."""
 
-    def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+    def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return a table a topic: one row a message in the order of log time, ``log_time_ns``, ``publish_time_ns``, fields by dotted name.
 
         A topic that cannot be decoded is missing from the result.

@@ -95,14 +95,14 @@ def test_the_kept_track_knows_its_speed_and_yaw(site: SimulatedSite, run: RunDir
 
 def test_whole_run_energy_and_odometer(site: SimulatedSite, run: RunDirectory) -> None:
     truth = read_truth(site.truths[0])
-    facts = run.manifest["info"]["findings"]["facts"]
-    assert facts["label"]["energy_joule"] == pytest.approx(truth.energy_joule[-1], rel=0.005)
-    assert sum(run.manifest["ledger_m"].values()) == pytest.approx(truth.distance_m[-1], rel=0.005)
+    facts = run.manifest.info.findings.facts
+    assert facts.label.energy_joule == pytest.approx(truth.energy_joule[-1], rel=0.005)
+    assert sum(run.manifest.ledger_m.values()) == pytest.approx(truth.distance_m[-1], rel=0.005)
 
 
 def test_every_metre_is_in_the_ledger_of_the_run_and_of_the_dataset(work: Path, run: RunDirectory) -> None:
     """The odometer here is a spline of SciPy through the track's rows."""
-    track, ledger_m = run.track().table, run.manifest["ledger_m"]
+    track, ledger_m = run.track().table, run.manifest.ledger_m
     seconds = (_column(track, "stamp_ns") - _column(track, "stamp_ns")[0]) * 1e-9
     pieces = np.split(np.arange(len(seconds)), np.flatnonzero(np.diff(seconds) > 0.075) + 1)
     metres = [
@@ -142,7 +142,7 @@ def test_steadily_driven_metres_become_segments(site: SimulatedSite, run: RunDir
     radius_m = np.abs(truth.forward_velocity_mps) / np.maximum(np.abs(truth.angular_velocity_radps[:, 2]), 1e-9)
     steady = settled & (truth.wheel_velocity_mps > 0.2) & (truth.forward_velocity_mps > 0.3) & (radius_m > 1.5)
     steady_m = np.diff(truth.distance_m, prepend=0.0)[steady].sum()
-    assert run.manifest["ledger_m"]["kept"] >= 0.90 * steady_m
+    assert run.manifest.ledger_m["kept"] >= 0.90 * steady_m
 
 
 def test_no_segment_contains_standing_or_turning_in_place(site: SimulatedSite, run: RunDirectory) -> None:

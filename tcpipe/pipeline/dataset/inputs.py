@@ -24,6 +24,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.recipe_toml import plain_recipe
+from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_sealed
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
@@ -66,7 +67,7 @@ def choose_inputs(
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     names = choose_maps(store, map_names)
     chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
-    once = each_drive_once(chosen.runs, {run_id: log["sha256"] for run_id, log in chosen.logs.items()})
+    once = each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
     runs = once.runs
     paths = tuple(store.map_path(name) for name in names)
     map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths, strict=True))
@@ -132,18 +133,18 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names)) or (maps[0],)
 
 
-def run_source(run: RunDirectory, log: Mapping[str, Any]) -> dict[str, Any]:
+def run_source(run: RunDirectory, log: LogOrigin) -> dict[str, Any]:
     """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, warnings and error budget."""
     return {
         "run_id": run.run_id,
         "recipe_id": run.recipe_id,
-        "robot": run.robot,
-        "tags": dict(run.manifest["tags"]),
-        "logs": [Path(path).name for path in log["paths"]],
-        "sha256": log["sha256"],
-        "segments_sha256": run.manifest["checksums"]["segments.parquet"]["sha256"],
-        "driven_m": math.fsum(run.manifest["ledger_m"].values()),
-        "warnings": list(run.manifest["warnings"]),
+        "robot": run.manifest.robot,
+        "tags": dict(run.manifest.tags),
+        "logs": [Path(path).name for path in log.paths],
+        "sha256": log.sha256,
+        "segments_sha256": run.manifest.checksums["segments.parquet"].sha256,
+        "driven_m": math.fsum(run.manifest.ledger_m.values()),
+        "warnings": list(run.manifest.warnings),
         "energy_budget": run.energy_budget,
     }
 

@@ -119,7 +119,7 @@ def _metres(
     """Return length [m], reason, slope and class (ids as `classes_at`) of every interval of a run's track."""
     track = run.table("track", _COLUMNS)
     stamp_ns, epoch = integers(track, "stamp_ns"), integers(track, "epoch")
-    piece = piece_of_rows(stamp_ns, epoch, period_ns=1e9 / run.manifest["info"]["rate_hz"])
+    piece = piece_of_rows(stamp_ns, epoch, period_ns=1e9 / run.manifest.info.rate_hz)
     position = np.column_stack([floats(track, f"{axis}_m") for axis in "xyz"])
     velocity = np.column_stack([floats(track, f"{name}_velocity_mps") for name in ("east", "north", "up")])
     length_m = interval_length_m(stamp_ns, position, velocity, piece)

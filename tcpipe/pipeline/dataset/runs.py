@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.formats.json_files import misfit
+from tcpipe.formats.json_files import misfit, typed
 from tcpipe.formats.recipe_toml import ingest_key
+from tcpipe.formats.run_documents import LogOrigin, Manifest, ManifestHead, RunJson
 from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
 from tcpipe.store import Ingestions, RunDirectory, Store
-from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +25,7 @@ class Chosen:
     """Runs of one robot and recipe, and what belongs to them but cannot be used."""
 
     runs: tuple[RunDirectory, ...]
-    logs: Mapping[str, Mapping[str, Any]]
+    logs: Mapping[str, LogOrigin]
     """By run, what its run.json says of its log."""
     missing: tuple[str, ...]
     """A line for each reason why runs that belong in have no ingestion that could be used."""
@@ -38,7 +39,7 @@ class Chosen:
 def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
     found, key = store.ingestions(), ingest_key(recipe)
-    mine = [run for run in found.finished if run.manifest["ingest_key"] == key]
+    mine = [run for run in found.finished if run.manifest.ingest_key == key]
     if not mine:
         raise DatasetError(*_nothing_to_pool(store, found))
     runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
@@ -52,18 +53,20 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     if not runs:
         raise DatasetError(*lines)
     if robot is None:
-        _refuse_unlike(store, [run.run_id for run in runs if run.robot == GENERIC])
-    others = [run for run in (*found.finished, *found.outdated.values()) if run.run_id not in {*known, *damaged}]
-    others = [run for run in others if _belongs(run.manifest, robot, tags)]
-    left_out = {*damaged, *(run.run_id for run in others)}
+        _refuse_unlike(store, [run.run_id for run in runs if run.manifest.robot == GENERIC])
+    settled = {*known, *damaged}
+    others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.manifest, robot, tags)}
+    older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
+    others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
+    left_out = {*damaged, *others, *older}
     total = len({run.run_id for run in runs} | left_out)
-    missing, warnings = tuple(_missing(store, others, total)), tuple(_remarks(store, found))
+    missing, warnings = tuple(_missing(store, others, older, total)), tuple(_remarks(store, found))
     return Chosen(tuple(runs), logs, missing, lines, frozenset(left_out | found.superseded.keys()), warnings)
 
 
 def _remarks(store: Store, found: Ingestions) -> Iterator[str]:
     """Yield a line about runs that have not finished, and about those that others have taken the place of."""
-    seen = {run.run_id for run in (*found.finished, *found.outdated.values())}
+    seen = {*found.outdated, *(run.run_id for run in found.finished)}
     unfinished = set(store.run_ids()) - seen - found.superseded.keys() - {path.parent.name for path in found.damaged}
     if unfinished:
         yield f"no ingestion of {_named(unfinished)} has finished; ingest again"
@@ -72,8 +75,8 @@ def _remarks(store: Store, found: Ingestions) -> Iterator[str]:
 
 
 def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:
-    robots = sorted({run.robot for run in runs})
-    wanted = [run for run in runs if robot is None or run.robot == robot]
+    robots = sorted({run.manifest.robot for run in runs})
+    wanted = [run for run in runs if robot is None or run.manifest.robot == robot]
     if not wanted:
         raise DatasetError(f"{store.root}: no run of robot {robot!r}; there are runs of {', '.join(robots)}")
     if robot is None and len(robots) > 1:
@@ -83,7 +86,7 @@ def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> 
 
 def _refuse_unlike(store: Store, run_ids: Iterable[str]) -> None:
     """Raise an error where runs of a robot that no profile knows are of robots whose sensors differ."""
-    groups = alike({run_id: _known(store, run_id).get("sensors", {}) for run_id in run_ids})
+    groups = alike({run_id: known.sensors if (known := _known(store, run_id)) else {} for run_id in run_ids})
     if len(groups) > 1:
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; wanted one: tag each "
@@ -94,10 +97,10 @@ def _refuse_unlike(store: Store, run_ids: Iterable[str]) -> None:
 
 def _tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
     """Return the runs that carry all of the tags; `DatasetError` with the tags there are where none does."""
-    chosen = [run for run in runs if tags.items() <= run.manifest.get("tags", {}).items()]
+    chosen = [run for run in runs if tags.items() <= run.manifest.tags.items()]
     if not chosen:
         wanted = " ".join(f"{key}={value}" for key, value in tags.items())
-        there = sorted({f"{key}={value}" for run in runs for key, value in run.manifest.get("tags", {}).items()})
+        there = sorted({f"{key}={value}" for run in runs for key, value in run.manifest.tags.items()})
         raise DatasetError(f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(there) or 'none'}")
     return chosen
 
@@ -113,7 +116,7 @@ def _nothing_to_pool(store: Store, found: Ingestions) -> list[str]:
             "(tcpipe ingest LOG), or give the recipe they were ingested with (--recipe FILE)"
         )
     elif found.outdated:
-        versions = ", ".join(sorted({run.version for run in found.outdated.values()}))
+        versions = ", ".join(sorted({str(head.data_model_version) for head in found.outdated.values()}))
         head = (
             f"{len(found.outdated)} runs in the store, all of data model {versions}, wanted {DATA_MODEL_VERSION}; "
             "ingest their logs again"
@@ -123,9 +126,9 @@ def _nothing_to_pool(store: Store, found: Ingestions) -> list[str]:
 
 def _proved(
     store: Store, runs: Sequence[RunDirectory]
-) -> tuple[list[RunDirectory], dict[str, Mapping[str, Any]], dict[str, str]]:
+) -> tuple[list[RunDirectory], dict[str, LogOrigin], dict[str, str]]:
     """Return the runs that are as they were written, what is known of their logs, and by run what is wrong with the others."""
-    whole, logs, damaged = list[RunDirectory](), dict[str, Mapping[str, Any]](), dict[str, str]()
+    whole, logs, damaged = list[RunDirectory](), dict[str, LogOrigin](), dict[str, str]()
     for run in runs:
         try:
             known = store.run_json(run.run_id)
@@ -136,19 +139,13 @@ def _proved(
         if known is None:
             damaged[run.run_id] = f"{run.path.parent / 'run.json'}: is gone"
         else:
-            logs[run.run_id] = known["source"]
+            logs[run.run_id] = known.source
             whole.append(run)
     return whole, logs, damaged
 
 
-def _missing(store: Store, others: Sequence[RunDirectory], total: int) -> list[str]:
+def _missing(store: Store, by_recipe: Mapping[str, str], by_version: Mapping[str, str], total: int) -> list[str]:
     """Return a line for each reason why runs that belong in have no ingestion that could be used."""
-    by_recipe, by_version = dict[str, str](), dict[str, str]()
-    for run in others:
-        if run.version in READ_VERSIONS:
-            by_recipe[run.run_id] = run.recipe_id
-        else:
-            by_version[run.run_id] = run.version
     return [
         f"{len(of)} of {total} runs have no ingestion {what} (they have {', '.join(sorted(set(of.values())))}): {_named(of)}; "
         f"ingest their logs again: tcpipe ingest {_logs_of(store, of)}"
@@ -157,19 +154,19 @@ def _missing(store: Store, others: Sequence[RunDirectory], total: int) -> list[s
     ]
 
 
-def _known(store: Store, run_id: str) -> Mapping[str, Any]:
-    """Return what run.json says, nothing where it cannot be believed."""
+def _known(store: Store, run_id: str) -> RunJson | None:
+    """Return what run.json says, None where it cannot be believed."""
     with suppress(StoreError):
-        return store.run_json(run_id) or {}
-    return {}
+        return store.run_json(run_id)
+    return None
 
 
-def _belongs(known: Mapping[str, Any], robot: str | None, tags: Mapping[str, str]) -> bool:
+def _belongs(known: RunJson | Manifest | ManifestHead | None, robot: str | None, tags: Mapping[str, str]) -> bool:
     """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
-    if robot is not None and known.get("robot", robot) != robot:
-        return False
-    its_tags = known.get("tags")
-    return not isinstance(its_tags, Mapping) or tags.items() <= its_tags.items()
+    if known is None:
+        return True
+    its_robot = robot is None or known.robot is None or known.robot == robot
+    return its_robot and (known.tags is None or tags.items() <= known.tags.items())
 
 
 def _named(run_ids: Iterable[str], most: int = 3) -> str:
@@ -180,7 +177,7 @@ def _named(run_ids: Iterable[str], most: int = 3) -> str:
 
 def _logs_of(store: Store, run_ids: Iterable[str]) -> str:
     """Return what to give to `tcpipe ingest` for the logs of runs: their folder, where they have one in common."""
-    paths = [path for run_id in run_ids for path in _known(store, run_id).get("source", {}).get("paths", ())]
+    paths = [path for run_id in run_ids if (known := _known(store, run_id)) for path in known.source.paths]
     with suppress(ValueError):  # no path, or some relative and some not
         folder = Path(os.path.commonpath(paths))
         if folder.is_absolute() and folder != Path(folder.anchor):
@@ -194,6 +191,10 @@ def gone_runs(
     """Return a line about the runs of the dataset that is replaced which the store no longer has, if any were not left out by choice."""
     here = {run.run_id for run in chosen.runs} | chosen.left_out
     before = [run for run in known.get("runs", ()) if misfit(run, {"run_id": str}) is None]
-    gone = [run["run_id"] for run in before if run["run_id"] not in here and _belongs(run, robot, tags)]
+    gone = [
+        run["run_id"]
+        for run in before
+        if run["run_id"] not in here and _belongs(typed(run, ManifestHead, Path("dataset.json")), robot, tags)
+    ]
     count = f"{len(gone)} of the {len(before)} runs of the dataset that is replaced"
     return (f"{count} are no longer in the store: {_named(gone)}",) if gone else ()

@@ -44,8 +44,8 @@ def pool_segments(
         None can: the lines say what the runs lack.
 
     """
-    names = dict.fromkeys(name for run in runs for name in run.manifest["ledger_m"])
-    ledger_m = {name: math.fsum(run.manifest["ledger_m"].get(name, 0.0) for run in runs) for name in names}
+    names = dict.fromkeys(name for run in runs for name in run.manifest.ledger_m)
+    ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}
     path, counts = directory / "segments.arrow", list[_Count]()
     write_pieces(path, LABELLED_SEGMENTS.arrow(), _usable(runs, again or {}, counts))
     every, powered, located = (

@@ -10,6 +10,7 @@ from wheel_drives import START_NS, drive_at, wheel_drive
 import tcpipe.pipeline.ingest as ingestion
 from tcpipe.errors import UsageError
 from tcpipe.formats.logs.writing import MessageStream, write_bag
+from tcpipe.formats.run_documents import LogOrigin, RunJson
 from tcpipe.pipeline import known_trouble
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
@@ -257,7 +258,7 @@ def test_a_link_is_called_what_the_user_calls_it(tmp_path):
     assert result.log == str(tmp_path / "logs" / "run.mcap")
     assert str(result.run_id).startswith("run-")
     (known,) = [Store(tmp_path / "store").run_json(run_id) for run_id in counted(tmp_path)]
-    assert known["source"]["paths"] == [result.log]
+    assert known.source.paths == (result.log,)
     annexed.unlink()
     with pytest.raises(UsageError, match=rf"run\.mcap: is a link to {annexed}, which is not there"):
         ingest([tmp_path / "logs" / "run.mcap"], store=tmp_path / "store", recipe=Recipe())
@@ -268,7 +269,7 @@ def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_pa
     hashes = ["abcdef01" + digit * 56 for digit in "012"] + ["abcdef01" + "0" * 55 + "9"]
     for sha256 in hashes:
         with store.claimed_run("latest", sha256) as run_id:
-            store.write_run_json(run_id, {"source": {"paths": ["/latest.bag"], "sha256": sha256}})
+            store.write_run_json(run_id, RunJson(LogOrigin(("/latest.bag",), sha256)))
             names.append(run_id)
     assert names == ["latest-abcdef01", "latest-abcdef011111", "latest-abcdef012222", "latest-abcdef010000"]
     for sha256, name in zip(hashes, names, strict=True):
@@ -296,7 +297,7 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     write_bag(second, wheel_drive(seed=1, start_ns=int(stream.log_time_ns[-1]) + 10**7))
     summary = ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
     assert [result.status for result in summary.results] == ["done", "done"]
-    known = [Store(tmp_path / "store").run_json(result.run_id)["remarks"] for result in summary.results]
+    known = [Store(tmp_path / "store").run_json(result.run_id).remarks for result in summary.results]
     taken = [sum("run_0.bag ends, whose static transforms are taken" in line for line in lines) for lines in known]
     assert taken == [0, 1]
 
@@ -304,8 +305,6 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
 def test_a_store_whose_first_ingest_was_killed_is_of_no_earlier_version(tmp_path):
     store = Store(tmp_path / "store")
     remember_earlier(store)
-    store.write_run_json(
-        "run-12345678", {"source": {"paths": ["/gone/run.mcap"], "sha256": "1" * 64}}
-    )  # and then it is killed
+    store.write_run_json("run-12345678", RunJson(LogOrigin(("/gone/run.mcap",), "1" * 64)))  # and then it is killed
     remember_earlier(store)
     assert not any(store.records_path.rglob("*.json"))

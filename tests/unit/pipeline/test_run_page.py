@@ -48,16 +48,16 @@ def test_without_any_readable_map_the_path_stands_alone(store, tmp_path):
 
 def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     run, html = page(store)
-    facts = run.manifest["info"]["findings"]["facts"]
+    facts = run.manifest.info.findings.facts
     trust = html.split("<h2>How far each sensor was believed</h2>")[1].split("<h2>")[0]
-    for role, nis in facts["fuse"]["nis_mean"].items():
+    for role, nis in facts.fuse.nis_mean.items():
         (row,) = [row for row in trust.split("<tr>") if f"<td>{role.replace('_', ' ')}</td>" in row]
         assert f"<td>{nis:.2f}</td>" in row
-        refused = facts["fuse"]["rejected"][role]
+        refused = facts.fuse.rejected[role]
         assert (f"<td>{refused} gate</td>" in row) == (refused > 0)
     clocks = html.split("<h2>Clocks</h2>")[1].split("<h2>")[0]
-    assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts["clock_offsets"]["offsets"])
-    assert f"Noise floor of E {100 * facts['label']['energy_budget']['total']:.1f} %" in html
+    assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts.clock_offsets.offsets)
+    assert f"Noise floor of E {100 * facts.label.energy_budget.total:.1f} %" in html
     assert "Kept and dropped add up to the odometer" in html
 
 

@@ -9,10 +9,11 @@ from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.unknown_robots import alike
 from tcpipe.store import Store
+from tcpipe.tables.levels import Sensor
 
 
 def sensor(topic, kind="sensor_msgs/msg/Imu", frame="imu_link"):
-    return {"topic": topic, "type_name": kind, "frame_id": frame}
+    return Sensor(topic, kind, frame, "the only one")
 
 
 ROVER = {"imu": sensor("/imu/data"), "gnss": sensor("/fix", "sensor_msgs/msg/NavSatFix", "gps")}

@@ -1,0 +1,108 @@
+"""The JSON documents of a run: run.json on its log, and manifest.json on what became of it under a recipe.
+
+A key with a default may be missing: documents of data model 1.0 have been written without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from tcpipe.formats.seals import Checksum
+from tcpipe.recipe import IngestSections
+from tcpipe.tables.findings import LEFT_OUT, NOTHING_FOUND, Findings, RunFacts
+from tcpipe.tables.levels import DATA_MODEL_VERSION, Sensor, TrackInfo
+
+
+@dataclass(frozen=True, slots=True)
+class LogOrigin:
+    """Where a run's log lay when it was ingested, and its content."""
+
+    paths: tuple[str, ...]
+    sha256: str
+    size_bytes: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class TopicCount:
+    """A topic of a log."""
+
+    name: str
+    type: str
+    messages: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class RunJson:
+    """The log and how it was read."""
+
+    source: LogOrigin
+    robot: str | None = None
+    tags: Mapping[str, str] = field(default_factory=dict)
+    topics: tuple[TopicCount, ...] = ()
+    sensors: Mapping[str, Sensor] = field(default_factory=dict)
+    damage: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+    message_definitions: str = ""
+    """Hash of the definitions that were given for types which the log does not define; "" without."""
+    findings: Findings[RunFacts] = NOTHING_FOUND
+
+
+@dataclass(frozen=True, slots=True)
+class Counts:
+    """How many segments, rows and refused measurements a run has, and messages of each role."""
+
+    segments: int
+    track_rows: int | None = field(default=None, metadata=LEFT_OUT)
+    rejections: int | None = field(default=None, metadata=LEFT_OUT)
+    gnss_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    imu_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    wheel_odometry_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    visual_odometry_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    power_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    command_messages: int | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What became of a run under a recipe: the metres by ledger entry, and what every stage noticed."""
+
+    run_id: str
+    recipe_id: str
+    data_model_version: str
+    tcpipe_version: str
+    ingest_key: str
+    """Hash of the recipe's sections that rule these files."""
+    recipe: IngestSections
+    robot: str
+    tags: Mapping[str, str]
+    counts: Counts
+    ledger_m: Mapping[str, float]
+    warnings: tuple[str, ...]
+    damage: tuple[str, ...]
+    info: TrackInfo
+    robot_requested: str | None = None
+    message_definitions: str = ""
+    checksums: Mapping[str, Checksum] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class ManifestHead:
+    """What is read of a manifest of another data model."""
+
+    data_model_version: str | None = None
+    robot: str | None = None
+    tags: Mapping[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class StreamInfo:
+    """What stands in the metadata of a role's Parquet file; ``key`` names the read settings it was made with."""
+
+    key: str
+    robot: str
+    gnss_crs: str
+    power_averaged: bool
+    findings: Findings[RunFacts]
+    sensor: Sensor
+    data_model_version: str = DATA_MODEL_VERSION

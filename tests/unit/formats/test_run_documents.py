@@ -1,0 +1,70 @@
+"""run.json and manifest.json: those of a kept store are read whole, and what does not fit is named by file and key."""
+
+import json
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import plain, read_as
+from tcpipe.formats.run_documents import Manifest, RunJson
+from tcpipe.formats.seals import SEAL, write_sealed
+from tcpipe.store import Store
+
+KEPT = Path(__file__).parents[2] / "data" / "store-1.0.tar.xz"
+SINCE = {"weight_over_efficiency_newton", "rolling_resistance", "gyro_bias_radps", "turn_scale"}
+"""Keys that are always there since, null where they were left out."""
+
+
+@pytest.fixture
+def kept(tmp_path):
+    with tarfile.open(KEPT) as archive:
+        archive.extractall(tmp_path, filter="data")
+    return tmp_path / "store"
+
+
+def without(value, names):
+    """The value without keys of these names that are null."""
+    if isinstance(value, dict):
+        return {key: without(of, names) for key, of in value.items() if of is not None or key not in names}
+    return [without(of, names) for of in value] if isinstance(value, list) else value
+
+
+@pytest.mark.parametrize(("pattern", "cls"), [("runs/*/run.json", RunJson), ("runs/*/*/manifest.json", Manifest)])
+def test_a_kept_document_is_read_whole_and_written_as_it_was(kept, pattern, cls):
+    (path,) = kept.glob(pattern)
+    written = json.loads(path.read_text())
+    del written[SEAL]
+    assert without(plain(read_as(path, cls)), SINCE) == without(written, SINCE)
+
+
+@pytest.mark.parametrize(
+    ("keys", "line"),
+    [
+        (("counts", "segments"), "counts.segments: wanted a whole number, got a list"),
+        (("ledger_m", "kept"), "ledger_m[...]: wanted a number, got a list"),
+        (
+            ("info", "findings", "facts", "fuse", "rows"),
+            "info.findings.facts.fuse.rows: wanted a whole number, got a list",
+        ),
+        (("info", "datum"), "info.datum: wanted an object or null, got a list"),
+    ],
+)
+def test_a_value_of_another_type_is_named_by_file_and_key(kept, keys, line):
+    (path,) = kept.glob("runs/*/*/manifest.json")
+    document = json.loads(path.read_text())
+    place = document
+    for key in keys[:-1]:
+        place = place[key]
+    place[keys[-1]] = []
+    write_sealed(path, document)
+    found = Store(kept).ingestions()
+    assert found.damaged == {path.parent: f"{path}: is not what this version writes: {line}"}
+
+
+def test_a_run_json_without_its_source_is_refused(kept):
+    (path,) = kept.glob("runs/*/run.json")
+    write_sealed(path, {"robot": "husky"})
+    with pytest.raises(StoreError, match=r"run\.json: is not what this version writes: source is missing$"):
+        Store(kept).run_json(path.parent.name)
