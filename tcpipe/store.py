@@ -22,7 +22,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import pyarrow as pa
 
@@ -31,7 +31,7 @@ from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exc
 from tcpipe.formats.json_files import digest, plain, typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.places import local_output
-from tcpipe.formats.record_files import put_record, read_record, read_records, record_name
+from tcpipe.formats.record_files import Sighting, Superseded, put_record, read_record, read_records, record_name
 from tcpipe.formats.run_documents import Manifest, ManifestHead, RunJson, StreamInfo
 from tcpipe.formats.seals import (
     CHECKSUMS,
@@ -54,6 +54,8 @@ from tcpipe.tables.levels import (
     metadata_of,
     with_metadata,
 )
+
+T = TypeVar("T")
 
 logger = logging.getLogger("tcpipe")
 
@@ -188,15 +190,14 @@ class Store:
 
     def superseded(self) -> dict[str, str]:
         """Return the runs whose log was completed or repaired, and by which run."""
-        latest: dict[str, Mapping[str, Any]] = {}
-        for record in sorted(self.records("superseded"), key=lambda record: (record["number"], record["by"] is None)):
-            latest[record["run_id"]] = record
-        return {run_id: record["by"] for run_id, record in latest.items() if record["by"] is not None}
+        records = sorted(self.records("superseded", Superseded), key=lambda record: (record.number, record.by is None))
+        latest = {record.run_id: record.by for record in records}
+        return {run_id: by for run_id, by in latest.items() if by is not None}
 
     def supersede(self, run_id: str, by: str | None) -> None:
         """Remember that another run takes this one's place, or, without ``by``, that it counts again."""
-        number = sum(record["run_id"] == run_id for record in self.records("superseded"))
-        fact = {"run_id": run_id, "by": by, "number": number}
+        number = sum(record.run_id == run_id for record in self.records("superseded", Superseded))
+        fact = Superseded(run_id, by, number)
         self.remember(f"superseded/{record_name(digest(fact))}", fact)
 
     def run_ids(self) -> list[str]:
@@ -283,17 +284,21 @@ class Store:
         """Directory of what is remembered."""
         return self.root / "records"
 
-    def remember(self, name: str, fact: Mapping[str, Any]) -> bool:
+    def remember(self, name: str, fact: object) -> bool:
         """Remember a fact under ``<kind>/<name>`` for good; return whether it was new."""
         return put_record(self.records_path, name, fact)
 
-    def recall(self, name: str) -> dict[str, Any] | None:
+    def recall(self, name: str, cls: type[T]) -> T | None:
         """Return what is remembered under ``<kind>/<name>``, None where nothing is."""
-        return read_record(self.records_path, name)
+        return read_record(self.records_path, name, cls)
 
-    def records(self, kind: str) -> list[dict[str, Any]]:
+    def records(self, kind: str, cls: type[T]) -> list[T]:
         """Return everything of a kind that is remembered, by name."""
-        return list(read_records(self.records_path, kind))
+        return list(read_records(self.records_path, kind, cls))
+
+    def sightings(self, lineage: str) -> list[Sighting]:
+        """Return what is remembered of a log."""
+        return self.records(lineage, Sighting)
 
     def write_streams(self, run_id: str, streams: Streams, *, key: str) -> None:
         """Write L1 whole or not at all; ``key`` names the read settings they were made with."""

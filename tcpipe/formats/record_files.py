@@ -6,28 +6,39 @@ The name of a record follows from the fact, so that the same fact is one file wh
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, put_file
 from tcpipe.formats.json_files import to_json
-from tcpipe.formats.seals import read_sealed, sealed, write_sealed
+from tcpipe.formats.seals import read_sealed_as, sealed, write_sealed
+
+T = TypeVar("T")
 
 logger = logging.getLogger("tcpipe")
 
 _NAME_DIGITS = 32
 
-_TROUBLE = {"content": str, "lines": [str], "log": [str]}
-_FORMS: Mapping[str, Any] = {
-    "logs": {"log": [str], "size_and_time": list, "sha256": str},
-    "failed": _TROUBLE,
-    "damaged": _TROUBLE,
-    "accepted": _TROUBLE,
-    "superseded": {"run_id": str, "number": int},
-}
-"""What a record of each kind must hold to be used."""
+
+@dataclass(frozen=True, slots=True)
+class Sighting:
+    """A log as it lay: its files, the size [byte] and modification time [ns] of each, and what they hold."""
+
+    log: tuple[str, ...]
+    size_and_time: tuple[tuple[int, int], ...]
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Superseded:
+    """That another run takes a run's place, or, by None, that the run counts again; of several the one of the highest number holds."""
+
+    run_id: str
+    by: str | None
+    number: int
 
 
 def record_name(digest: str) -> str:
@@ -35,8 +46,8 @@ def record_name(digest: str) -> str:
     return digest[:_NAME_DIGITS]
 
 
-def put_record(root: Path, name: str, value: Mapping[str, Any]) -> bool:
-    """Write a record below ``root`` unless it is there already, whole; return whether this call did.
+def put_record(root: Path, name: str, value: object) -> bool:
+    """Write a record, a dataclass, below ``root`` unless it is there already, whole; return whether this call did.
 
     Raises
     ------
@@ -46,32 +57,32 @@ def put_record(root: Path, name: str, value: Mapping[str, Any]) -> bool:
     """
     path = root / f"{name}.json"
     clear(root)
-    if read_record(root, name) is not None:
+    if read_record(root, name, type(value)) is not None:
         return False
     if put_file(path, to_json(sealed(value)), staging=root):
         return True
-    if read_record(root, name) is not None:  # another process was faster
+    if read_record(root, name, type(value)) is not None:  # another process was faster
         return False
     write_sealed(path, value)
     return True
 
 
-def read_record(root: Path, name: str) -> dict[str, Any] | None:
+def read_record(root: Path, name: str, cls: type[T]) -> T | None:
     """Return a record; None where there is none, and where it is not as it was written, which is said."""
     path = root / f"{name}.json"
-    return _whole(path, name) if path.is_file() else None
+    return _whole(path, cls) if path.is_file() else None
 
 
-def read_records(root: Path, kind: str) -> Iterator[dict[str, Any]]:
+def read_records(root: Path, kind: str, cls: type[T]) -> Iterator[T]:
     """Yield the records in a directory below ``root``, by name; those that are not as they were written are named and left out."""
     for path in sorted((root / kind).glob("*.json")):
-        if not path.name.startswith(TEMPORARY_PREFIX) and (found := _whole(path, kind)) is not None:
+        if not path.name.startswith(TEMPORARY_PREFIX) and (found := _whole(path, cls)) is not None:
             yield found
 
 
-def _whole(path: Path, name: str) -> dict[str, Any] | None:
+def _whole(path: Path, cls: type[T]) -> T | None:
     try:
-        return read_sealed(path, _FORMS.get(name.partition("/")[0]))
+        return read_sealed_as(path, cls)
     except StoreError as error:
         logger.error("%s; this record is ignored", error)  # noqa: TRY400  one line
         return None

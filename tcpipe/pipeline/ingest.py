@@ -26,7 +26,7 @@ from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe, rea
 from tcpipe.formats.record_files import record_name
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
-from tcpipe.pipeline.known_trouble import Trouble, failure_name, failure_record
+from tcpipe.pipeline.known_trouble import Trouble, failure_name
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -193,7 +193,7 @@ def ingest(
         mine = found.sources if shard is None else in_shard(found.sources, shard)
         common = (opened.root, ruling, robot, dict(tags or {}), force, message_definitions)
         how = (definitions_key(message_definitions), retry_failed, min_age_s)
-        sources = with_hashes(mine, (lambda _: []) if force else opened.records)
+        sources = with_hashes(mine, (lambda _: []) if force else opened.sightings)
         tasks = [IngestTask(source, *common, *how) for source in sources]
         if on_found:
             on_found(len(tasks) + len(found.problems))
@@ -237,9 +237,9 @@ def _without_work(task: IngestTask, *, runs: Mapping[str, Sequence[str]]) -> Ing
     if run_id and finished:
         same_as = _twin(store, run_id, source)
         return _result(source, _retagged(store, run_id, task), finished, str(source.sha256), same_as=same_as)
-    failed = None if task.force or task.retry_failed else store.recall(task.failure)
+    failed = None if task.force or task.retry_failed else store.recall(task.failure, Trouble)
     if failed is not None:
-        return IngestResult(source.name, "failed", problems=tuple(failed["lines"]), sha256=source.sha256, known=True)
+        return IngestResult(source.name, "failed", problems=failed.lines, sha256=source.sha256, known=True)
     return _too_young(task)
 
 
@@ -271,8 +271,8 @@ def _judged(store: Store, source: LogSource, result: IngestResult, runs: dict[st
 def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
     content = result.sha256 or source.files_digest
     if result.status == "failed":
-        return Trouble("failed", content, result.problems, source.origins)
-    return Trouble("damaged", content, result.damage, source.origins, result.run_id) if result.damage else None
+        return Trouble(content, result.problems, source.origins, kind="failed")
+    return Trouble(content, result.damage, source.origins, result.run_id, "damaged") if result.damage else None
 
 
 def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult) -> None:
@@ -286,7 +286,7 @@ def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestR
             trouble.told(store)
         elif trouble is not None and not result.transient and not result.known:
             task = replace(task, source=replace(source, sha256=result.sha256))
-            store.remember(task.failure, failure_record(trouble))
+            store.remember(task.failure, replace(trouble, version=__version__))
     except StoreError as error:
         logger.error("%s", error)  # noqa: TRY400  one line
 

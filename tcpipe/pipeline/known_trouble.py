@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError
@@ -13,6 +12,7 @@ from tcpipe.formats.json_files import digest
 from tcpipe.formats.record_files import record_name
 from tcpipe.pipeline.log_sources import lineage_of
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import LEFT_OUT
 
 _MOST_CANDIDATES = 10
 
@@ -21,14 +21,16 @@ _MOST_CANDIDATES = 10
 class Trouble:
     """What is wrong with a content, wherever that lies: lines of damage, or why it failed."""
 
-    kind: str
-    """``damaged`` or ``failed``."""
     content: str
     """The sha256 of the log; where nothing could be read, a hash of where it lies, sizes and times."""
     lines: tuple[str, ...]
     log: tuple[str, ...]
     """Where it lay when it was told."""
     run_id: str | None = None
+    kind: str = ""
+    """``damaged`` or ``failed``."""
+    version: str | None = field(default=None, metadata=LEFT_OUT)
+    """Of a failure: of the program that failed."""
 
     @property
     def called(self) -> str:
@@ -41,37 +43,25 @@ class Trouble:
 
     def is_accepted(self, store: Store) -> bool:
         """Tell whether a person has said that this is no news."""
-        return store.recall(f"accepted/{self._name}") is not None
+        return store.recall(f"accepted/{self._name}", Trouble) is not None
 
     def accept(self, store: Store) -> bool:
         """Remember that a person has looked at it; return whether that is new."""
-        fact = {"kind": self.kind, "content": self.content, "lines": self.lines, "log": self.log, "run_id": self.run_id}
-        return store.remember(f"accepted/{self._name}", fact)
+        return store.remember(f"accepted/{self._name}", self)
 
     def is_told(self, store: Store) -> bool:
         """Tell whether this damage was told before."""
-        return store.recall(f"damaged/{self._name}") is not None
+        return store.recall(f"damaged/{self._name}", Trouble) is not None
 
     def told(self, store: Store) -> None:
         """Remember that this damage was told."""
-        fact = {"content": self.content, "lines": self.lines, "log": self.log, "run_id": self.run_id}
-        store.remember(f"damaged/{self._name}", fact)
+        store.remember(f"damaged/{self._name}", self)
 
 
 def failure_name(content: str, *, ingest_key: str, robot: str | None, definitions: str) -> str:
     """Return the name of the record of a failure: the same content, treated in the same way, fails again."""
     how = {"version": __version__, "ingest_key": ingest_key, "robot": robot, "message_definitions": definitions}
     return f"failed/{record_name(digest({'content': content, **how}))}"
-
-
-def failure_record(trouble: Trouble) -> dict[str, Any]:
-    """Return what is remembered of a failure."""
-    return {"content": trouble.content, "lines": trouble.lines, "log": trouble.log, "version": __version__}
-
-
-def trouble_of(kind: str, record: Mapping[str, Any]) -> Trouble:
-    """Return the trouble that a record holds."""
-    return Trouble(kind, record["content"], tuple(record["lines"]), tuple(record["log"]), record.get("run_id"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,18 +108,17 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
 
 def _known(store: Store) -> list[Trouble]:
     """Return all trouble that was told, and the damage of runs that were made before that was remembered."""
-    known = [trouble_of(kind, record) for kind in ("failed", "damaged") for record in store.records(kind)]
+    known = [replace(told, kind=kind) for kind in ("failed", "damaged") for told in store.records(kind, Trouble)]
     for run in store.runs():
         about = store.run_json(run.run_id)
         if run.manifest.damage and about:
-            known.append(Trouble("damaged", about.source.sha256, run.manifest.damage, about.source.paths, run.run_id))
+            known.append(Trouble(about.source.sha256, run.manifest.damage, about.source.paths, run.run_id, "damaged"))
     return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
 
 
 def _named(name: str, known: Sequence[Trouble], store: Store) -> list[Trouble]:
     paths = {name, str(Path(name).absolute()), str(Path(name).resolve())}
-    sightings = [record for path in paths for record in store.records(lineage_of([path]))]
-    contents = {record["sha256"] for record in sightings}
+    contents = {sighting.sha256 for path in paths for sighting in store.sightings(lineage_of([path]))}
     exact = [
         trouble
         for trouble in known

@@ -9,7 +9,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from tcpipe.errors import LogError, TcpipeError, plain_line
 from tcpipe.formats.json_files import digest
@@ -17,7 +16,7 @@ from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, storage_files
 from tcpipe.formats.object_storage import copied, is_url, stand_ins
-from tcpipe.formats.record_files import record_name
+from tcpipe.formats.record_files import Sighting, record_name
 from tcpipe.pipeline.transience import is_transient
 
 _LONGEST_STEM_BYTES = 200
@@ -70,9 +69,9 @@ class LogSource:
         """Where the sightings of the log are remembered."""
         return lineage_of(self.origins)
 
-    def sighting(self, sha256: str) -> dict[str, Any]:
+    def sighting(self, sha256: str) -> Sighting:
         """Return what is remembered of the log as it is now."""
-        return {"log": self.origins, "size_and_time": self.files, "sha256": sha256}
+        return Sighting(self.origins, self.files, sha256)
 
     @property
     def youngest_ns(self) -> int:
@@ -193,7 +192,7 @@ def on_this_machine(source: LogSource) -> Iterator[LogSource]:
         yield replace(source, paths=tuple(paths))
 
 
-def with_hashes(sources: Sequence[LogSource], seen: Callable[[str], Sequence[Mapping[str, Any]]]) -> list[LogSource]:
+def with_hashes(sources: Sequence[LogSource], seen: Callable[[str], Sequence[Sighting]]) -> list[LogSource]:
     """Return the sources with the hashes that are remembered, and computed where two of one size may be the same recording.
 
     ``seen`` returns what is remembered of a log by its `lineage`.
@@ -235,25 +234,20 @@ def _files(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
     return tuple((stat.st_size, stat.st_mtime_ns) for stat in found)
 
 
-def _as_json(files: Iterable[tuple[int, int]]) -> list[list[int]]:
-    return [list(file) for file in files]
-
-
-def is_there(sighting: Mapping[str, Any]) -> bool:
+def is_there(sighting: Sighting) -> bool:
     """Tell whether a log that was seen lies where it was, unchanged; in object storage nobody looks, and it is taken to be there."""
-    if any(is_url(origin) for origin in sighting["log"]):
+    if any(is_url(origin) for origin in sighting.log):
         return True
-    return bool(_as_json(_files([Path(origin) for origin in sighting["log"]])) == sighting["size_and_time"])
+    return _files([Path(origin) for origin in sighting.log]) == sighting.size_and_time
 
 
 def _size(source: LogSource) -> int:
     return sum(size for size, _ in source.files)
 
 
-def _remembered(source: LogSource, seen: Sequence[Mapping[str, Any]]) -> LogSource:
+def _remembered(source: LogSource, seen: Sequence[Sighting]) -> LogSource:
     """Return the source with its hash; where nothing is known of these sizes and times, or two different things, without."""
-    files = _as_json(source.files)
-    found = {sighting["sha256"] for sighting in seen if files and sighting["size_and_time"] == files}
+    found = {sighting.sha256 for sighting in seen if source.files and sighting.size_and_time == source.files}
     return replace(source, sha256=found.pop()) if len(found) == 1 else source
 
 

@@ -12,6 +12,7 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.record_files import Superseded
 from tcpipe.pipeline.log_sources import LogSource, is_there
 from tcpipe.store import Store
 
@@ -35,10 +36,10 @@ def superseded_by(
     if run_id in gone:
         store.supersede(run_id, None)
         yield f"run {run_id} counts again: its recording is back"
-    seen = store.records(source.lineage)
-    new = all(sighting["sha256"] != sha256 for sighting in seen)
-    parties = {record[key] for record in store.records("superseded") for key in ("run_id", "by")}
-    earlier = {sighting["sha256"] for sighting in seen} - {sha256} if new or run_id in parties else ()
+    seen = {sighting.sha256 for sighting in store.sightings(source.lineage)}
+    new, records = sha256 not in seen, store.records("superseded", Superseded)
+    parties = {party for record in records for party in (record.run_id, record.by)}
+    earlier = seen - {sha256} if new or run_id in parties else ()
     for older in sorted(filter(None, (store.run_of(of, runs) for of in earlier))):
         if older != run_id and older not in gone and (new or older in parties):
             share = _share_of(store, older, run_id)
@@ -76,9 +77,9 @@ def _elsewhere(store: Store, run_id: str, source: LogSource) -> str:
     known = store.run_json(run_id)
     for directory in sorted((store.records_path / "logs").glob("*")):
         lineage = f"logs/{directory.name}"
-        for sighting in store.records(lineage) if lineage != source.lineage else ():
-            if known and sighting["sha256"] == known.source.sha256 and sighting["size_and_time"] and is_there(sighting):
-                return " + ".join(sighting["log"])
+        for sighting in store.sightings(lineage) if lineage != source.lineage else ():
+            if known and sighting.sha256 == known.source.sha256 and sighting.size_and_time and is_there(sighting):
+                return " + ".join(sighting.log)
     return ""
 
 

@@ -9,6 +9,7 @@ from mcap.writer import Writer
 from random_messages import ROS1, Message, random_messages, write_bag, write_mcap
 
 from tcpipe.errors import LogError, UsageError
+from tcpipe.formats.record_files import Sighting
 from tcpipe.pipeline.export import export
 from tcpipe.store import Store
 
@@ -83,7 +84,7 @@ def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, sign, 
 
 
 def test_nothing_is_written_into_a_store(tmp_path, log):
-    Store(tmp_path / "out").remember("logs/where/what", {"log": ["/a.bag"]})
+    Store(tmp_path / "out").remember("logs/where/what", Sighting(("/a.bag",), (), "0"))
     with pytest.raises(UsageError, match="out: is a store; give another directory"):
         export(log, tmp_path / "out")
 

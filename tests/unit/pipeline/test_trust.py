@@ -14,6 +14,7 @@ from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.parquet import write_table
+from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_checksums, write_sealed
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
@@ -69,7 +70,7 @@ def test_a_store_its_runs_and_its_map_verify(made):
 
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
-    store.remember("logs/where/what", {"log": ["/logs/north.mcap"], "sha256": "north", "size_and_time": []})
+    store.remember("logs/where/what", Sighting(("/logs/north.mcap",), (), "north"))
     path = store.map_path("site")
     write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
     for run in store.runs():
