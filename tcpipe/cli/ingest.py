@@ -21,7 +21,8 @@ from tcpipe.cli.options import (
 from tcpipe.cli.output import say
 
 if TYPE_CHECKING:
-    from tcpipe.pipeline.ingest import IngestResult, IngestSummary
+    from tcpipe.pipeline.ingest import IngestSummary
+    from tcpipe.pipeline.ingest_task import IngestResult
 
 
 @click.command(short_help="Logs to labelled 1 m segments")

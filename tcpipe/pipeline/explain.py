@@ -28,7 +28,7 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
 from tcpipe.formats.recipe_toml import parse_recipe, read_key
 from tcpipe.formats.seals import file_checksum
-from tcpipe.pipeline.ingest import run_stages
+from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import sample_segments
 from tcpipe.store import RunDirectory, Store, open_store

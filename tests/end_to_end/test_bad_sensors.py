@@ -12,7 +12,7 @@ from tcpipe.errors import FusionError, RoleError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.robot_files import shipped_profiles
-from tcpipe.pipeline.ingest import run_stages
+from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Placement, ReadConfig, Recipe
 from tcpipe.simulation import Faults, Truth, scenario, simulated_drive, true_cost
 from tcpipe.simulation.messages import TOPICS, streams

@@ -7,7 +7,7 @@ import re
 import pytest
 from simulated_streams import log_of
 
-from tcpipe.pipeline import ingest as module
+from tcpipe.pipeline import ingest_run as module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.simulation import tiny
 

@@ -7,7 +7,7 @@ import shutil
 import pytest
 from wheel_drives import START_NS, drive_at, wheel_drive
 
-import tcpipe.pipeline.ingest as ingestion
+import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
 from tcpipe.formats.logs.writing import MessageStream, write_bag
 from tcpipe.formats.run_documents import LogOrigin, RunJson

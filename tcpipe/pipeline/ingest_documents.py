@@ -1,0 +1,48 @@
+"""The documents that ingesting writes beside its tables: run.json of a log, manifest.json of what became of it."""
+
+from __future__ import annotations
+
+from tcpipe import __version__
+from tcpipe.formats.logs.joined import JoinedLog
+from tcpipe.formats.logs.log_file import Log
+from tcpipe.formats.recipe_toml import ingest_key, recipe_id
+from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
+from tcpipe.pipeline.ingest_task import IngestTask
+from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, Streams, Track
+
+
+def run_json_of(task: IngestTask, log: Log | JoinedLog, streams: Streams, sha256: str) -> RunJson:
+    """Return what is known of a log that was read; its damage, remarks and tags are to be added."""
+    return RunJson(
+        source=LogOrigin(task.source.origins, sha256, log.size_bytes),
+        robot=streams.robot,
+        topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
+        sensors=streams.sensors,
+        message_definitions=task.definitions,
+        findings=streams.findings,
+    )
+
+
+def manifest_of(
+    task: IngestTask, known: RunJson, streams: Streams, track: Track, labelled: LabelledSegments
+) -> Manifest:
+    """Return what became of a run; ``known`` gives tags and damage."""
+    info = labelled.info
+    rows = {f"{role}_messages": table.num_rows for role, table in streams.tables.items()}
+    return Manifest(
+        run_id=info.run_id,
+        recipe_id=recipe_id(task.recipe, streams.robot),
+        data_model_version=DATA_MODEL_VERSION,
+        tcpipe_version=__version__,
+        ingest_key=ingest_key(task.recipe),
+        recipe=task.recipe.ingest,
+        robot=streams.robot,
+        tags=known.tags,
+        counts=Counts(labelled.table.num_rows, track.table.num_rows, track.rejections.num_rows, **rows),
+        ledger_m=labelled.ledger_m,
+        warnings=tuple(dict.fromkeys(info.findings.warnings)),
+        damage=known.damage,
+        info=info,
+        robot_requested=task.robot,
+        message_definitions=task.definitions,
+    )

@@ -1,0 +1,136 @@
+"""One log becomes a run of the store: read, fused, gated, cut and labelled, each file whole or not at all."""
+
+from __future__ import annotations
+
+import logging
+from contextlib import ExitStack
+from dataclasses import replace
+from functools import partial
+
+from tcpipe import __version__
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.joined import JoinedLog, open_logs
+from tcpipe.formats.logs.log_file import Log
+from tcpipe.formats.recipe_toml import ingest_key, read_key
+from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.run_documents import RunJson
+from tcpipe.pipeline.ingest_documents import manifest_of, run_json_of
+from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, Status, result_of, told, too_young
+from tcpipe.pipeline.log_sources import LogSource, on_this_machine
+from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.store import RunDirectory, Store
+from tcpipe.tables.levels import Streams
+
+logger = logging.getLogger("tcpipe")
+
+
+def ingest_one(task: IngestTask) -> tuple[LogSource, IngestResult]:
+    """Ingest one run from its log as that is now; every error becomes its result, so that one log never costs the others."""
+    task = replace(task, source=task.source.now())
+    hashed: list[str] = []
+    young = too_young(task)
+    if young is not None:
+        return task.source, young
+    result = told(task, partial(_ingest, hashed=hashed))
+    if task.source.has_changed():
+        note = "it changed while it was looked at; it is ingested when its recording has ended"
+        return task.source, IngestResult(task.source.name, "waiting", notes=(note,))
+    return task.source, replace(result, sha256=hashed[0]) if hashed else result
+
+
+def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
+    """Ingest one run; what its log hashes to is left in ``hashed``, also on failure."""
+    store, source = Store(task.store), task.source
+    with ExitStack() as stack:
+        opened = None if source.sha256 else _opened(task, stack)
+        sha256 = str(opened[1].sha256() if opened else source.sha256)
+        hashed.append(sha256)
+        run_id = stack.enter_context(store.claimed_run(source.stem, sha256))
+        same_as = _twin(store, run_id, source)
+        before = None if task.force or store.known_run(run_id) is None else made_before(store, run_id, task, sha256)
+        if before is not None:
+            return before
+        task, log = opened or _opened(task, stack)
+        logger.info("%s: reading", source.name)
+        streams, damage, remarks = _streams(store, run_id, log, task)
+        known = run_json_of(task, log, streams, sha256)
+        known = replace(known, damage=damage, remarks=remarks, tags=_tags(store, run_id, task))
+        store.write_run_json(run_id, known)
+        run = _fuse_and_label(store, run_id, streams, known, task)
+    return result_of(source, "done", run, sha256, same_as=same_as)
+
+
+def made_before(store: Store, run_id: str, task: IngestTask, sha256: str) -> IngestResult | None:
+    """Return the result of a run that is there as it would be made now, after setting its tags; None where there is none."""
+    finished = _finished(store, run_id, task)
+    if finished is None:
+        return None
+    same_as = _twin(store, run_id, task.source)
+    return result_of(task.source, _retagged(store, run_id, task), finished, sha256, same_as=same_as)
+
+
+def _finished(store: Store, run_id: str, task: IngestTask) -> RunDirectory | None:
+    key = ingest_key(task.recipe)
+    for run in store.recipes_of(run_id):
+        made = run.manifest
+        same_robot = made.robot_requested == task.robot or (task.robot and made.robot == task.robot)
+        same_version = made.tcpipe_version == __version__
+        if made.ingest_key == key and same_version and same_robot and made.message_definitions == task.definitions:
+            return run
+    return None
+
+
+def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, Log | JoinedLog]:
+    """Return the task with the log's files on this machine, and the log, both until ``stack`` ends."""
+    source = stack.enter_context(on_this_machine(task.source))
+    log = open_logs(source.paths, message_definitions=task.message_definitions)
+    stack.enter_context(log)
+    return replace(task, source=source), log
+
+
+def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> RunDirectory:
+    track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id, name=task.source.name)
+    manifest = manifest_of(task, known, streams, track, labelled)
+    path = store.write_run(manifest, track=track, gated=gated, labelled=labelled)
+    return next(run for run in store.recipes_of(run_id) if run.path == path)
+
+
+def _tags(store: Store, run_id: str, task: IngestTask) -> dict[str, str]:
+    """Return the run's tags: those it has, and those given."""
+    known = store.known_run(run_id)
+    before = known.tags if known else next((run.manifest.tags for run in store.recipes_of(run_id)), {})
+    return {**before, **task.tags}
+
+
+def _retagged(store: Store, run_id: str, task: IngestTask) -> Status:
+    """Set the tags of a run that is there already; "done" where that changed something."""
+    known, tags = store.known_run(run_id), _tags(store, run_id, task)
+    if tags == (known.tags if known else {}):
+        return "unchanged"
+    store.tag_run(run_id, tags)
+    return "done"
+
+
+def _twin(store: Store, run_id: str, source: LogSource) -> str | None:
+    """Return where else the same recording was ingested from, if it was."""
+    known = store.known_run(run_id)
+    return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
+
+
+def _streams(
+    store: Store, run_id: str, log: Log | JoinedLog, task: IngestTask
+) -> tuple[Streams, tuple[str, ...], tuple[str, ...]]:
+    """Return L1, from the store when it was made with the same read settings, the log's damage, and remarks on it."""
+    from tcpipe.stages.read import read_run  # noqa: PLC0415
+
+    key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
+    known = store.known_run(run_id)
+    same = known is not None and known.message_definitions == task.definitions
+    cached = store.read_streams(run_id, key=key) if same and not task.force else None
+    if cached is not None and known is not None:
+        return cached, known.damage, known.remarks
+    streams = read_run(log, task.recipe.read, robot=task.robot, known=profiles_of(task.recipe))
+    if task.source.has_changed():
+        raise LogError(f"{task.source.name}: changed while it was read")
+    store.write_streams(run_id, streams, key=key)
+    return streams, tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.remarks)

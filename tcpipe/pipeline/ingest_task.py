@@ -1,0 +1,151 @@
+"""What ingesting one log takes and what becomes of it; an error becomes a result, so that one log never costs the others."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, TypeVar
+
+from tcpipe.errors import TcpipeError, plain_line
+from tcpipe.formats.recipe_toml import ingest_key
+from tcpipe.pipeline.known_trouble import failure_name
+from tcpipe.pipeline.log_sources import LogSource
+from tcpipe.pipeline.transience import is_transient
+from tcpipe.recipe import Recipe
+from tcpipe.store import RunDirectory
+from tcpipe.tables.findings import EnergyBudget
+
+R = TypeVar("R")
+
+Status = Literal["done", "unchanged", "damaged", "failed", "waiting"]
+
+
+@dataclass(frozen=True, slots=True)
+class IngestTask:
+    """One run to make: the log and how."""
+
+    source: LogSource
+    store: Path
+    recipe: Recipe
+    robot: str | None
+    tags: Mapping[str, str]
+    force: bool
+    message_definitions: Path | None = None
+    """A directory of .msg files for types that the log does not define."""
+    definitions: str = ""
+    """Their `definitions_key`."""
+    retry_failed: bool = False
+    min_age_s: float = 0.0
+
+    @property
+    def failure(self) -> str:
+        """The name of the record that this fails, should it fail for what the log's content is."""
+        key, content = ingest_key(self.recipe), self.source.sha256 or self.source.files_digest
+        return failure_name(content, ingest_key=key, robot=self.robot, definitions=self.definitions)
+
+
+@dataclass(frozen=True, slots=True)
+class IngestResult:
+    """What became of one log."""
+
+    log: str
+    status: Status
+    run_id: str | None = None
+    recipe_id: str | None = None
+    robot: str | None = None
+    segments: int = 0
+    distance_m: float = 0.0
+    kept_m: float = 0.0
+    energy_budget: EnergyBudget | None = None
+    """The noise floor of the labels' energy and its causes, as shares of their mean (`tcpipe.cost.budget`)."""
+    warnings: tuple[str, ...] = ()
+    problems: tuple[str, ...] = ()
+    damage: tuple[str, ...] = ()
+    same_as: str | None = None
+    """The log from which the same recording was ingested before, under another path; it is one run."""
+    sha256: str | None = None
+    notes: tuple[str, ...] = ()
+    """What else is to be said: why it waits, which runs it supersedes."""
+    transient: bool = False
+    """Whether it failed for what may pass: a full disk, a killed worker."""
+    known: bool = False
+    """Whether it failed before and was not tried again, or its damage was told before."""
+    accepted: bool = False
+    """Whether a person has accepted what is wrong with it (`tcpipe accept`)."""
+    traceback: str | None = None
+    """Where an internal error comes from."""
+
+    @property
+    def is_news(self) -> bool:
+        """Whether something is wrong that nobody was told before, or accepted."""
+        return (self.status == "failed" or bool(self.damage)) and not self.known and not self.accepted
+
+
+def result_of(
+    source: LogSource, status: Status, run: RunDirectory, sha256: str, *, same_as: str | None
+) -> IngestResult:
+    """Return what became of a log whose run is in the store."""
+    made = run.manifest
+    return IngestResult(
+        log=source.name,
+        status="damaged" if made.damage and status == "done" else status,
+        run_id=run.run_id,
+        recipe_id=run.recipe_id,
+        robot=made.robot,
+        segments=made.counts.segments,
+        distance_m=sum(made.ledger_m.values()),
+        kept_m=made.ledger_m.get("kept", 0.0),
+        energy_budget=run.energy_budget,
+        warnings=made.warnings,
+        damage=made.damage,
+        same_as=same_as,
+        sha256=sha256,
+    )
+
+
+def too_young(task: IngestTask) -> IngestResult | None:
+    """Return that a log has to wait, None where it has not."""
+    age_s = (time.time_ns() - task.source.youngest_ns) / 1e9
+    if not task.source.files or age_s >= task.min_age_s or not task.min_age_s:
+        return None
+    note = f"it was written {max(age_s, 0.0):.0f} s ago; it is ingested when it is {task.min_age_s:g} s old"
+    return IngestResult(task.source.name, "waiting", notes=(note,))
+
+
+def died(source: LogSource) -> IngestResult:
+    """Return that the process which worked on a log is gone."""
+    problem = f"{source.name}: its worker process died (killed, or out of memory); run it again"
+    return IngestResult(source.name, "failed", problems=(problem,), transient=True)
+
+
+def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
+    """Do something with a log; an error becomes its result."""
+    try:
+        return act(task)
+    except Exception as error:  # noqa: BLE001  at last a bug that one log meets
+        problems, trace = _in_words(error, task.source)
+        transient = is_transient(error) or not task.source.files
+        return IngestResult(task.source.name, "failed", problems=problems, transient=transient, traceback=trace)
+
+
+def _in_words(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str | None]:
+    """Return lines about what went wrong with a log, and where an internal error comes from."""
+    if isinstance(error, TcpipeError):
+        return _naming(source, error.problems), None
+    if isinstance(error, OSError):
+        where = f"{error.filename}: " if error.filename else ""
+        return _naming(source, (plain_line(f"{where}{error.strerror or error}"),)), None
+    if isinstance(error, MemoryError):
+        return (f"{source.name}: not enough memory; fewer --jobs need less",), None
+    what = f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"
+    return (plain_line(f"{source.name}: {what}"),), "".join(traceback.format_exception(error))
+
+
+def _naming(source: LogSource, problems: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the problems with the log's name in the first, unless a file of it is named there."""
+    if any(plain_line(origin) in problems[0] for origin in source.origins):
+        return problems
+    return (f"{source.name}: {problems[0]}", *problems[1:])

@@ -1,0 +1,35 @@
+"""The pipeline: what becomes of a run's streams, stage by stage."""
+
+from __future__ import annotations
+
+import logging
+
+from tcpipe.formats.robot_files import profiles_of
+from tcpipe.recipe import IngestSections
+from tcpipe.tables.levels import GatedTrack, LabelledSegments, Streams, Track
+
+logger = logging.getLogger("tcpipe")
+
+
+def run_stages(
+    streams: Streams, sections: IngestSections, *, run_id: str, name: str
+) -> tuple[Track, GatedTrack, LabelledSegments]:
+    """Run fuse, gate, segment and label over the streams of one run (``name`` is for progress only).
+
+    A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash of is in reach.
+    """
+    from tcpipe.stages.fuse import fuse_run  # noqa: PLC0415  kernels load only when there is work
+    from tcpipe.stages.gate import gate_track  # noqa: PLC0415
+    from tcpipe.stages.label import label_segments  # noqa: PLC0415
+    from tcpipe.stages.segment import segment_track  # noqa: PLC0415
+
+    profile = profiles_of(sections).robots[streams.robot]
+    logger.info("%s: fusing", name)
+    track = fuse_run(streams, sections.fuse, run_id=run_id)
+    logger.info("%s: cutting and labelling", name)
+    gated = gate_track(
+        track, sections.gate, max_velocity_mps=profile.max_velocity_mps, chord_m=sections.segment.chord_m
+    )
+    segments = segment_track(gated, sections.segment)
+    labelled = label_segments(segments, gated, streams, sections.label, voltage_range_volt=profile.voltage_range_volt)
+    return track, gated, labelled
