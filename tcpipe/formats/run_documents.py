@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from tcpipe.formats.seals import Checksum
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.findings import LEFT_OUT, NOTHING_FOUND, Findings, RunFacts
-from tcpipe.tables.levels import DATA_MODEL_VERSION, Sensor, TrackInfo
+from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,4 +105,4 @@ class StreamInfo:
     power_averaged: bool
     findings: Findings[RunFacts]
     sensor: Sensor
-    data_model_version: str = DATA_MODEL_VERSION
+    data_model_version: str = TABLES_VERSION
