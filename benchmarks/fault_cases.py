@@ -4,7 +4,7 @@ import json
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from pkgutil import walk_packages
@@ -163,10 +163,12 @@ def _make_world(place: Path) -> None:
 def _make_model(place: Path) -> None:
     from made_models import CARD, made_model
 
+    from tcpipe.learning.fitting import FitConfig
     from tcpipe.learning.model_card import Seen
 
     ranges = {"slope_rad": (-0.5, 0.5), "cross_slope_rad": (-0.5, 0.5), "relief_m": (0.0, 1.0)}
-    training = {"config": {"epochs": 1, "width": 16}, "samples": {"fitted": 100, "held out": 20}}
+    config = FitConfig(epochs=1, width=16)
+    training = replace(CARD.training, config=config, samples={"fitted": 100, "held out": 20})
     made_model(place / "model", seen=Seen(CARD.seen.class_counts | {5: 10}, (4, 5, 6, 7), ranges), training=training)
     ends = [[float(value) for value in end.split(",")] for end in (FROM, TO)]
     (place / "path.geojson").write_text(json.dumps({"type": "LineString", "coordinates": ends}))

@@ -34,10 +34,9 @@ from tcpipe.formats.places import local_output
 from tcpipe.formats.record_files import Sighting, Superseded, put_record, read_record, read_records, record_name
 from tcpipe.formats.run_documents import Manifest, ManifestHead, RunJson, StreamInfo
 from tcpipe.formats.seals import (
-    CHECKSUMS,
-    Checksum,
     file_checksums,
     prove_files,
+    read_checksums,
     read_sealed,
     read_sealed_as,
     write_checksums,
@@ -94,7 +93,7 @@ class RunDirectory:
 
     def prove(self, *names: str) -> None:
         """Compare files with what the manifest has of them; `StoreError` names the first that is not as it was written."""
-        prove_files(self.path, plain(self.manifest.checksums), names)
+        prove_files(self.path, self.manifest.checksums, names)
 
     def segments(self) -> pa.Table:
         """Read the labelled segments (schema LABELLED_SEGMENTS)."""
@@ -313,7 +312,7 @@ class Store:
         """Return L1 if it is there, whole, of this data model and made with these read settings; else None."""
         directory = self.runs_path / run_id / "streams"
         try:
-            listed = read_sealed(directory / CHECKSUMS, {"checksums": dict})["checksums"]
+            listed = read_checksums(directory)
             prove_files(directory, listed, {*listed, *(path.name for path in directory.glob("*.parquet"))})
         except StoreError:
             return None
@@ -342,8 +341,7 @@ class Store:
         with atomic_directory(path) as directory:
             for name, table in tables.items():
                 write_table(with_metadata(table, told), directory / f"{name}.parquet")
-            checksums = {path: Checksum(*of) for path, of in file_checksums(directory).items()}
-            write_sealed(directory / "manifest.json", replace(manifest, checksums=checksums))
+            write_sealed(directory / "manifest.json", replace(manifest, checksums=file_checksums(directory)))
         return path
 
 

@@ -16,6 +16,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from tcpipe.cli.answers import answers
+from tcpipe.formats.json_files import plain, typed
+
 COMMAND = Path(sys.executable).parent / "tcpipe"
 HANGS_S = 3600.0
 """After this long a command hangs; a machine that others use takes its time."""
@@ -28,14 +31,26 @@ def tcpipe(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = No
     clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")} | dict(env or {})
     command = [str(COMMAND), *map(str, arguments)]
     if _ANEW:
-        return subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, timeout=HANGS_S, check=False)
+        done = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, timeout=HANGS_S, check=False)
+        return _as_promised(done)
     server = _server("learning" if arguments[0] in _LEARNING else "other")
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         request = json.dumps({"arguments": command, "cwd": str(cwd), "env": clean})
         socket.send_fds(server, [request.encode()], [out.fileno(), err.fileno()])
         code = json.loads(server.recv(100))
         printed = [os.pread(stream.fileno(), os.fstat(stream.fileno()).st_size, 0).decode() for stream in (out, err)]
-    return subprocess.CompletedProcess(command, code, *printed)
+    return _as_promised(subprocess.CompletedProcess(command, code, *printed))
+
+
+def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.CompletedProcess[str]:
+    """Return what is given; assert that what a command printed with ``--json`` is all of its contract, and no more."""
+    cls = (
+        answers().get(f"{done.args[1]}.answer") if "--json" in done.args[1:] and done.returncode in {0, 1, 3} else None
+    )
+    if cls is not None and '"problems"' not in done.stdout[:40]:
+        said = json.loads(done.stdout)
+        assert plain(typed(said, cls, Path(done.args[1]))) == said
+    return done
 
 
 @cache

@@ -6,7 +6,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from tcpipe.learning.model_card import ModelCard, Seen
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.model_card import ModelCard, Seen, TrainedOn, Training
 from tcpipe.learning.models import write_model
 from tcpipe.learning.network import Architecture, resnet18
 from tcpipe.terrain.classes import PAPER_CLASSES
@@ -21,14 +22,14 @@ CARD = ModelCard(
     max_arc_to_chord=1.02,
     label_velocity="ground",
     robot="husky",
-    classes=PAPER_CLASSES,
+    classes=PAPER_CLASSES.classes,
     seen=Seen(
         {4: 60, 6: 25, 7: 15},
         (4, 6, 7),
         {"slope_rad": (-0.3, 0.3), "cross_slope_rad": (-0.25, 0.25), "relief_m": (0.0, 0.5)},
     ),
-    dataset={"name": "made", "sha256": "0" * 64, "data_model_version": 1, "samples": {"train": 100}},
-    training={"loss": "nrmse", "seed": 0},
+    dataset=TrainedOn("made", "0" * 64, "1.0", {"train": 100}),
+    training=Training("key", FitConfig(), "Adam", {"fitted": 80, "held out": 20}, 3, 2, 0.1, "cpu"),
 )
 
 

@@ -14,8 +14,33 @@ PACKAGE = Path(__file__).parents[1] / "tcpipe"
 Trees = dict[str, ast.Module]
 MAPPINGS = {"dict", "Mapping", "MutableMapping"}
 
-UNTYPED_LIBRARIES: dict[str, str] = {}
-"""Functions that take or return a value of a library without types, as ``path:function``, and which library."""
+_BY_LIBRARY = {
+    "keras": """learning/fitting.py:predicted learning/fitting.py:held_loss learning/fitting.py:_epoch learning/fitting.py:_optimizer_arrays
+        learning/fitting.py:_state learning/fitting.py:_restore learning/keras_backend.py:load_keras learning/losses.py:keras_loss
+        learning/losses.py:keras_loss.loss learning/models.py:Model.network learning/models.py:write_model learning/models.py:set_weights
+        learning/network.py:resnet18 learning/network.py:_normed learning/network.py:_basic_block learning/network.py:named_weights""",
+    "torch": "dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_tensors",
+    "rasterio": """formats/maps/geotiff.py:TilePool._dataset formats/maps/geotiff.py:_grey formats/maps/geotiff.py:_open_as
+        formats/maps/geotiff.py:_refuse_unplaced formats/maps/geotiff.py:_choose_bands formats/maps/geotiff.py:_scaling
+        formats/maps/geotiff.py:_vertical_unit_m formats/maps/geotiff.py:_described""",
+    "zarr": """formats/maps/map_files.py:_put formats/maps/map_files.py:_place formats/maps/map_files.py:_add_layer
+        formats/maps/map_files.py:_add_axis formats/maps/map_files.py:MapWriter._add_level formats/zarr_arrays.py:add_array""",
+    "numcodecs": "formats/shards.py:_codec",
+    "obstore": "formats/object_storage.py:_remote_file",
+    "ruamel.yaml": """formats/logs/rosbag2.py:_by_metadata formats/logs/rosbag2.py:_topic_counts
+        formats/logs/rosbag2.py:_bag_information""",
+    "rosbags": """formats/logs/ros_types.py:_typestore formats/logs/ros_types.py:TypeLibrary._known
+        formats/logs/ros_types.py:TypeLibrary._fallback
+        formats/logs/ros_types.py:_Unfold.__init__ formats/logs/ros_types.py:_Unfold.wire_type formats/logs/ros_types.py:_parsed
+        formats/logs/ros_types.py:_parsed_msg formats/logs/ros_types.py:_described formats/logs/ros_types.py:_parsed_idl
+        formats/logs/ros_types.py:_bundled_by_rosbags formats/logs/ros_types.py:_bundled_by_tcpipe formats/logs/ros_types.py:_definitions_of
+        formats/logs/ros_types.py:_definitions_of_directory formats/logs/ros_types.py:_plain formats/logs/writing.py:_message
+        formats/logs/writing.py:_value formats/logs/writing.py:_elements formats/logs/writing.py:_place""",
+    "numba": """compiled.py:kernel compiled.py:_Announce.on_start compiled.py:_Announce.on_end""",
+    "click": "cli/options.py:Place.convert cli/options.py:FloatRange.convert cli/train.py:train",
+}
+UNTYPED_LIBRARIES = {key: library for library, keys in _BY_LIBRARY.items() for key in keys.split()}
+"""Functions that take or return a value of a library without types (or whose types name no class for it), as ``path:function``."""
 
 
 @dataclass(frozen=True)

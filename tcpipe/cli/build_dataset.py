@@ -89,7 +89,7 @@ def build_dataset(
 
     Exit code 3: runs that belong in are left out or gone, or a split that was asked for is empty; each is a line that says what mends it.
     """
-    from dataclasses import asdict, replace
+    from dataclasses import replace
 
     from tcpipe.cli.output import print_json, progress, ruling_recipe, say, say_lines
     from tcpipe.pipeline.dataset.build import build_dataset as run
@@ -116,7 +116,7 @@ def build_dataset(
         for problem in result.problems:
             shown.problem(problem)
     if as_json:
-        print_json({**asdict(result), "exit_code": result.exit_code, "recipe": source})
+        print_json(replace(result, recipe=source))
     else:
         say_lines(replace(result, problems=()))
     return result.exit_code

@@ -41,8 +41,6 @@ def cost_map(
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
     maps for Nav2. An interrupted call goes on where it was.
     """
-    from dataclasses import asdict
-
     from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.models import load_model
     from tcpipe.planning.cost_map import make_cost_map
@@ -52,6 +50,6 @@ def cost_map(
         source = chosen_map(store, map_name)
         result = make_cost_map(load_model(model), source, Path(out), step_m=step_m, step=shown.count)
     if as_json:
-        print_json(asdict(result))
+        print_json(result)
     else:
         say_lines(result)

@@ -13,14 +13,12 @@ from tcpipe.cli.options import INPUT_DIRECTORY, json_option
 @json_option
 def diff(a: str, b: str, *, as_json: bool) -> int:
     """Name what changed from A to B and why (log, recipe key, map, region, code), with the labels' shift; exit code 1 if they differ."""
-    from dataclasses import asdict
-
     from tcpipe.cli.output import print_json, say
     from tcpipe.pipeline.diff import diff as run
 
     found = run(a, b)
     if as_json:
-        print_json({"same": found.same, **asdict(found)})
+        print_json(found)
     else:
         for line in found.lines():
             say(line)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import click
 
@@ -36,17 +36,11 @@ def export(
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))  # the file of every topic is open at once
     exported = run(log, Path(out), topics=(*topics, *names), message_definitions=Path(msgdef) if msgdef else None)
-    exit_code = 3 if exported.damage else 0
     if as_json:
-        print_json({**_as_json(exported), "log": log, "out": out, "exit_code": exit_code})
+        print_json(exported)
     else:
         _print(exported, log, out)
-    return exit_code
-
-
-def _as_json(exported: Exported) -> dict[str, Any]:
-    files = [{"topic": of.topic, "type": of.type_name, "path": of.path, "messages": of.rows} for of in exported.topics]
-    return {"status": exported.status, "topics": files, "damage": exported.damage, "remarks": exported.remarks}
+    return exported.exit_code
 
 
 def _print(exported: Exported, log: str, out: str) -> None:
@@ -57,7 +51,7 @@ def _print(exported: Exported, log: str, out: str) -> None:
         say(f"nothing to do: {count} of {count} topics of {log} are in {out} already")
     else:
         for of in exported.topics:
-            say(f"{of.rows:>9} messages  {of.topic}  {of.path}")
+            say(f"{of.messages:>9} messages  {of.topic}  {of.path}")
         if not exported.topics:
             say(f"nothing to export: {log} holds no topic")
     for kind in ("damage", "remarks"):

@@ -11,8 +11,6 @@ import click
 
 from tcpipe.formats import places
 
-Command = Callable[..., Any]
-
 
 class Place(click.ParamType[str]):
     """A path in the command line: looked at before the command begins; what it cannot be is a usage error (exit code 2)."""
@@ -54,55 +52,43 @@ ONE_OF_SEVERAL = Place(str)
 """A log or raster, by pattern or address: the command looks at each for itself, and tells of all at once."""
 
 
-def store_option(function: Command) -> Command:
-    """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
-    return click.option(
-        "--store",
-        envvar="TCPIPE_STORE",
-        default="tcpipe-store",
-        show_default=True,
-        type=OUTPUT_DIRECTORY,
-        metavar="DIR",
-        help="Where runs and maps are kept (or TCPIPE_STORE).",
-    )(function)
+store_option = click.option(
+    "--store",
+    envvar="TCPIPE_STORE",
+    default="tcpipe-store",
+    show_default=True,
+    type=OUTPUT_DIRECTORY,
+    metavar="DIR",
+    help="Where runs and maps are kept (or TCPIPE_STORE).",
+)
+"""``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
 
+recipe_option = click.option(
+    "--recipe",
+    type=INPUT_FILE,
+    metavar="FILE",
+    help="Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).",
+)
+"""``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
 
-def recipe_option(function: Command) -> Command:
-    """``--recipe``; without it TCPIPE_RECIPE, the nearest tcpipe.toml upward, or the defaults."""
-    return click.option(
-        "--recipe",
-        type=INPUT_FILE,
-        metavar="FILE",
-        help="Recipe (or TCPIPE_RECIPE, or the nearest tcpipe.toml upward; else defaults).",
-    )(function)
+msgdef_option = click.option(
+    "--msgdef",
+    type=INPUT_DIRECTORY,
+    metavar="DIR",
+    help="Directory of package/msg/Name.msg (or .idl) files for types the log does not define.",
+)
+"""``--msgdef``: definitions of types that a log does not define."""
 
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")
+"""``--json``: one JSON object on stdout instead of text."""
 
-def msgdef_option(function: Command) -> Command:
-    """``--msgdef``: definitions of types that a log does not define."""
-    return click.option(
-        "--msgdef",
-        type=INPUT_DIRECTORY,
-        metavar="DIR",
-        help="Directory of package/msg/Name.msg (or .idl) files for types the log does not define.",
-    )(function)
+quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")
+"""``--quiet``: no progress on stderr."""
 
-
-def json_option(function: Command) -> Command:
-    """``--json``: one JSON object on stdout instead of text."""
-    return click.option("--json", "as_json", is_flag=True, help="Print one JSON object instead of text.")(function)
-
-
-def quiet_option(function: Command) -> Command:
-    """``--quiet``: no progress on stderr."""
-    return click.option("--quiet", "-q", is_flag=True, help="No progress on stderr.")(function)
-
-
-def map_option(function: Command) -> Command:
-    """``--map``: the map to look at."""
-    return click.option(
-        "--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store)."
-    )(function)
-
+map_option = click.option(
+    "--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store)."
+)
+"""``--map``: the map to look at."""
 
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _MOST_SHARDS = 100_000

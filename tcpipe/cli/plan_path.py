@@ -81,8 +81,6 @@ def plan_path(
 
     Exit code 3: some of the path has no cost, because --step is large.
     """
-    from dataclasses import asdict
-
     from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.models import load_model
     from tcpipe.planning.inputs import chosen_map
@@ -94,7 +92,7 @@ def plan_path(
         drawn = Path(picture) if picture else None
         result = plan(load_model(model), source, request, out=Path(out), picture=drawn, step=shown.count)
     if as_json:
-        print_json(asdict(result))
+        print_json(result)
     else:
         say_lines(result)
     return result.exit_code

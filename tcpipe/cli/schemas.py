@@ -12,13 +12,13 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY
 @click.command(short_help="The contracts as JSON Schema")
 @click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
 def schemas(out: str) -> None:
-    """Write the contract of every table and of the recipe as JSON Schema, one file each, to OUT."""
+    """Write the contract of every table, document and --json answer, and of the recipe, as JSON Schema, one file each, to OUT."""
+    from tcpipe.cli.answers import every_contract
     from tcpipe.cli.output import say
     from tcpipe.formats.atomic import clear, write_text
-    from tcpipe.formats.contracts import contracts
 
     clear(Path(out))
-    wanted = {Path(out) / name: text for name, text in contracts().items()}
+    wanted = {Path(out) / name: text for name, text in every_contract().items()}
     missing = {path: text for path, text in wanted.items() if not path.is_file() or path.read_bytes() != text.encode()}
     for path, text in missing.items():
         write_text(path, text)

@@ -49,8 +49,6 @@ def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **
 
     Needs the extra: pip install 'tcpipe[train]'. Runs on a GPU when there is one. A training that was stopped goes on where it was.
     """
-    from dataclasses import asdict
-
     from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.fitting import FitConfig
     from tcpipe.learning.training import train as run
@@ -58,6 +56,6 @@ def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **
     with progress("train", 1, quiet=quiet):
         result = run(dataset, out, config=FitConfig(**options), fresh=fresh)
     if as_json:
-        print_json({**asdict(result), "feeding_share": result.spent.feeding_share})
+        print_json(result)
     else:
         say_lines(result)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.dataset.pixels import View
+from tcpipe.dataset.pixels import Pixels, View
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -30,7 +30,7 @@ class BatchContent:
     view: View
     labels: Floats
     weights: Floats | None
-    features: tuple[tuple[str, NDArray[Any]], ...]
+    features: tuple[tuple[str, NDArray[np.generic]], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +94,7 @@ class Batches:
                 cut = slice(first, first + rules.size)
                 yield self._batch(pixels, rows[cut], samples[cut], mirrors)
 
-    def _full(self, rng: np.random.Generator) -> Iterator[tuple[dict[str, NDArray[Any]], Ints, Ints]]:
+    def _full(self, rng: np.random.Generator) -> Iterator[tuple[Pixels, Ints, Ints]]:
         """Yield pixels, rows in them and the samples that these are: whole batches, but for the last ones of the epoch."""
         rules, view, mine = self._rules, self._content.view, self._samples
         layers = view.form.layers
@@ -103,7 +103,7 @@ class Batches:
             samples = order[: len(self) * rules.size]
             yield view.stored.in_memory(layers), view.at[samples], samples
             return
-        pool: dict[str, NDArray[Any]] = {}
+        pool: Pixels = {}
         left = np.empty(0, np.int64)  # samples that wait at the head of the pool for their batch to fill
         shuffler = rng if rules.shuffle else None
         for pool, found, which in view.stored.pools(
@@ -118,7 +118,7 @@ class Batches:
         if len(left) and not rules.drop_last:
             yield pool, np.arange(len(left)), left
 
-    def _batch(self, pixels: dict[str, NDArray[Any]], rows: Ints, samples: Ints, mirrors: np.random.Generator) -> Batch:
+    def _batch(self, pixels: Pixels, rows: Ints, samples: Ints, mirrors: np.random.Generator) -> Batch:
         content = self._content
         mirrored = mirrors.random(len(rows)) < 0.5 if self._rules.mirror else np.zeros(len(rows), np.bool_)
         patches: Any = content.view.form.form(pixels, rows, mirrored)
@@ -129,7 +129,7 @@ class Batches:
 
 
 def _features(
-    named: Sequence[tuple[str, NDArray[Any]]], samples: Ints, mirrored: NDArray[np.bool_]
+    named: Sequence[tuple[str, NDArray[np.generic]]], samples: Ints, mirrored: NDArray[np.bool_]
 ) -> NDArray[np.float32]:
     columns = [np.where(mirrored & (name in _FLIPPED), -1.0, 1.0) * column[samples] for name, column in named]
     return np.column_stack(columns).astype(np.float32)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from tcpipe.dataset.pixels import StoredPixels, View
 from tcpipe.dataset.split import SampleColumns, Split
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import open_patches, read_current_card, read_samples, rows_in_files
 from tcpipe.terrain.layers import LAYERS
 
@@ -19,7 +19,7 @@ from tcpipe.terrain.layers import LAYERS
 class Dataset(Mapping[str, Split]):
     """The splits ``train``, ``test``, ``unseen`` and ``buffer`` by name (a split may be empty), and the card."""
 
-    def __init__(self, path: Path, card: Mapping[str, Any], splits: Mapping[str, Split]) -> None:
+    def __init__(self, path: Path, card: DatasetCard, splits: Mapping[str, Split]) -> None:
         self.path = path
         self.card = card
         self._splits = dict(splits)
@@ -68,9 +68,9 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None) -> Da
     directory = Path(path)
     card = read_current_card(directory)
     split = read_samples(directory, ["split"]).column("split").to_numpy()
-    if len(split) != card["samples"]:
+    if len(split) != card.samples:
         raise DatasetError(
-            f"{directory}: samples.parquet has {len(split)} rows, its card says {card['samples']}; build it again"
+            f"{directory}: samples.parquet has {len(split)} rows, its card says {card.samples}; build it again"
         )
     files = open_patches(directory, card)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers

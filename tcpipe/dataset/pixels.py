@@ -14,7 +14,7 @@ from tcpipe.dataset.tensor import TensorForm
 from tcpipe.formats.dataset_files import PatchFiles
 
 Ints = NDArray[np.int64]
-Pixels = dict[str, NDArray[Any]]
+Pixels = dict[str, NDArray[np.uint8 | np.uint16 | np.float32]]
 
 IN_MEMORY_BYTES = 2 << 30
 """A split whose stored layers are smaller is kept in memory; the paper's whole dataset takes 70 MB."""

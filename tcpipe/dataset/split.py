@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +15,7 @@ from tcpipe.dataset.batches import BatchContent, Batches, BatchRules
 from tcpipe.dataset.pixels import View
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import read_samples, sample_columns
 from tcpipe.tables.bits import Quality, name_of
 
@@ -34,9 +35,9 @@ class SampleColumns:
 
     directory: Path
     rows: Ints
-    _read: dict[str, NDArray[Any]] = field(default_factory=dict)
+    _read: dict[str, NDArray[np.generic]] = field(default_factory=dict)
 
-    def __getitem__(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> NDArray[np.generic]:
         """Return one column, nulls as NaN or None, shape (N,)."""
         if name not in self._read:
             there = sample_columns(self.directory)
@@ -64,7 +65,7 @@ class Split:
 
     """
 
-    def __init__(self, name: str, card: Mapping[str, Any], columns: SampleColumns, view: View) -> None:
+    def __init__(self, name: str, card: DatasetCard, columns: SampleColumns, view: View) -> None:
         self.name = name
         self.view = view
         self._card = card
@@ -117,7 +118,7 @@ class Split:
     def labels(self) -> Floats:
         """Power [W] and velocity [m/s], float32, shape (N, 2); the card says which velocity."""
         if self._labels is None:
-            columns = [self.column(name) for name in self._card["label"]["columns"]]
+            columns = [self.column(name) for name in self._card.label.columns]
             self._labels = np.column_stack(columns).astype(np.float32)
         return self._labels
 
@@ -136,7 +137,7 @@ class Split:
             self._patches = self._tensor(np.arange(len(self)))
         return self._patches
 
-    def column(self, name: str) -> NDArray[Any]:
+    def column(self, name: str) -> NDArray[np.generic]:
         """Return a column of samples.parquet, shape (N,)."""
         return self._columns[name][self.view.at]
 
@@ -185,7 +186,7 @@ class Split:
         good = (self.column("quality").astype(np.int64) & bits) == 0
         for name, limit in (("power_std_watt", max_power_std_watt), ("velocity_std_mps", max_velocity_std_mps)):
             if limit is not None:
-                good &= self.column(name) <= limit
+                good &= self.column(name).astype(np.float64) <= limit
         return self.take(good)
 
     def fold(self, number: int) -> tuple[Split, Split]:

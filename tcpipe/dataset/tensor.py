@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.terrain.layers import LAYERS, Layer, in_order
 
 Floats = NDArray[np.float32]
-Pixels = Mapping[str, NDArray[Any]]
+Pixels = Mapping[str, NDArray[np.uint8 | np.uint16 | np.float32]]
 
 ONE_HOT = "_one_hot"
 """Ending of a categorical layer's name: a channel for each of its classes, 1 where the pixel is of it."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import pyarrow as pa
 
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import DIALECT, schema_of, to_json
 from tcpipe.formats.recipe_toml import recipe_schema
 from tcpipe.formats.run_documents import Manifest, RunJson
@@ -13,7 +14,7 @@ from tcpipe.tables.bits import name_of
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
 
-DOCUMENTS = {"run": RunJson, "manifest": Manifest}
+DOCUMENTS = {"run": RunJson, "manifest": Manifest, "dataset": DatasetCard}
 """The JSON documents that others read, by the name of their schema."""
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import pyarrow as pa
 
-_CONTEXT: dict[str, Any] = {
+from tcpipe.formats.json_files import Json, to_json
+from tcpipe.formats.seals import Checksum
+
+_CONTEXT: Json = {
     "@language": "en",
     "@vocab": "https://schema.org/",
     "cr": "http://mlcommons.org/croissant/",
@@ -76,14 +78,14 @@ def croissant(
     description: str,
     licence: str,
     creator: str,
-    files: Mapping[str, tuple[int, str]],
+    files: Mapping[str, Checksum],
     samples_file: str,
     samples: pa.Schema,
     version: str,
     shards: str | None = None,
     layers: Mapping[str, tuple[int, str]] | None = None,
-) -> dict[str, Any]:
-    """Return the document.
+) -> str:
+    """Return the document as text.
 
     Parameters
     ----------
@@ -103,7 +105,7 @@ def croissant(
 
     Returns
     -------
-    JSON-LD as Python values.
+    JSON-LD.
 
     """
     samples_source = {"fileObject": {"@id": samples_file}}
@@ -139,26 +141,26 @@ def croissant(
         "license": licence,
         "creator": {"@type": "sc:Person", "name": creator} if creator else None,
         "version": version,
-        "distribution": [*(_file_object(path, *files[path]) for path in sorted(files)), *sets],
+        "distribution": [*(_file_object(path, files[path]) for path in sorted(files)), *sets],
         "recordSet": records,
     }
-    return {key: value for key, value in document.items() if value}
+    return to_json({key: value for key, value in document.items() if value})
 
 
-def _file_object(path: str, size_bytes: int, sha256: str) -> dict[str, Any]:
+def _file_object(path: str, file: Checksum) -> Json:
     suffix = path[path.rfind(".") :] if "." in path.rsplit("/", 1)[-1] else ""
     return {
         "@type": "cr:FileObject",
         "@id": path,
         "name": path,
         "contentUrl": path,
-        "contentSize": f"{size_bytes} B",
+        "contentSize": f"{file.size_bytes} B",
         "encodingFormat": _ENCODING_BY_SUFFIX.get(suffix, "application/octet-stream"),
-        "sha256": sha256,
+        "sha256": file.sha256,
     }
 
 
-def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Any]) -> dict[str, Any]:
+def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Json]) -> Json:
     return {
         "@type": "cr:RecordSet",
         "@id": name,
@@ -177,7 +179,7 @@ def _patch_field(layer: str, values: int, kind: str) -> pa.Field:
     )
 
 
-def _field(records: str, field: pa.Field, source: Mapping[str, Any]) -> dict[str, Any]:
+def _field(records: str, field: pa.Field, source: Mapping[str, Json]) -> Json:
     metadata = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
     unit = f" [{metadata['unit']}]" if metadata.get("unit") else ""
     many = pa.types.is_fixed_size_list(field.type)

@@ -19,9 +19,10 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import DatasetError, StoreError, UsageError
+from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
+from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
+from tcpipe.formats.json_files import typed
 from tcpipe.formats.layer_descriptions import cf_attributes, layers_described
-from tcpipe.formats.maps.class_table import table_from_json
 from tcpipe.formats.parquet import column_names, read_row_group, read_table, write_table
 from tcpipe.formats.seals import prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
@@ -31,8 +32,9 @@ from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.terrain.layers import Layer, in_order, missing
 
 FileFormat = Literal["zarr", "parquet"]
+LayerPixels = NDArray[np.uint8 | np.uint16 | np.float32]
+"""Patches of one layer as they are stored, shape (N, px, px)."""
 
-KIND = "tcpipe dataset"
 CARD = "dataset.json"
 CROISSANT = "croissant.json"
 SAMPLES = "samples.parquet"
@@ -68,7 +70,7 @@ class Pixels:
     layers: Mapping[str, Layer]
     patch_px: int
     slots: NDArray[np.int64]
-    read: Callable[[str, NDArray[np.int64]], NDArray[Any]]
+    read: Callable[[str, NDArray[np.int64]], LayerPixels]
 
 
 def write_patches_zarr(
@@ -138,7 +140,7 @@ def write_patches_parquet(
     pixels: Pixels,
     samples: Callable[[NDArray[np.int64]], pa.Table],
     split: NDArray[np.str_],
-) -> list[dict[str, Any]]:
+) -> list[Shard]:
     """Write ``data/<split>-*.parquet``: the columns of the samples and each layer as a plain fixed-size list.
 
     Parameters
@@ -154,10 +156,10 @@ def write_patches_parquet(
 
     Returns
     -------
-    Path inside the dataset, split and rows of every shard.
+    Every shard.
 
     """
-    shards = []
+    shards = list[Shard]()
     for name in SPLITS:
         here = np.flatnonzero(split == name)
         count = -(-len(here) // SHARD_ROWS)
@@ -168,11 +170,11 @@ def write_patches_parquet(
                 table = table.append_column(*_list_column(layer, pixels.read(layer.name, pixels.slots[part])))
             path = f"{SHARDS}/{name}-{number:05d}-of-{count:05d}.parquet"
             write_table(table, directory / path, rows_per_group=GROUP_ROWS)
-            shards.append({"path": path, "split": name, "rows": len(part)})
+            shards.append(Shard(path, name, len(part)))
     return shards
 
 
-def _list_column(layer: Layer, patches: NDArray[Any]) -> tuple[pa.Field, pa.Array]:
+def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array]:
     """Return a layer as a column: rows of the patch one after another."""
     px = patches.shape[1]
     values = pa.array(np.ascontiguousarray(patches, layer.stored).reshape(-1))
@@ -182,20 +184,7 @@ def _list_column(layer: Layer, patches: NDArray[Any]) -> tuple[pa.Field, pa.Arra
     return pa.field(layer.name, dtype, nullable=False, metadata=metadata), column
 
 
-_CARD = {
-    "tcpipe_version": str, "inputs": str, "name": str, "description": str, "recipe": dict, "tensor": {"channels": [str]},
-    "samples": int, "splits": dict.fromkeys(SPLITS, int), "format": str, "patch_m": float, "patch_px": int, "layers": dict,
-    "classes": [{"id": int, "name": str}], "label": {"columns": [str], "velocity": str},
-    "split": {"region": (dict, type(None)), "audit": [dict], "test_fraction": float, "holdout": str},
-    "ledger_m": dict, "removal": dict, "balance": dict, "warnings": [str], "checksums": dict,
-    "maps": [{"name": str, "crs": str}],
-    "runs": [{"run_id": str, "recipe_id": str, "robot": str, "logs": [str], "samples": int}],
-    "shards": [{"path": str, "split": str, "rows": int}],
-}  # fmt: skip
-"""What every reader of a card may rely on."""
-
-
-def read_card(directory: Path, *, proved: bool = True) -> dict[str, Any]:
+def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
     """Return the card of the dataset in ``directory``, of any data model.
 
     Raises
@@ -211,19 +200,27 @@ def read_card(directory: Path, *, proved: bool = True) -> dict[str, Any]:
     if not (directory / CARD).is_file():
         raise UsageError(f"{directory}: not a dataset: it has no {CARD}")
     try:
-        card = read_sealed(directory / CARD, _CARD, ours=lambda found: proved and _is_current(found))
+        found = read_sealed(directory / CARD, ours=lambda found: proved and _is_current(found))
     except StoreError as error:
         raise DatasetError(*error.problems) from None
-    if card.get("kind") != KIND:
-        raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {card.get('kind')!r})")
-    return card
+    if found.get("kind") != KIND:
+        raise DatasetError(f"{directory / CARD}: not the card of a tcpipe dataset (kind is {found.get('kind')!r})")
+    try:
+        return typed(found, DatasetCard, directory / CARD)
+    except (StoreError, RecipeError) as error:
+        problems = error.problems if _is_current(found) else (_outdated(directory, found.get("data_model_version")),)
+        raise DatasetError(*problems) from None
 
 
-def _is_current(card: Mapping[str, Any]) -> bool:
+def _outdated(directory: Path, version: object) -> str:
+    return f"{directory}: written by data model {version}, wanted {DATA_MODEL_VERSION}; build it again"
+
+
+def _is_current(card: Mapping[str, object]) -> bool:
     return card.get("kind") == KIND and card.get("data_model_version") in READ_VERSIONS
 
 
-def read_current_card(directory: Path) -> dict[str, Any]:
+def read_current_card(directory: Path) -> DatasetCard:
     """Return the card of a dataset of this data model, whose samples and descriptions of patches are as they were written.
 
     Patches carry checksums of their own, which are proved when they are read.
@@ -235,13 +232,11 @@ def read_current_card(directory: Path) -> dict[str, Any]:
 
     """
     card = read_card(directory)
-    if not _is_current(card):
-        raise DatasetError(
-            f"{directory}: written by data model {card.get('data_model_version')}, wanted {DATA_MODEL_VERSION}; build it again"
-        )
-    described = [name for name in card["checksums"] if Path(name).name == DESCRIPTION]
+    if card.data_model_version not in READ_VERSIONS:
+        raise DatasetError(_outdated(directory, card.data_model_version))
+    described = [name for name in card.checksums if Path(name).name == DESCRIPTION]
     try:
-        prove_files(directory, card["checksums"], [SAMPLES, *described])
+        prove_files(directory, card.checksums, [SAMPLES, *described])
     except StoreError as error:
         raise DatasetError(*error.problems) from None
     return card
@@ -319,19 +314,19 @@ class PatchFiles:
         return {layer: into[layer][:rows] for layer in layers}
 
 
-def open_patches(directory: Path, card: Mapping[str, Any]) -> PatchFiles:
+def open_patches(directory: Path, card: DatasetCard) -> PatchFiles:
     """Return where the patches of a dataset lie; `DatasetError` if they are gone, or not what the card says."""
-    px, samples, classes = card["patch_px"], card["samples"], card["classes"]
-    layers = in_order(layers_described(card["layers"], table_from_json(classes).classes, directory / CARD))
-    known = card["format"] in get_args(FileFormat)
+    px, samples = card.patch_px, card.samples
+    layers = in_order(layers_described(card.layers, card.classes, directory / CARD))
+    known = card.format in get_args(FileFormat)
     if not (layers and known and 0 < px <= MOST_PX and 0 <= samples <= MOST_SAMPLES):
         raise DatasetError(
-            f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card['format']}: wanted up to "
+            f"{directory / CARD}: {samples} patches of {px} px in {len(layers)} layers, {card.format}: wanted up to "
             f"{MOST_SAMPLES} of up to {MOST_PX} px, zarr or parquet"
         )
-    if "terrain" in layers and not classes:
+    if "terrain" in layers and not card.classes:
         raise DatasetError(f"{directory / CARD}: a layer terrain, but no classes; build the dataset again")
-    if card["format"] == "parquet":
+    if card.format == "parquet":
         return _in_shards(directory, layers, px, card)
     try:
         arrays = {layer: open_sharded(directory / PATCHES / layer) for layer in layers}
@@ -346,14 +341,14 @@ def open_patches(directory: Path, card: Mapping[str, Any]) -> PatchFiles:
     return PatchFiles(directory, layers, px, starts, arrays)
 
 
-def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: Mapping[str, Any]) -> PatchFiles:
-    rows = [shard["rows"] for shard in card["shards"]]
-    if min(rows, default=0) < 0 or sum(rows) != card["samples"]:
-        raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, wanted {card['samples']}")
+def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:
+    rows = [shard.rows for shard in card.shards]
+    if min(rows, default=0) < 0 or sum(rows) != card.samples:
+        raise DatasetError(f"{directory / CARD}: its shards hold {sum(rows)} rows, wanted {card.samples}")
     groups = [
-        (shard["path"], group, min(GROUP_ROWS, shard["rows"] - group * GROUP_ROWS))
-        for shard in card["shards"]
-        for group in range(-(-shard["rows"] // GROUP_ROWS))
+        (shard.path, group, min(GROUP_ROWS, shard.rows - group * GROUP_ROWS))
+        for shard in card.shards
+        for group in range(-(-shard.rows // GROUP_ROWS))
     ]
     starts = np.concatenate([[0], np.cumsum([rows for *_, rows in groups])]).astype(np.int64)
     return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
@@ -370,10 +365,10 @@ def zarr_sample_ids(directory: Path) -> list[str]:
         raise DatasetError(f"{directory / PATCHES}: its sample ids cannot be read ({error}); build it again") from None
 
 
-def rows_in_files(card: Mapping[str, Any], splits: NDArray[np.object_]) -> dict[str, NDArray[np.int64]]:
+def rows_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> dict[str, NDArray[np.int64]]:
     """Return, for every split, where its samples lie in the order of the files; ``splits`` is the samples' column, (N,)."""
     rows = {name: np.flatnonzero(splits == name) for name in SPLITS}
-    if card["format"] == "parquet":
+    if card.format == "parquet":
         return dict(_following(rows))
     return rows
 

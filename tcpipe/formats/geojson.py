@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry.base import BaseGeometry
 from shapely.validation import explain_validity
 
 from tcpipe.errors import RegionError
+from tcpipe.formats.json_files import Json
 from tcpipe.splits.regions import Regions
 
 KINDS = ("train_test", "unseen", "exclude")
@@ -75,8 +76,33 @@ class PolygonFeature:
     """A feature: where it stands (file and number), its properties, and its polygons in WGS84 lon/lat [deg]."""
 
     where: str
-    properties: Mapping[str, Any]
+    properties: Mapping[str, Json]
     polygons: tuple[BaseGeometry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PolygonGeometry:
+    """A GeoJSON Polygon or MultiPolygon in WGS84 lon, lat [deg]."""
+
+    type: str
+    coordinates: tuple[tuple[tuple[float | tuple[float, ...], ...], ...], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """A polygon feature as it is written: rings to the right-hand rule, lon before lat."""
+
+    properties: Mapping[str, str | float | None]
+    geometry: PolygonGeometry
+    type: str = "Feature"
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureCollection:
+    """A GeoJSON file as it is written."""
+
+    features: tuple[Feature, ...]
+    type: str = "FeatureCollection"
 
 
 def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
@@ -95,12 +121,12 @@ def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
     return features, problems
 
 
-def read_features(path: Path) -> Iterator[tuple[str, Mapping[str, Any], Any]]:
+def read_features(path: Path) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
     """Yield where, properties and geometry object of every feature of a file; `RegionError` if it is not GeoJSON in WGS84."""
     yield from _features(path, _document(path))
 
 
-def brief(value: Any) -> str:
+def brief(value: object) -> str:
     """Return a value as it stands in a file, cut if it is long."""
     text = repr(value)
     return text if len(text) <= _SHOWN_CHARACTERS else f"{text[:_SHOWN_CHARACTERS]}…"
@@ -112,7 +138,7 @@ def shortened(problems: list[str]) -> list[str]:
     return problems if more <= 0 else [*problems[:_SHOWN], f"… and {more} more"]
 
 
-def _document(path: Path) -> Mapping[str, Any]:
+def _document(path: Path) -> Mapping[str, Json]:
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
@@ -136,11 +162,12 @@ def _document(path: Path) -> Mapping[str, Any]:
     return document
 
 
-def _features(path: Path, document: Mapping[str, Any]) -> Iterator[tuple[str, Mapping[str, Any], Any]]:
+def _features(path: Path, document: Mapping[str, Json]) -> Iterator[tuple[str, Mapping[str, Json], Json]]:
     """Yield where, properties and geometry object of every feature."""
-    name = document["type"]
-    if name == "FeatureCollection" and isinstance(document.get("features"), list):
-        features = document["features"]
+    name, listed = document["type"], document.get("features")
+    features: Sequence[Json]
+    if name == "FeatureCollection" and isinstance(listed, list):
+        features = listed
     elif name == "Feature":
         features = [document]
     elif name in _GEOMETRIES:
@@ -155,13 +182,14 @@ def _features(path: Path, document: Mapping[str, Any]) -> Iterator[tuple[str, Ma
         yield where, properties if isinstance(properties, dict) else {}, feature.get("geometry")
 
 
-def _polygons(where: str, geometry: Any, problems: list[str], *, depth: int = 0) -> Iterator[BaseGeometry]:
+def _polygons(where: str, geometry: Json, problems: list[str], *, depth: int = 0) -> Iterator[BaseGeometry]:
     """Yield the sound polygons of one geometry object; add a line to ``problems`` for every unsound one."""
-    name = geometry.get("type") if isinstance(geometry, dict) else None
-    if geometry is None or (isinstance(geometry, dict) and not geometry.get("coordinates", geometry.get("geometries"))):
+    told = geometry if isinstance(geometry, dict) else {}
+    name = told.get("type")
+    if geometry is None or (told == geometry and not told.get("coordinates", told.get("geometries"))):
         problems.append(f"{where}: its geometry is empty; draw it or remove the feature")
     elif name == "GeometryCollection":
-        parts = geometry.get("geometries")
+        parts = told.get("geometries")
         if depth == _MAX_DEPTH or not isinstance(parts, list):
             problems.append(
                 f"{where}: a GeometryCollection without a list of geometries, or more than {_MAX_DEPTH} in one another"
@@ -172,7 +200,7 @@ def _polygons(where: str, geometry: Any, problems: list[str], *, depth: int = 0)
     elif name not in ("Polygon", "MultiPolygon"):
         problems.append(f"{where}: geometry is {brief(name)}, wanted Polygon or MultiPolygon")
     else:
-        coordinates = geometry.get("coordinates")
+        coordinates = told.get("coordinates")
         parts = coordinates if name == "MultiPolygon" else [coordinates]
         for rings in parts if isinstance(parts, list) else [None]:
             found = _polygon(rings)
@@ -182,7 +210,7 @@ def _polygons(where: str, geometry: Any, problems: list[str], *, depth: int = 0)
                 yield found
 
 
-def _polygon(rings: Any) -> BaseGeometry | str:
+def _polygon(rings: Json) -> BaseGeometry | str:
     """Return the polygon, or what is wrong with it."""
     if not isinstance(rings, list) or not rings:
         return "its geometry is empty; draw it or remove the feature"
@@ -200,7 +228,7 @@ def _polygon(rings: Any) -> BaseGeometry | str:
     return polygon
 
 
-def _ring_problem(lonlat: np.ndarray[Any, np.dtype[np.float64]]) -> str | None:
+def _ring_problem(lonlat: NDArray[np.float64]) -> str | None:
     if lonlat.ndim != 2 or lonlat.shape[1:] != (2,) or not np.isfinite(lonlat).all():
         return "its coordinates are not rings of finite [lon, lat] positions"
     lon, lat = lonlat[np.argmax(np.abs(lonlat).max(axis=1))]

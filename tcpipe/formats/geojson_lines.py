@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import PathError, RegionError
 from tcpipe.formats.geojson import brief, read_features
-from tcpipe.formats.json_files import write_json
+from tcpipe.formats.json_files import Json, write_json
 
 _DECIMALS = 9
 """A tenth of a millimetre."""
@@ -44,7 +44,7 @@ def read_line(path: Path) -> NDArray[np.float64]:
     return _positions(where, coordinates)
 
 
-def _positions(where: str, coordinates: Any) -> NDArray[np.float64]:
+def _positions(where: str, coordinates: Json) -> NDArray[np.float64]:
     if not isinstance(coordinates, list) or not coordinates:
         raise PathError(f"{where}: its line has no points; wanted at least two")
     try:

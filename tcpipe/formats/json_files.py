@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from pathlib import Path
@@ -18,6 +18,8 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_text
 
 T = TypeVar("T")
+Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
+"""A value of a document whose form is others' (JSON-LD, CF attributes); our own documents are dataclasses."""
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """Of every schema in ``schemas/``."""
@@ -30,7 +32,7 @@ def plain(value: Any) -> Any:
     """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
     if is_dataclass(value) and not isinstance(value, type):
         told = ((of.name, getattr(value, of.name), "json" in of.metadata) for of in fields(value))
-        value = {name: item for name, item, left_out in told if not (left_out and item in (None, {}, []))}
+        value = {name: item for name, item, left_out in told if not (left_out and item in (None, {}, [], ()))}
     elif isinstance(value, Enum):
         value = value.value
     elif hasattr(value, "tolist"):  # numpy scalars and arrays
@@ -96,33 +98,6 @@ def parse_json(data: bytes, path: Path) -> dict[str, Any]:
     return found
 
 
-def misfit(value: Any, form: Any, where: str = "") -> str | None:
-    """Return what of a JSON value is not of a form, None if all is.
-
-    A form is a type or a tuple of types (a number is a float), an object of forms by key, of which all must be there and others may be,
-    or a list with the form of each element.
-    """
-    if isinstance(form, dict) and isinstance(value, dict):
-        pairs = [(f"{where}{key}", value.get(key, _ABSENT), of) for key, of in form.items()]
-    elif isinstance(form, list) and isinstance(value, list):
-        pairs = [(f"{where.rstrip('.')}[{number}]", element, form[0]) for number, element in enumerate(value)]
-    else:
-        wanted = (dict,) if isinstance(form, dict) else (list,) if isinstance(form, list) else form
-        types = wanted if isinstance(wanted, tuple) else (wanted,)
-        fits = type(value) in types or (type(value) is int and float in types)
-        names = " or ".join(_FORM_NAMES[of] for of in types)
-        found = "missing" if value is _ABSENT else _FORM_NAMES[type(value)]
-        return None if fits else f"{where.rstrip('.')} is {found}, wanted {names}"
-    return next((line for name, part, of in pairs if (line := misfit(part, of, f"{name}."))), None)
-
-
-_ABSENT = object()
-_FORM_NAMES = {
-    dict: "an object", list: "a list", str: "a text", int: "a whole number", float: "a number", bool: "true or false",
-    type(None): "null",
-}  # fmt: skip
-
-
 def read_as(path: Path, cls: type[T]) -> T:
     """Read one JSON object as a dataclass; `StoreError` names a file that cannot be read, or the file and the key of what does not fit."""
     return typed(read_json(path), cls, path)
@@ -138,7 +113,7 @@ def typed(value: object, cls: type[T], path: Path) -> T:
 
     """
     try:
-        return msgspec.convert(value, cls)
+        return msgspec.convert(value, cls, str_keys=True, dec_hook=_from_text)
     except msgspec.ValidationError as error:
         raise StoreError(f"{path}: is not what this version writes: {_in_words(str(error))}") from None
 
@@ -160,9 +135,15 @@ _JSON_NAMES = {
 }  # fmt: skip
 
 
+def _from_text(kind: type, text: str) -> Path:
+    if kind is not Path:
+        raise NotImplementedError(kind)
+    return Path(text)
+
+
 def schema_of(cls: type) -> str:
     """Return the JSON Schema of a dataclass as text: of what `to_json` writes of it, and `read_as` reads."""
-    return to_json({"$schema": DIALECT, **msgspec.json.schema(cls)})
+    return to_json({"$schema": DIALECT, **msgspec.json.schema(cls, schema_hook=lambda _: {"type": "string"})})
 
 
 def digest(value: Any) -> str:

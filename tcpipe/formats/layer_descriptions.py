@@ -11,7 +11,7 @@ from tcpipe.formats.json_files import typed
 from tcpipe.terrain.classes import ClassTable, TerrainClass
 from tcpipe.terrain.layers import PAPER_LAYERS, Kind, Layer, categorical_layer, continuous_layer, paper_layers
 
-Value: TypeAlias = str | float | Sequence[float] | Sequence[Mapping[str, str | int]] | None
+Value: TypeAlias = str | int | float | Sequence[float | Mapping[str, str | int | bool]] | None
 Description: TypeAlias = Mapping[str, Value]
 
 

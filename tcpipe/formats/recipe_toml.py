@@ -57,14 +57,9 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     return from_values(Recipe, values, where=where)
 
 
-def plain_recipe(recipe: Recipe | IngestSections) -> Any:
-    """Return a recipe as JSON values; without robots and power sources of its own where it has none, as before there were any."""
-    return {name: values for name, values in plain(recipe).items() if values or name not in _OWN_TABLES}
-
-
 def ingest_key(recipe: Recipe | Mapping[str, Any]) -> str:
     """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
-    values = plain_recipe(recipe.ingest) if isinstance(recipe, Recipe) else recipe
+    values = plain(recipe.ingest) if isinstance(recipe, Recipe) else recipe
     names = [section.name for section in fields(IngestSections)]
     return digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import digest, misfit, parse_json, plain, read_document, typed, write_json
+from tcpipe.formats.json_files import digest, parse_json, plain, read_document, typed, write_json
 
 T = TypeVar("T")
 
@@ -42,6 +42,13 @@ class Checksum:
     sha256: str
 
 
+@dataclass(frozen=True, slots=True)
+class Checksums:
+    """The document ``checksums.json``: every file of its directory, by path."""
+
+    checksums: Mapping[str, Checksum]
+
+
 def write_sealed(path: Path, value: object) -> None:
     """Write a JSON object with a seal, whole or not at all."""
     write_json(path, sealed(value))
@@ -53,17 +60,13 @@ def sealed(value: object) -> dict[str, Any]:
     return {**bare, SEAL: digest(bare)}
 
 
-def read_sealed(
-    path: Path, form: Mapping[str, Any] | None = None, *, ours: Callable[[Mapping[str, Any]], bool] = lambda _: True
-) -> dict[str, Any]:
+def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
     """Read a JSON object that `write_sealed` wrote, and prove it.
 
     Parameters
     ----------
     path
         The document.
-    form
-        What it must hold (`tcpipe.formats.json_files.misfit`).
     ours
         Tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
         refuse.
@@ -71,7 +74,7 @@ def read_sealed(
     Raises
     ------
     StoreError
-        It cannot be read, is not as it was written, or does not hold what it must.
+        It cannot be read, or is not as it was written.
 
     """
     data = read_document(path)
@@ -80,9 +83,6 @@ def read_sealed(
         return found
     if not _document_is_whole(data):
         raise StoreError(f"{broken(path)}{_TELLS.format(path.parent)}")
-    wrong = misfit(found, form or {})
-    if wrong:
-        raise StoreError(f"{path}: is not what this version writes: {wrong}")
     return found
 
 
@@ -91,7 +91,7 @@ def read_sealed_as(path: Path, cls: type[T]) -> T:
     return typed(read_sealed(path), cls, path)
 
 
-def prove_files(directory: Path, checksums: Mapping[str, Any], names: Iterable[str]) -> None:
+def prove_files(directory: Path, checksums: Mapping[str, Checksum], names: Iterable[str]) -> None:
     """Compare files of a directory with what a sealed document has of them; `StoreError` names the first that differs."""
     lines = list(broken_checksums(directory, {name: checksums.get(name) for name in names}))
     if lines:
@@ -101,7 +101,12 @@ def prove_files(directory: Path, checksums: Mapping[str, Any], names: Iterable[s
 
 def write_checksums(directory: Path) -> None:
     """Write ``checksums.json`` into a directory that is otherwise complete: every file below it."""
-    write_sealed(directory / CHECKSUMS, {"checksums": checksums_to_json(directory)})
+    write_sealed(directory / CHECKSUMS, Checksums(file_checksums(directory)))
+
+
+def read_checksums(directory: Path) -> Mapping[str, Checksum]:
+    """Return what ``checksums.json`` has of every file of its directory; `StoreError` as `read_sealed`."""
+    return read_sealed_as(directory / CHECKSUMS, Checksums).checksums
 
 
 def sealed_page(html: str) -> str:
@@ -125,42 +130,39 @@ def broken_seal(path: Path) -> str | None:
     return None if whole(data) else broken(path)
 
 
-def broken_checksums(directory: Path, checksums: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a line for every file below ``directory`` that is not what ``checksums`` has of it, ``size_bytes`` and ``sha256`` by path."""
-    for name, entry in checksums.items():
+def broken_checksums(directory: Path, checksums: Mapping[str, Checksum | None]) -> Iterator[str]:
+    """Yield a line for every file below ``directory`` that is not what ``checksums`` has of it, by path; None: nothing."""
+    for name, wanted in checksums.items():
         path = directory / name
         if not path.is_file():
             yield f"{path}: is gone"
             continue
-        wanted_bytes, wanted = (
-            entry.get(key) if isinstance(entry, Mapping) else None for key in ("size_bytes", "sha256")
-        )
         try:
-            size_bytes, sha256 = file_checksum(path)
+            found = file_checksum(path)
         except OSError as error:
             yield f"{path}: cannot be read ({error.strerror})"
             continue
-        if (size_bytes, sha256) != (wanted_bytes, wanted):
-            size = "" if size_bytes == wanted_bytes else f" ({size_bytes} bytes, wanted {wanted_bytes})"
-            yield f"{path}: its sha256 is {sha256[:12]}…, wanted {str(wanted)[:12]}…{size}"
+        if wanted is None:
+            yield f"{path}: its sha256 is not on record"
+        elif found != wanted:
+            size = (
+                ""
+                if found.size_bytes == wanted.size_bytes
+                else f" ({found.size_bytes} bytes, wanted {wanted.size_bytes})"
+            )
+            yield f"{path}: its sha256 is {found.sha256[:12]}…, wanted {wanted.sha256[:12]}…{size}"
 
 
-def file_checksum(path: Path) -> tuple[int, str]:
-    """Return size [byte] and sha256 (hex) of a file."""
+def file_checksum(path: Path) -> Checksum:
+    """Return size and sha256 of a file."""
     with path.open("rb") as stream:
-        return path.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest()
+        return Checksum(path.stat().st_size, hashlib.file_digest(stream, "sha256").hexdigest())
 
 
-def file_checksums(directory: Path) -> dict[str, tuple[int, str]]:
-    """Return size [byte] and sha256 (hex) of every file below ``directory``, by its path inside it."""
+def file_checksums(directory: Path) -> dict[str, Checksum]:
+    """Return size and sha256 of every file below ``directory``, by its path inside it."""
     files = sorted(entry for entry in directory.rglob("*") if entry.is_file())
     return {path.relative_to(directory).as_posix(): file_checksum(path) for path in files}
-
-
-def checksums_to_json(directory: Path) -> dict[str, dict[str, int | str]]:
-    """Return `file_checksums` as JSON values: ``size_bytes`` and ``sha256`` by path."""
-    found = file_checksums(directory)
-    return {path: {"size_bytes": size_bytes, "sha256": sha256} for path, (size_bytes, sha256) in found.items()}
 
 
 def seal_of(directory: Path) -> str:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import read_arrays, write_arrays
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = Mapping[str, NDArray[np.generic]]
 
 _STATE = "state"
 
@@ -32,7 +32,7 @@ class Progress:
     """Epoch, loss, loss of the held-out fold."""
 
 
-def write_checkpoint(path: Path, progress: Progress, parts: Mapping[str, Mapping[str, NDArray[Any]]]) -> None:
+def write_checkpoint(path: Path, progress: Progress, parts: Mapping[str, Mapping[str, NDArray[np.generic]]]) -> None:
     """Write where training stands and its weights, whole or not at all."""
     state = np.frombuffer(json.dumps(asdict(progress)).encode(), np.uint8)  # keeps what is infinite or not a number
     arrays = {f"{part}/{name}": array for part, named in parts.items() for name, array in named.items()}
@@ -56,11 +56,11 @@ def read_checkpoint(path: Path, key: str) -> tuple[Progress, dict[str, Arrays]]:
         raise ModelError(f"{path}: {reason}; remove it, or start anew with --fresh") from None
     if progress.key != key:
         raise ModelError(f"{path}: of another dataset or other options; remove it, or start anew with --fresh")
-    parts: dict[str, Arrays] = {}
+    parts: dict[str, dict[str, NDArray[np.generic]]] = {}
     for name, array in arrays.items():
         part, _, rest = name.partition("/")
         parts.setdefault(part, {})[rest] = array
-    return progress, parts
+    return progress, dict(parts)
 
 
 def _progress(found: Any) -> Progress:

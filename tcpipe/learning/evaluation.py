@@ -12,7 +12,8 @@ import numpy as np
 
 from tcpipe import __version__
 from tcpipe.dataset import Dataset, Split, open_dataset
-from tcpipe.errors import DatasetError, ModelError
+from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.learning.fitting import FitConfig
@@ -124,7 +125,7 @@ def evaluate(
         "schema_version": 1,
         "tcpipe_version": __version__,
         "model": {"name": ours.name, "checksum": ours.checksum, "training": ours.card.training},
-        "dataset": {"name": data.card["name"], "sha256": dataset_checksum(data.card), "samples": data.card["splits"]},
+        "dataset": {"name": data.card.name, "sha256": dataset_checksum(data.card), "samples": data.card.splits},
         "config": asdict(config),
         "splits": {name: _split_values(found, said[name], plant) for name, found in sets.items()},
         "ablation": ablation,
@@ -139,16 +140,13 @@ def evaluate(
 
 def _how_it_was_trained(model: Model) -> tuple[FitConfig, int]:
     """Return options and number of fitted samples, by which networks beside the model are trained."""
-    try:
-        return FitConfig(**model.card.training["config"]), int(model.card.training["samples"]["fitted"])
-    except (KeyError, TypeError):
-        raise ModelError(f"{model.name}: its card does not say how it was trained; train the model again") from None
+    return model.card.training.config, model.card.training.samples["fitted"]
 
 
-def _repeatability(card: Mapping[str, Any]) -> dict[str, Any]:
+def _repeatability(card: DatasetCard) -> dict[str, Any]:
     """Return how well each label repeats itself where ground was driven twice, as the dataset's card has it; None where it was not."""
-    columns = {"w": "power_watt", "v": card["label"]["columns"][1], "T": "duration_s", "E": "energy_joule"}
-    found = card.get("balance", {}).get("repeatability", {})
+    columns = {"w": "power_watt", "v": card.label.columns[1], "T": "duration_s", "E": "energy_joule"}
+    found = card.balance.repeatability
     return {quantity: found.get(column) for quantity, column in columns.items()}
 
 
@@ -209,7 +207,7 @@ def _energy(
 ) -> dict[str, Any]:
     """Return table IV: E by this model, by a height-only network of grass, and by one a class."""
     found: dict[str, Any] = {OURS: {name: _all_errors(said[name], part)["E"] for name, part in sets.items()}}
-    if trained is None or "height" not in data.card["layers"]:
+    if trained is None or "height" not in data.card.layers:
         return found
     counts = ours.card.seen.class_counts
     grass = next((entry.id for entry in ours.classes.classes if entry.name == "grass" and counts.get(entry.id)), None)
@@ -241,8 +239,8 @@ def _by_own_network(networks: Mapping[int, Model], found: Measured) -> Errors:
 
 def _fastest_mps(robot: str, data: Dataset) -> float | None:
     """Return a robot's greatest speed [m/s], as the recipe of the dataset or else the package knows it."""
-    own = data.card["recipe"].get("robots", {}).get(robot)
-    return own["max_velocity_mps"] if own else shipped_profiles().robots.get(robot, Robot()).max_velocity_mps
+    known = {**shipped_profiles().robots, **data.card.recipe.robots}
+    return known.get(robot, Robot()).max_velocity_mps
 
 
 def _time(
@@ -270,9 +268,9 @@ def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
             count = int((found.class_ids == class_id).sum())
             if class_id not in {NODATA_ID, *ours.class_counts}:
                 lines.append(f"{called}: {count} samples of {name}, none in training: the model never saw this class")
-    if dataset_checksum(data.card) != ours.card.dataset["sha256"]:
+    if dataset_checksum(data.card) != ours.card.dataset.sha256:
         lines.append(
-            f"the model was trained on another dataset ({ours.card.dataset['name']}, {ours.card.dataset['sha256'][:12]}): "
+            f"the model was trained on another dataset ({ours.card.dataset.name}, {ours.card.dataset.sha256[:12]}): "
             "its test samples here may have been trained on there"
         )
     return lines

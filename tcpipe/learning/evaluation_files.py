@@ -14,6 +14,7 @@ from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import digest, read_json, to_json, write_json
+from tcpipe.formats.seals import sealed
 from tcpipe.learning.evaluation import NETWORKS, EvaluateConfig, PlantCosts, evaluate
 from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows
 from tcpipe.learning.metrics import ALL, QUANTITIES
@@ -93,7 +94,7 @@ def run_evaluation(
 def _key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
     """Return what tells one evaluation from another."""
     told = [
-        read_model_card(Path(model)),
+        sealed(read_model_card(Path(model))),
         dataset_checksum(read_card(Path(dataset))),
         asdict(config),
         simulated,

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass, field
 
-from tcpipe.errors import ModelError
-from tcpipe.formats.maps.class_table import table_from_json, table_to_json
+from tcpipe.formats.seals import Checksum
+from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.network import Architecture
-from tcpipe.terrain.classes import ClassTable
+from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe model"
 
@@ -30,9 +29,39 @@ class Seen:
 
 
 @dataclass(frozen=True, slots=True)
-class ModelCard:
-    """All of model.json but its checksums."""
+class TrainedOn:
+    """The dataset that a model was trained on."""
 
+    name: str
+    sha256: str
+    """Over the checksums of its files."""
+    data_model_version: str
+    samples: Mapping[str, int]
+    """By split."""
+
+
+@dataclass(frozen=True, slots=True)
+class Training:
+    """How a model was trained."""
+
+    key: str
+    """Hash of dataset and options: the same key, the same training."""
+    config: FitConfig
+    optimizer: str
+    samples: Mapping[str, int]
+    """``fitted``, and ``held out`` to stop by."""
+    epochs: int
+    best_epoch: int
+    held_out_loss: float
+    device: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelCard:
+    """All of model.json but its seal."""
+
+    kind: str = KIND
+    schema_version: int = SCHEMA_VERSION
     architecture: Architecture
     channels: tuple[str, ...]
     outputs: tuple[str, ...]
@@ -47,62 +76,14 @@ class ModelCard:
     label_velocity: str
     """ground or fused: which velocity v is."""
     robot: str
-    classes: ClassTable
+    classes: tuple[TerrainClass, ...]
     seen: Seen
-    dataset: Mapping[str, Any]
-    """Name, checksum, data-model version and number of samples of what it was trained on."""
-    training: Mapping[str, Any]
-    """Loss, optimiser, seed, fold, epochs: how it was trained."""
+    dataset: TrainedOn
+    training: Training
+    checksums: Mapping[str, Checksum] = field(default_factory=dict)
+    """Of the files beside it, by name."""
 
 
-_PLAIN = ("patch_m", "chord_m", "max_arc_to_chord", "label_velocity", "robot", "dataset", "training")
-
-
-def card_to_json(card: ModelCard) -> dict[str, Any]:
-    """Return the card as JSON values."""
-    values = {name: getattr(card, name) for name in ModelCard.__slots__}
-    values |= {
-        "architecture": asdict(card.architecture),
-        "classes": table_to_json(card.classes),
-        "seen": asdict(card.seen),
-    }
-    return {"kind": KIND, "schema_version": SCHEMA_VERSION, **values}
-
-
-def is_current(found: Mapping[str, Any]) -> bool:
+def is_current(found: Mapping[str, object]) -> bool:
     """Return whether a document is the card of a model of this schema."""
     return found.get("kind") == KIND and found.get("schema_version") == SCHEMA_VERSION
-
-
-def card_from_json(found: Mapping[str, Any], where: str) -> ModelCard:
-    """Return the card that `card_to_json` wrote.
-
-    Raises
-    ------
-    ModelError
-        It is none, of another schema, or incomplete.
-
-    """
-    if found.get("kind") != KIND:
-        raise ModelError(f"{where}: not the card of a tcpipe model (kind is {found.get('kind')!r})")
-    if found.get("schema_version") != SCHEMA_VERSION:
-        version = found.get("schema_version")
-        raise ModelError(f"{where}: written by model schema {version}, wanted {SCHEMA_VERSION}; train the model again")
-    try:
-        seen = found["seen"]
-        plain = {name: found[name] for name in _PLAIN}
-        return ModelCard(
-            architecture=Architecture(**found["architecture"]),
-            channels=tuple(found["channels"]),
-            outputs=tuple(found["outputs"]),
-            scale=tuple(float(value) for value in found["scale"]),
-            classes=table_from_json(found["classes"]),
-            seen=Seen(
-                {int(class_id): int(count) for class_id, count in seen["class_counts"].items()},
-                tuple(seen["pixel_classes"]),
-                {name: (float(low), float(high)) for name, (low, high) in seen["ranges"].items()},
-            ),
-            **plain,
-        )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ModelError(f"{where}: incomplete ({type(error).__name__}: {error}); train the model again") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 from jinja2 import Environment, StrictUndefined
@@ -33,17 +34,17 @@ load_model("model").predict(patches)
 
 def model_readme(card: ModelCard) -> str:
     """Return the text of MODEL.md."""
-    names = {entry.id: entry.name for entry in card.classes.classes}
+    names = {entry.id: entry.name for entry in card.classes}
     counts = (
         f"{_in_markdown(str(names.get(class_id, class_id)))} {count}"
         for class_id, count in card.seen.class_counts.items()
     )
-    dataset = {**card.dataset, "name": _in_markdown(str(card.dataset["name"]))}
+    dataset = replace(card.dataset, name=_in_markdown(card.dataset.name))
     return Environment(autoescape=False, undefined=StrictUndefined, keep_trailing_newline=True).from_string(_TEXT).render(  # noqa: S701  Markdown
         outputs=", ".join(card.outputs), chord=f"{card.chord_m:g}", px=card.architecture.patch_px,
         depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
         velocity=card.label_velocity, robot=card.robot, width=card.architecture.width,
-        config=card.training["config"], told=card.training, dataset=dataset, classes=", ".join(counts),
+        config=card.training.config, told=card.training, dataset=dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.seen.ranges["slope_rad"]),
         relief=" to ".join(f"{value:.2f} m" for value in card.seen.ranges.get("relief_m", ())) or "not looked at",
     )  # fmt: skip

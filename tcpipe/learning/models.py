@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import atomic_directory, write_text
-from tcpipe.formats.json_files import digest
+from tcpipe.formats.json_files import digest, typed
 from tcpipe.formats.parquet import read_table, write_table
-from tcpipe.formats.seals import broken_checksums, checksums_to_json, read_sealed, write_sealed
+from tcpipe.formats.seals import broken_checksums, file_checksums, read_sealed, sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
-from tcpipe.learning.model_card import ModelCard, card_from_json, card_to_json, is_current
+from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.network import named_weights, resnet18
 from tcpipe.terrain.classes import ClassTable
 
@@ -56,7 +56,7 @@ class Model:
     place: Path
     checksum: str
     """Of card and weights: what rules its predictions."""
-    residuals: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    residuals: Mapping[str, NDArray[np.generic]] = field(default_factory=dict)
     """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
 
     @cached_property
@@ -69,7 +69,7 @@ class Model:
     @property
     def classes(self) -> ClassTable:
         """The class table that the terrain channel is scaled by."""
-        return self.card.classes
+        return ClassTable(self.card.classes)
 
     @property
     def channels(self) -> tuple[str, ...]:
@@ -154,7 +154,7 @@ def write_model(place: Path, *, card: ModelCard, network: Any, residuals: pa.Tab
         write_table(residuals, directory / RESIDUALS)
         write_text(directory / HISTORY, history)
         write_text(directory / README, readme)
-        write_sealed(directory / CARD, {**card_to_json(card), "checksums": checksums_to_json(directory)})
+        write_sealed(directory / CARD, replace(card, checksums=file_checksums(directory)))
 
 
 def load_model(path: str | Path) -> Model:
@@ -172,29 +172,42 @@ def load_model(path: str | Path) -> Model:
 
     """
     place = Path(path)
-    found = read_model_card(place)
-    card = card_from_json(found, str(place / CARD))
-    if problems := list(broken_checksums(place, found["checksums"])):
+    card = read_model_card(place)
+    if problems := list(broken_checksums(place, card.checksums)):
         raise ModelError(*(f"{problem}; train the model again" for problem in problems))
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
-    return Model(str(path), card, place, digest(found), residuals)
+    return Model(str(path), card, place, card_checksum(card), residuals)
 
 
-def read_model_card(place: Path) -> dict[str, Any]:
+def read_model_card(place: Path) -> ModelCard:
     """Return model.json of a folder; `ModelError` says what the folder is otherwise."""
     if not place.is_dir():
         raise UsageError(f"{place}: there is no such model; run 'tcpipe train' first")
-    if not (place / CARD).is_file():
+    where = place / CARD
+    if not where.is_file():
         raise UsageError(f"{place}: not a model: it has no {CARD}")
     try:
-        return read_sealed(place / CARD, {"checksums": dict}, ours=is_current)
+        found = read_sealed(where, ours=is_current)
+        if found.get("kind") != KIND:
+            raise ModelError(f"{where}: not the card of a tcpipe model (kind is {found.get('kind')!r})")
+        if not is_current(found):
+            version = found.get("schema_version")
+            raise ModelError(
+                f"{where}: written by model schema {version}, wanted {SCHEMA_VERSION}; train the model again"
+            )
+        return typed(found, ModelCard, where)
     except StoreError as error:
         reason = error.problems[0].removesuffix("; remove it and run the command again")
         raise ModelError(f"{reason}; remove the folder and train the model again") from None
 
 
-def set_weights(network: Any, arrays: Mapping[str, NDArray[Any]], where: str) -> None:
+def card_checksum(card: ModelCard) -> str:
+    """Return the hash of a card, which is of its files, too."""
+    return digest(sealed(card))
+
+
+def set_weights(network: Any, arrays: Mapping[str, NDArray[np.generic]], where: str) -> None:
     """Put weights into a network; `ModelError` if they are another network's."""
     shapes = {name: value.shape for name, value in named_weights(network).items()}
     if {name: value.shape for name, value in arrays.items()} != shapes:

@@ -14,6 +14,7 @@ from tcpipe.learning.metrics import Array, costs
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
 from tcpipe.learning.training import class_table
+from tcpipe.terrain.classes import ClassTable
 
 _TOGETHER = 1024
 _UNKNOWN = (0, "unknown")
@@ -99,20 +100,20 @@ def _patches(split: Split) -> Iterator[NDArray[np.float32]]:
 def check_fit(card: ModelCard, data: Dataset, name: str) -> None:
     """Raise an error with every reason for which a model cannot be asked about a dataset."""
     told = data.card
-    problems = [f"classes: in the model {clause}" for clause in card.classes.differences(class_table(told))]
+    problems = [f"classes: in the model {clause}" for clause in ClassTable(card.classes).differences(class_table(told))]
     same = (
-        ("patch_px", card.architecture.patch_px, told["patch_px"]),
-        ("patch_m", card.patch_m, told["patch_m"]),
-        ("segment.chord_m", card.chord_m, told["recipe"]["segment"]["chord_m"]),
-        ("label.velocity", card.label_velocity, told["label"]["velocity"]),
-        ("robot", card.robot, ", ".join(told["robots"])),
+        ("patch_px", card.architecture.patch_px, told.patch_px),
+        ("patch_m", card.patch_m, told.patch_m),
+        ("segment.chord_m", card.chord_m, told.recipe.segment.chord_m),
+        ("label.velocity", card.label_velocity, told.label.velocity),
+        ("robot", card.robot, ", ".join(told.robots)),
     )
     problems += [
         f"{key} is {mine!r} in the model, {theirs!r} in the dataset" for key, mine, theirs in same if mine != theirs
     ]
-    if len(card.outputs) != len(told["label"]["columns"]):
-        problems.append(f"it predicts {', '.join(card.outputs)} alone, wanted {' and '.join(told['label']['columns'])}")
-    absent = [channel for channel in card.channels if channel not in told["layers"]]
+    if len(card.outputs) != len(told.label.columns):
+        problems.append(f"it predicts {', '.join(card.outputs)} alone, wanted {' and '.join(told.label.columns)}")
+    absent = [channel for channel in card.channels if channel not in told.layers]
     problems += [f"the dataset has no layer {', '.join(absent)}, which the model takes"] if absent else []
     if problems:
         raise ModelError(*(f"{name} does not fit {data.path}: {problem}" for problem in problems))

@@ -112,7 +112,7 @@ def reproduce(directory: str | Path, *, quick: bool = False, seeds: int = 1, job
     with _timed(result, "ingest and build"):
         _build(place, site, jobs)
     card = open_dataset(place / "dataset").card
-    result.counts = {"splits": card["splits"], "terrain": card["terrain"], "segments": card["samples"]}
+    result.counts = {"splits": card.splits, "terrain": card.terrain, "segments": card.samples}
     for seed in range(seeds):
         result.runs.append(_train_and_evaluate(place, made, plan, seed, result))
     result.claims = checked_claims(result.runs)

@@ -13,14 +13,14 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.dataset import Dataset, Split, open_dataset
-from tcpipe.errors import DatasetError, ModelError, UsageError
+from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
-from tcpipe.formats.json_files import digest
-from tcpipe.formats.maps.class_table import table_from_json
+from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.json_files import digest, read_json
 from tcpipe.learning.checkpoint import Progress, read_checkpoint
 from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
 from tcpipe.learning.keras_backend import device_name
-from tcpipe.learning.model_card import KIND, ModelCard, Seen
+from tcpipe.learning.model_card import KIND, ModelCard, Seen, TrainedOn, Training, is_current
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
 from tcpipe.learning.network import Architecture
@@ -58,13 +58,15 @@ class TrainResult:
     held_out_loss: float
     device: str
     spent: Spent
+    feeding_share: float
+    """Share of the time in which the network waited for batches."""
 
     def __str__(self) -> str:
         """Return how it went, as plain lines."""
         if self.status == "unchanged":
             return f"{self.path}: nothing to do: trained on the same dataset with the same options"
         fitted, held = self.samples["fitted"], self.samples["held out"]
-        speed, share = self.spent.samples / max(self.spent.total_s, 1e-9), 100.0 * self.spent.feeding_share
+        speed, share = self.spent.samples / max(self.spent.total_s, 1e-9), 100.0 * self.feeding_share
         return (
             f"{self.path}: trained on {fitted} samples, stopped by {held}; best of {self.epochs} epochs is {self.best_epoch}\n"
             f"held-out loss {self.held_out_loss:.4f}; {speed:.0f} samples/s on {self.device}, {share:.1f} % of the time feeding"
@@ -108,9 +110,9 @@ def train(
     clear_beside(place)
     key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     checkpoint = _checkpoint_of(place)
-    if (known := _known(place)) is not None and known["training"].get("key") == key and not fresh and _is_whole(place):
+    if (known := _known(place)) is not None and known.training.key == key and not fresh and _is_whole(place):
         _drop_what_is_done(checkpoint, key)
-        return _unchanged(place, known)
+        return _unchanged(place, known.training)
     task = training_task(data, rules.fold, other)
     _refuse_strangers(place)
     if rules.weights and not other.energy_only:
@@ -129,13 +131,21 @@ def train(
     counts = {"fitted": len(task.fit), "held out": len(task.held)}
     progress = fitted.progress
     return TrainResult(
-        place, "done", counts, progress.epoch, progress.best_epoch, progress.best_loss, device_name(), fitted.spent
+        place,
+        "done",
+        counts,
+        progress.epoch,
+        progress.best_epoch,
+        progress.best_loss,
+        device_name(),
+        fitted.spent,
+        fitted.spent.feeding_share,
     )
 
 
-def dataset_checksum(card: Mapping[str, Any]) -> str:
+def dataset_checksum(card: DatasetCard) -> str:
     """Return one checksum of every file of a dataset."""
-    return digest(card["checksums"])
+    return digest(card.checksums)
 
 
 def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
@@ -147,7 +157,7 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
         There is nothing to train on, or the fold is empty.
 
     """
-    train, outputs = data["train"], (ENERGY,) if variant.energy_only else tuple(data.card["label"]["columns"])
+    train, outputs = data["train"], (ENERGY,) if variant.energy_only else tuple(data.card.label.columns)
     wanted = np.isfinite(train.labels).all(axis=1)
     if unlabelled := len(train) - int(wanted.sum()):
         logger.info("%s: %d of %d samples of train have no label and are left out", data.path, unlabelled, len(train))
@@ -180,7 +190,7 @@ def what_was_seen(split: Split) -> Seen:
         if "terrain" in layers:
             pixel_classes |= set(np.flatnonzero(np.bincount(layers["terrain"].ravel())).tolist()) - {NODATA_ID}
         if "height" in layers:
-            found_m = relief_m(layers["height"])
+            found_m = relief_m(np.asarray(layers["height"], np.uint16))
             reliefs_m += [float(found_m.min()), float(found_m.max())]
     ranges = {name: _range(split.column(name)) for name in ("slope_rad", "cross_slope_rad")}
     if reliefs_m:
@@ -198,14 +208,18 @@ def _class_counts(split: Split) -> dict[int, int]:
     return dict(zip(ids.tolist(), counts.tolist(), strict=True))
 
 
-def _known(place: Path) -> dict[str, Any] | None:
-    """Return model.json of what is there, None if nothing is; `ModelError` if it is something else."""
+def _known(place: Path) -> ModelCard | None:
+    """Return the card of the model that is there, None if there is none or one of another schema; an error if it is something else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None
-    found = read_model_card(place) if (place / CARD).is_file() else {}
-    if found.get("kind") != KIND:
+    found = None
+    with suppress(StoreError):  # what cannot be read is told by `read_model_card`
+        found = read_json(place / CARD) if (place / CARD).is_file() else {}
+    if found is not None and found.get("kind") != KIND:
         raise UsageError(f"{place}: exists and is no model; it is left alone; give another OUT")
-    return found
+    if found is not None and not is_current(found):
+        return None
+    return read_model_card(place)
 
 
 def _refuse_strangers(place: Path) -> None:
@@ -258,61 +272,48 @@ def _refuse_without_deviations(task: Task, data: Dataset) -> None:
         )
 
 
-def _unchanged(place: Path, known: Mapping[str, Any]) -> TrainResult:
-    told = known["training"]
+def _unchanged(place: Path, told: Training) -> TrainResult:
     return TrainResult(
-        place,
-        "unchanged",
-        told["samples"],
-        told["epochs"],
-        told["best_epoch"],
-        told["held_out_loss"],
-        told["device"],
-        Spent(),
+        place, "unchanged", told.samples, told.epochs, told.best_epoch, told.held_out_loss, told.device, Spent(), 0.0
     )
 
 
 def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:
     card, form = data.card, task.fit.view.form
     return ModelCard(
-        architecture=Architecture(card["patch_px"], form.depth, len(fitted.scale), config.width),
+        architecture=Architecture(card.patch_px, form.depth, len(fitted.scale), config.width),
         channels=task.fit.channels,
         outputs=task.outputs,
         scale=fitted.scale,
-        patch_m=card["patch_m"],
-        chord_m=card["recipe"]["segment"]["chord_m"],
-        max_arc_to_chord=card["recipe"]["segment"]["max_arc_to_chord"],
-        label_velocity=card["label"]["velocity"],
-        robot=", ".join(card["robots"]),
-        classes=class_table(card),
+        patch_m=card.patch_m,
+        chord_m=card.recipe.segment.chord_m,
+        max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
+        label_velocity=card.label.velocity,
+        robot=", ".join(card.robots),
+        classes=class_table(card).classes,
         seen=what_was_seen(task.fit),
-        dataset={
-            "name": card["name"],
-            "sha256": dataset_checksum(card),
-            "data_model_version": card["data_model_version"],
-            "samples": card["splits"],
-        },
+        dataset=TrainedOn(card.name, dataset_checksum(card), card.data_model_version, card.splits),
         training=_told(task, config, fitted.progress, key),
     )
 
 
-def class_table(card: Mapping[str, Any]) -> ClassTable:
+def class_table(card: DatasetCard) -> ClassTable:
     """Return a dataset's class table; one without a terrain layer has the paper's."""
-    return table_from_json(card["classes"]) if card["classes"] else PAPER_CLASSES
+    return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _told(task: Task, config: FitConfig, progress: Progress, key: str) -> dict[str, Any]:
+def _told(task: Task, config: FitConfig, progress: Progress, key: str) -> Training:
     """Return what a model card tells of its training."""
-    return {
-        "key": key,
-        "config": asdict(config),
-        "optimizer": "Adam",
-        "samples": {"fitted": len(task.fit), "held out": len(task.held)},
-        "epochs": progress.epoch,
-        "best_epoch": progress.best_epoch,
-        "held_out_loss": progress.best_loss,
-        "device": device_name(),
-    }
+    return Training(
+        key=key,
+        config=config,
+        optimizer="Adam",
+        samples={"fitted": len(task.fit), "held out": len(task.held)},
+        epochs=progress.epoch,
+        best_epoch=progress.best_epoch,
+        held_out_loss=progress.best_loss,
+        device=device_name(),
+    )
 
 
 def _residuals(held: Split, fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:

@@ -26,11 +26,7 @@ class Group:
     driven_m: float
     used_m: float
     removed_m: Mapping[str, float]
-
-    @property
-    def used_share(self) -> float:
-        """Share in use, 0 of nothing."""
-        return self.used_m / self.driven_m if self.driven_m > 0 else 0.0
+    used_share: float
 
 
 def tally_m(
@@ -49,6 +45,7 @@ def named_groups(tally: NDArray[np.float64], names: Sequence[str], reasons: Sequ
             float(row.sum()),
             float(row[0]),
             {reasons[i]: float(row[i]) for i in range(1, len(reasons)) if row[i] > 0},
+            float(row[0]) / float(row.sum()),
         )
         for name, row in zip(names, tally, strict=True)
         if row.sum() > 0

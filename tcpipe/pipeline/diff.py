@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,6 +12,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import plain_lines
+from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
 from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
 from tcpipe.formats.json_files import plain
 from tcpipe.pipeline.explain import flat_recipe
@@ -45,11 +45,8 @@ class Difference:
     """For every label: means, deviations and the largest gap between the two distribution functions, over all samples."""
     labels_of_train: Mapping[str, Mapping[str, float]]
     """The same over train alone."""
-
-    @property
-    def same(self) -> bool:
-        """Whether nothing differs."""
-        return not (self.causes or self.moved or any(self.samples[name] for name in _CHANGES))
+    same: bool
+    """Whether nothing differs."""
 
     def __str__(self) -> str:
         """Return the lines as one text."""
@@ -93,7 +90,9 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     }
     moved = _moved(tables[0].column("split").to_numpy()[in_a], tables[1].column("split").to_numpy()[in_b])
     train = [table.filter(pc.equal(table.column("split"), "train")) for table in tables]
-    return Difference(first, second, tuple(_causes(*cards)), counts, moved, _shifts(tables), _shifts(train))
+    causes = tuple(_causes(*cards))
+    same = not (causes or moved or any(counts[name] for name in _CHANGES))
+    return Difference(first, second, causes, counts, moved, _shifts(tables), _shifts(train), same)
 
 
 def _shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:
@@ -120,13 +119,13 @@ def _other(both: Sequence[tuple[Path, Ints]], names: Sequence[str]) -> int:
 
 def _other_patches(
     directories: tuple[Path, Path],
-    cards: tuple[Mapping[str, Any], Mapping[str, Any]],
+    cards: tuple[DatasetCard, DatasetCard],
     tables: Sequence[pa.Table],
     in_a: Ints,
     in_b: Ints,
 ) -> int:
     """Return how many samples of both have other pixels; all of them where layers or size differ."""
-    if set(cards[0]["layers"]) != set(cards[1]["layers"]) or cards[0]["patch_px"] != cards[1]["patch_px"]:
+    if set(cards[0].layers) != set(cards[1].layers) or cards[0].patch_px != cards[1].patch_px:
         return len(in_a)
     ours, theirs = (
         _hashes(directory, card, table) for directory, card, table in zip(directories, cards, tables, strict=True)
@@ -134,7 +133,7 @@ def _other_patches(
     return int((ours[in_a] != theirs[in_b]).sum())
 
 
-def _hashes(directory: Path, card: Mapping[str, Any], table: pa.Table) -> NDArray[np.int64]:
+def _hashes(directory: Path, card: DatasetCard, table: pa.Table) -> NDArray[np.int64]:
     """Return a hash of every patch, in the order of the samples: equal pixels, equal hashes."""
     files = open_patches(directory, card)
     split = table.column("split").to_numpy()
@@ -152,7 +151,7 @@ def _hashes(directory: Path, card: Mapping[str, Any], table: pa.Table) -> NDArra
     return out
 
 
-def _moved(ours: NDArray[Any], theirs: NDArray[Any]) -> dict[str, int]:
+def _moved(ours: NDArray[np.object_], theirs: NDArray[np.object_]) -> dict[str, int]:
     moves = {f"{a} to {b}": int(((ours == a) & (theirs == b)).sum()) for a in SPLITS for b in SPLITS if a != b}
     return {name: count for name, count in moves.items() if count}
 
@@ -172,56 +171,54 @@ def _shift(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> dict[str, 
     }
 
 
-def _causes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+def _causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
     """Yield a line for everything that the two are made from differently."""
     for name in _VERSIONS:
-        if a[name] != b[name]:
-            yield f"code: {name} {a[name]} → {b[name]}"
-    ours, theirs = flat_recipe(a["recipe"]), flat_recipe(b["recipe"])
+        was, now = getattr(a, name), getattr(b, name)
+        if was != now:
+            yield f"code: {name} {was} → {now}"
+    ours, theirs = flat_recipe(asdict(a.recipe)), flat_recipe(asdict(b.recipe))
     for key in sorted({*ours, *theirs}):
         if ours.get(key) != theirs.get(key):
             yield f"recipe: {key} {_shown(ours.get(key))} → {_shown(theirs.get(key))}"
-    yield from _run_causes({run["run_id"]: run for run in a["runs"]}, {run["run_id"]: run for run in b["runs"]})
-    yield from _map_causes({m["name"]: m for m in a["maps"]}, {m["name"]: m for m in b["maps"]})
-    if a["split"]["region"] != b["split"]["region"]:
-        was, now = (card["split"]["region"] for card in (a, b))
-        yield "region: " + ("added" if was is None else "removed" if now is None else "another one")
-    if a["split"].get("kept") != b["split"].get("kept"):
-        yield f"kept split: {_shown(a['split'].get('kept'))} → {_shown(b['split'].get('kept'))}"
-    if a["format"] != b["format"]:
-        yield f"format: {a['format']} → {b['format']}"
+    yield from _run_causes({run.run_id: run for run in a.runs}, {run.run_id: run for run in b.runs})
+    yield from _map_causes({entry.name: entry for entry in a.maps}, {entry.name: entry for entry in b.maps})
+    if a.split.region != b.split.region:
+        yield f"region: {'added' if a.split.region is None else 'removed' if b.split.region is None else 'another one'}"
+    if a.split.kept != b.split.kept:
+        yield f"kept split: {_shown(plain(a.split.kept))} → {_shown(plain(b.split.kept))}"
+    if a.format != b.format:
+        yield f"format: {a.format} → {b.format}"
 
 
-def _run_causes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+def _run_causes(a: Mapping[str, RunSource], b: Mapping[str, RunSource]) -> Iterator[str]:
     for run_id in sorted({*a, *b}):
         if run_id not in a or run_id not in b:
             which, run = ("added", b[run_id]) if run_id not in a else ("removed", a[run_id])
-            yield f"log: {which} {', '.join(run['logs'])} (run {run_id}, {run['samples']} samples)"
-        elif a[run_id].get("segments_sha256") != b[run_id].get("segments_sha256"):
-            was, now = a[run_id]["recipe_id"], b[run_id]["recipe_id"]
+            yield f"log: {which} {', '.join(run.logs)} (run {run_id}, {run.samples} samples)"
+        elif a[run_id].segments_sha256 != b[run_id].segments_sha256:
+            was, now = a[run_id].recipe_id, b[run_id].recipe_id
             why = f"ingested with recipe {was} → {now}" if was != now else "the same log and recipe, ingested anew"
             yield f"log: run {run_id} has other segments: {why}"
 
 
-def _map_causes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+def _map_causes(a: Mapping[str, MapSource], b: Mapping[str, MapSource]) -> Iterator[str]:
     for name in sorted({*a, *b}):
         if name not in a or name not in b:
             yield f"map: {'added' if name not in a else 'removed'} {name}"
-        elif a[name].get("sha256") != b[name].get("sha256"):
+        elif a[name].sha256 != b[name].sha256:
             yield f"map: {name} is another one: {', '.join(_map_changes(a[name], b[name])) or 'its files were made anew'}"
 
 
-def _map_changes(a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[str]:
+def _map_changes(a: MapSource, b: MapSource) -> Iterator[str]:
     for key in ("crs", "pitch_m", "rows", "cols", "sources"):
-        if a.get(key) != b.get(key):
-            yield f"{key} {_shown(a.get(key))} → {_shown(b.get(key))}"
-    files = [(entry.get("inputs") or {}).get("files") or {} for entry in (a, b)]
-    yield from (
-        f"another {role} file" for role in sorted({*files[0], *files[1]}) if files[0].get(role) != files[1].get(role)
-    )
+        if getattr(a, key) != getattr(b, key):
+            yield f"{key} {_shown(getattr(a, key))} → {_shown(getattr(b, key))}"
+    ours, theirs = ({} if entry.inputs is None else entry.inputs.files for entry in (a, b))
+    yield from (f"another {role} file" for role in sorted({*ours, *theirs}) if ours.get(role) != theirs.get(role))
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return "none" if value is None else str(value)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, plain_lines
+from tcpipe.formats.dataset_card import DatasetCard, MapInputs
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     open_patches,
@@ -23,10 +24,10 @@ from tcpipe.formats.dataset_files import (
     rows_in_files,
     sample_columns,
 )
-from tcpipe.formats.json_files import plain
+from tcpipe.formats.json_files import plain, typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
-from tcpipe.formats.recipe_toml import parse_recipe, read_key
+from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.seals import file_checksum
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
@@ -78,7 +79,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     """
     directory, opened = Path(dataset), open_store(store)
     card, sample = read_current_card(directory), _sample(directory, sample_id)
-    recipe = parse_recipe(card["recipe"], where=str(directory / "dataset.json"))
+    recipe = card.recipe
     run = _run(opened, directory, card, sample)
     told = run.manifest
     read_with = read_key(recipe, told.robot_requested, definitions=told.message_definitions)
@@ -101,10 +102,10 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
         "recipe_id": run.recipe_id,
         "recipe_differs_in": _changed_keys(recipe),
         "versions": {
-            "dataset": card["tcpipe_version"],
+            "dataset": card.tcpipe_version,
             "run": run.manifest.tcpipe_version,
             "here": __version__,
-            "data_model": card["data_model_version"],
+            "data_model": card.data_model_version,
         },
         "made_from": "segments" if streams is None else "streams",
     }
@@ -136,8 +137,8 @@ def _sample(directory: Path, sample_id: str) -> dict[str, Any]:
     return {**found, "row": row}
 
 
-def _run(store: Store, directory: Path, card: Mapping[str, Any], sample: Mapping[str, Any]) -> RunDirectory:
-    recipe_id = next((run["recipe_id"] for run in card["runs"] if run["run_id"] == sample["run_id"]), None)
+def _run(store: Store, directory: Path, card: DatasetCard, sample: Mapping[str, Any]) -> RunDirectory:
+    recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample["run_id"]), None)
     if recipe_id is None:
         raise DatasetError(
             f"{directory}: its card lists no run {sample['run_id']}; 'tcpipe verify {directory}' tells what else is wrong"
@@ -268,7 +269,7 @@ def _made_again(
 
 
 def _differences(
-    directory: Path, card: Mapping[str, Any], sample: Mapping[str, Any], made: Mapping[str, Any] | str
+    directory: Path, card: DatasetCard, sample: Mapping[str, Any], made: Mapping[str, Any] | str
 ) -> Iterator[str]:
     """Yield a line for each value and each layer that is not, bit for bit, what the dataset holds."""
     if isinstance(made, str):
@@ -290,21 +291,21 @@ def _differences(
             yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
 
 
-def _reasons(card: Mapping[str, Any], sample: Mapping[str, Any], run: RunDirectory, source: MapFile) -> Iterator[str]:
+def _reasons(card: DatasetCard, sample: Mapping[str, Any], run: RunDirectory, source: MapFile) -> Iterator[str]:
     """Yield what is not as it was when the dataset was built, which may be why."""
-    versions = {card["tcpipe_version"], run.manifest.tcpipe_version, __version__}
+    versions = {card.tcpipe_version, run.manifest.tcpipe_version, __version__}
     if len(versions) > 1:
         yield f"made by tcpipe {', '.join(sorted(versions - {__version__}))}, this is {__version__}"
-    for entry in card["maps"]:
-        if entry["name"] == sample["map"] and entry.get("inputs") != source.facts.get("inputs"):
+    for entry in card.maps:
+        if entry.name == sample["map"] and entry.inputs != typed(source.facts["inputs"], MapInputs, Path(source.name)):
             yield f"map {source.name} was added anew since, from other files"
-    for entry in card["runs"]:
-        now = file_checksum(run.path / "segments.parquet")[1]
-        if entry["run_id"] == run.run_id and entry["segments_sha256"] != now:
+    for made_from in card.runs:
+        now = file_checksum(run.path / "segments.parquet").sha256
+        if made_from.run_id == run.run_id and made_from.segments_sha256 != now:
             yield f"run {run.run_id} was ingested anew since, with other segments"
 
 
-def _stored(directory: Path, card: Mapping[str, Any], row: int) -> dict[str, NDArray[Any]]:
+def _stored(directory: Path, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
     """Return the stored layers of the sample in a row of samples.parquet, each of shape (px, px)."""
     files = open_patches(directory, card)
     split = read_samples(directory, ["split"]).column("split").to_numpy()

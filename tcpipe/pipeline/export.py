@@ -34,19 +34,23 @@ class ExportedTopic:
     """One topic's file."""
 
     topic: str
-    type_name: str
+    type: str
     path: Path
-    rows: int
+    messages: int
 
 
 @dataclass(frozen=True, slots=True)
 class Exported:
     """The files, what the log had lost, and what else is worth saying of it; ``unchanged`` where all was there already."""
 
+    log: str
+    out: Path
     status: Literal["done", "unchanged"]
     topics: tuple[ExportedTopic, ...]
     damage: tuple[str, ...]
     remarks: tuple[str, ...]
+    exit_code: int
+    """3 where the log had lost something."""
 
 
 def export(
@@ -92,17 +96,17 @@ def export(
         _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
         known = {name for name in wanted if _is_there(index["topics"].get(name), made_from, out)}
         if wanted and known == set(wanted):
-            return _exported("unchanged", index["topics"], wanted, out)
+            return _exported("unchanged", index["topics"], wanted, str(log_path), out)
         written = _write(log, {name: paths[name] for name in wanted}, threads)
         if wanted and not any(entry["file"] for entry in written.values()):
             raise LogError(f"{log_path}: nothing to export: no topic can be read", *map(str, log.damage))
         damage = [str(damage) for damage in log.damage if damage.is_loss]
         if not wanted:
-            return Exported("done", (), tuple(damage), tuple(log.remarks))
+            return Exported(str(log_path), out, "done", (), tuple(damage), tuple(log.remarks), 3 if damage else 0)
         said = {"made_from": made_from, "damage": damage, "remarks": log.remarks}
         entries = {name: {**said, **entry} for name, entry in written.items()}
     write_json(out / INDEX, {**index, "topics": {**index["topics"], **entries}})
-    return _exported("done", entries, wanted, out)
+    return _exported("done", entries, wanted, str(log_path), out)
 
 
 def _wanted(log: Log, log_path: Path | str, topics: Sequence[str]) -> list[str]:
@@ -180,7 +184,7 @@ def _is_there(entry: Mapping[str, Any] | None, made_from: Mapping[str, Any], out
 
 
 def _exported(
-    status: Literal["done", "unchanged"], entries: Mapping[str, Any], wanted: Sequence[str], out: Path
+    status: Literal["done", "unchanged"], entries: Mapping[str, Any], wanted: Sequence[str], log: str, out: Path
 ) -> Exported:
     files = tuple(
         ExportedTopic(name, entries[name]["type"], out / entries[name]["file"], entries[name]["rows"])
@@ -189,7 +193,7 @@ def _exported(
     )
     damage = dict.fromkeys(line for name in wanted for line in entries[name]["damage"])
     remarks = dict.fromkeys(line for name in wanted for line in entries[name]["remarks"])
-    return Exported(status, files, tuple(damage), tuple(remarks))
+    return Exported(log, out, status, files, tuple(damage), tuple(remarks), 3 if damage else 0)
 
 
 def _write(log: Log, paths: Mapping[str, Path], threads: int) -> dict[str, dict[str, Any]]:

@@ -47,7 +47,7 @@ def inspect(
     if (path / "dataset.json").is_file():
         from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as below
 
-        return {**read_current_card(path), "kind": "dataset", "path": str(path)}
+        return {**plain(read_current_card(path)), "kind": "dataset", "path": str(path)}
     if is_store(path):
         return _store(Store(path))
     found = run_at(path)

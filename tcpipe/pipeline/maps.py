@@ -211,7 +211,7 @@ def _inputs(files: Mapping[str, Sequence[Path]], options: Mapping[str, Any]) -> 
         try:
             plain = role.endswith(_CLASSES) or (role == "terrain" and is_drawn(paths))
             for part in dict.fromkeys(part for path in paths for part in ([path] if plain else raster_files(path))):
-                checksums[role][os.path.relpath(part, folder)] = file_checksum(part)[1]
+                checksums[role][os.path.relpath(part, folder)] = file_checksum(part).sha256
         except MapError as error:
             problems += error.problems
         except OSError as error:

@@ -95,9 +95,9 @@ def _brought(place: Path) -> bool:
         return False
     if place.name == CARD:
         read_card(place.parent)
-    found: Document = read_sealed(place, {"data_model_version": str})
+    found: Document = read_sealed(place)
     document = found
-    while (version := document["data_model_version"]) != DATA_MODEL_VERSION:
+    while (version := document.get("data_model_version", "")) != DATA_MODEL_VERSION:
         if version not in _STEPS:
             raise StoreError(
                 f"{place}: of data model {version}, this version knows {', '.join(READ_VERSIONS)}; left as it is"

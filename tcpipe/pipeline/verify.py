@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tcpipe.errors import TcpipeError, UsageError, plain_lines
 from tcpipe.formats.atomic import left_beside
 from tcpipe.formats.dataset_files import CARD
-from tcpipe.formats.seals import broken_checksums, read_sealed
+from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
 from tcpipe.store import Store, is_store
@@ -98,7 +97,7 @@ def _what(path: Path) -> tuple[str, Iterator[Finding]]:
 
 def _sealed_directory(directory: Path, card: str) -> Iterator[Finding]:
     """Compare every file with what the card has of it; name those that it does not know."""
-    checksums: Mapping[str, Any] = read_sealed(directory / card, {"checksums": dict})["checksums"]
+    checksums = read_sealed_as(directory / card, Checksums).checksums
     yield from broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}

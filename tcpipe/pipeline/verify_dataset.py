@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.cost.budget import pooled
 from tcpipe.errors import DatasetError, TcpipeError
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     CARD,
     PATCHES,
@@ -28,13 +28,12 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.recipe_toml import parse_recipe, recipe_id
+from tcpipe.formats.recipe_toml import recipe_id
 from tcpipe.formats.seals import broken_checksums, broken_seal
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measured
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.store import is_named_after
 from tcpipe.tables.columns import floats
-from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer
@@ -48,29 +47,26 @@ def verify_dataset(directory: Path) -> Iterator[Finding]:
     for path in (directory / CARD, directory / REPORT):
         problem = broken_seal(path)
         yield problem or ("files", 1)
-    if card.get("data_model_version") not in READ_VERSIONS:
+    if card.data_model_version not in READ_VERSIONS:
         yield (
-            f"{directory / CARD}: of data model {card.get('data_model_version')}, this version knows {DATA_MODEL_VERSION}; "
+            f"{directory / CARD}: of data model {card.data_model_version}, this version knows {DATA_MODEL_VERSION}; "
             "verify it with the version that wrote it, or build it again"
         )
         return
-    try:
-        yield from _files(directory, card)
-        yield from _samples(directory, card)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
-        yield f"{directory / CARD}: cannot be followed any further ({type(error).__name__}: {error})"
+    yield from _files(directory, card)
+    yield from _samples(directory, card)
 
 
-def _files(directory: Path, card: Mapping[str, Any]) -> Iterator[Finding]:
+def _files(directory: Path, card: DatasetCard) -> Iterator[Finding]:
     """Compare every file with the checksum that the card has of it; name those that it does not know."""
-    yield from broken_checksums(directory, card["checksums"])
-    yield "files", len(card["checksums"])
+    yield from broken_checksums(directory, card.checksums)
+    yield "files", len(card.checksums)
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
-    for name in sorted(there - {*card["checksums"], CARD, REPORT}):
+    for name in sorted(there - {*card.checksums, CARD, REPORT}):
         yield f"{directory / name}: is no file of this dataset"
 
 
-def _samples(directory: Path, card: Mapping[str, Any]) -> Iterator[Finding]:
+def _samples(directory: Path, card: DatasetCard) -> Iterator[Finding]:
     samples, where = read_samples(directory), directory / SAMPLES
     yield "samples", samples.num_rows
     try:
@@ -79,17 +75,17 @@ def _samples(directory: Path, card: Mapping[str, Any]) -> Iterator[Finding]:
         yield from (f"{where}: {problem}" for problem in error.problems)
         return
     yield from (f"{where}: {problem}" for problem in _wrong_joins(samples, card))
-    for key, value in plain(measured(samples.select(CARD_COLUMNS), has_terrain="terrain" in card["layers"])).items():
-        if card.get(key) != value:
-            yield f"{directory / CARD}: {key} is {card.get(key)}, but the samples give {value}"
+    for key, value in measured(samples.select(CARD_COLUMNS), has_terrain="terrain" in card.layers).items():
+        if getattr(card, key) != value:
+            yield f"{directory / CARD}: {key} is {plain(getattr(card, key))}, but the samples give {plain(value)}"
     yield from (f"{directory / CARD}: {problem}" for problem in _wrong_runs(samples, card))
     used_m = math.fsum(floats(samples, "arc_length_m")[samples.column("split").to_numpy() != "buffer"])
-    if not math.isclose(used_m, card["ledger_m"][KEPT], rel_tol=1e-9, abs_tol=1e-6):
-        yield f"{directory / CARD}: the ledger keeps {card['ledger_m'][KEPT]:.3f} m, the samples cover {used_m:.3f} m"
+    if not math.isclose(used_m, card.ledger_m[KEPT], rel_tol=1e-9, abs_tol=1e-6):
+        yield f"{directory / CARD}: the ledger keeps {card.ledger_m[KEPT]:.3f} m, the samples cover {used_m:.3f} m"
     yield from _patches(directory, card, samples)
 
 
-def _wrong_joins(samples: pa.Table, card: Mapping[str, Any]) -> Iterator[str]:
+def _wrong_joins(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
     """Yield a line for each kind of row that belongs to nothing, or to something else than its columns say."""
     ids = samples.column("sample_id")
     repeated = len(ids) - pc.count_distinct(ids).as_py()
@@ -97,42 +93,39 @@ def _wrong_joins(samples: pa.Table, card: Mapping[str, Any]) -> Iterator[str]:
         yield f"{repeated} sample ids occur more than once"
     yield from _rows(pc.not_equal(ids, samples.column("segment_id")), "have another id than their segment")
     for column, known in (
-        ("run_id", [run["run_id"] for run in card["runs"]]),
-        ("map", [m["name"] for m in card["maps"]]),
+        ("run_id", [run.run_id for run in card.runs]),
+        ("map", [entry.name for entry in card.maps]),
     ):
         strange = pc.invert(pc.is_in(samples.column(column), value_set=pa.array(known, pa.string())))
         yield from _rows(strange, f"have a {column} that the card does not list")
-    names = {entry["id"]: entry["name"] for entry in card["classes"]}
+    names = {entry.id: entry.name for entry in card.classes}
     pairs = samples.select(["terrain_class", "terrain_name"]).group_by(["terrain_class", "terrain_name"]).aggregate([])
     for pair in pairs.to_pylist():
         if names.get(pair["terrain_class"]) != pair["terrain_name"]:
             yield f"class {pair['terrain_class']} is called {pair['terrain_name']!r}, {names.get(pair['terrain_class'])!r} in the card"
 
 
-def _wrong_runs(samples: pa.Table, card: Mapping[str, Any]) -> Iterator[str]:
+def _wrong_runs(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
     """Yield a line for what the card copied from its runs and the samples, the recipe or the rest of the card say otherwise."""
-    recipe = parse_recipe(card["recipe"], where=CARD)
     robots: dict[str, dict[str, int]] = {}
     for row in samples.group_by(["run_id", "robot"]).aggregate([([], "count_all")]).to_pylist():
         robots.setdefault(row["run_id"], {})[row["robot"]] = row["count_all"]
-    for run in card["runs"]:
-        name, robot = run["run_id"], run["robot"]
+    for run in card.runs:
+        name, robot = run.run_id, run.robot
         of = robots.get(name, {})
         if of.keys() - {robot}:
             yield f"run {name} is of robot {robot}, its samples of {', '.join(sorted(of))}"
-        if sum(of.values()) != run["samples"]:
-            yield f"run {name} has {run['samples']} samples, {sum(of.values())} are there"
-        if run["recipe_id"] != recipe_id(recipe, robot):
-            yield f"run {name} is of recipe {run['recipe_id']}, the card's for robot {robot} is {recipe_id(recipe, robot)}"
-        if not is_named_after(name, run["sha256"]):
-            yield f"run {name} is of a log whose sha256 begins with {run['sha256'][:8]}"
-    driven_m, ledger_m = [run.get("driven_m") for run in card["runs"]], math.fsum(card["ledger_m"].values())
-    if None not in driven_m and not math.isclose(math.fsum(driven_m), ledger_m, rel_tol=1e-9, abs_tol=1e-6):
-        yield f"the ledger sums to {ledger_m:.3f} m, its runs drove {math.fsum(driven_m):.3f} m"
-    if (
-        plain(pooled([EnergyBudget(**run["energy_budget"]) for run in card["runs"] if run["energy_budget"]]))
-        != card["energy_budget"]
-    ):
+        if sum(of.values()) != run.samples:
+            yield f"run {name} has {run.samples} samples, {sum(of.values())} are there"
+        if run.recipe_id != (wanted := recipe_id(card.recipe, robot)):
+            yield f"run {name} is of recipe {run.recipe_id}, the card's for robot {robot} is {wanted}"
+        if not is_named_after(name, run.sha256):
+            yield f"run {name} is of a log whose sha256 begins with {run.sha256[:8]}"
+    driven_m, ledger_m = [run.driven_m for run in card.runs], math.fsum(card.ledger_m.values())
+    known_m = [metres for metres in driven_m if metres is not None]
+    if len(known_m) == len(driven_m) and not math.isclose(math.fsum(known_m), ledger_m, rel_tol=1e-9, abs_tol=1e-6):
+        yield f"the ledger sums to {ledger_m:.3f} m, its runs drove {math.fsum(known_m):.3f} m"
+    if pooled(run.energy_budget for run in card.runs) != card.energy_budget:
         yield "its energy budget is not that of its runs"
 
 
@@ -142,7 +135,7 @@ def _rows(wrong: pa.ChunkedArray, what: str) -> Iterator[str]:
         yield f"{count} rows {what}, the first is row {pc.index(wrong, value=True).as_py()}"
 
 
-def _patches(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Iterator[Finding]:
+def _patches(directory: Path, card: DatasetCard, samples: pa.Table) -> Iterator[Finding]:
     """Decode every patch; compare order, ids and values with the samples and the class table."""
     files = open_patches(directory, card)
     split = samples.column("split").to_numpy()
@@ -174,24 +167,24 @@ def _piece(files: PatchFiles, piece: int) -> Iterator[Finding]:
     yield "patches", rows
 
 
-def _within(pixels: NDArray[Any], layer: Layer) -> bool:
+def _within(pixels: NDArray[np.generic], layer: Layer) -> bool:
     """Return whether all pixels with data lie in the layer's range, but for rounding."""
     there = pixels[np.isfinite(pixels)]
     slack = 1e-5 * max(abs(layer.low), abs(layer.high))
     return bool(((there >= layer.low - slack) & (there <= layer.high + slack)).all())
 
 
-def _beside_patches(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Iterator[str]:
+def _beside_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     """Compare what stands beside the patches with the samples, given in the order of the files."""
-    if card["format"] == "zarr":
+    if card.format == "zarr":
         if zarr_sample_ids(directory) != samples.column("sample_id").to_pylist():
             yield f"{directory / PATCHES}: its sample ids are not those of {SAMPLES}, in their order"
         return
     first = 0
-    for shard in card["shards"]:
-        found = read_table(directory / shard["path"], samples.column_names)
-        wanted = samples.slice(first, shard["rows"])
+    for shard in card.shards:
+        found = read_table(directory / shard.path, samples.column_names)
+        wanted = samples.slice(first, shard.rows)
         other = [name for name in samples.column_names if not found.column(name).equals(wanted.column(name))]
         if other:
-            yield f"{directory / shard['path']}: {', '.join(other)} are not those of {SAMPLES}, in their order"
-        first += shard["rows"]
+            yield f"{directory / shard.path}: {', '.join(other)} are not those of {SAMPLES}, in their order"
+        first += shard.rows

@@ -12,12 +12,12 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
-from tcpipe.formats.json_files import plain, typed
+from tcpipe.formats.json_files import typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Manifest
-from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal, read_sealed
+from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal, read_checksums, read_sealed
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
@@ -113,7 +113,7 @@ def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
 def _listed(directory: Path) -> Any:
     """Compare every file below a directory with its ``checksums.json``; return what that lists, or None if it cannot be trusted."""
     try:
-        checksums: Mapping[str, Any] = read_sealed(directory / CHECKSUMS, {"checksums": dict})["checksums"]
+        checksums = read_checksums(directory)
     except StoreError as error:
         yield from error.problems
         return None
@@ -154,7 +154,7 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
     manifest, recipe = typed(document, Manifest, where), document["recipe"]
     if manifest.ingest_key != ingest_key(recipe) or directory.name != recipe_id(recipe, manifest.robot):
         yield f"{where}: its recipe is not the one that the directory is named after"
-    yield from broken_checksums(directory, plain(manifest.checksums))
+    yield from broken_checksums(directory, manifest.checksums)
     yield "files", len(manifest.checksums) + 1
     yield from _unlisted(directory, {*manifest.checksums, _MANIFEST, _REPORT})
     if (directory / _REPORT).exists():

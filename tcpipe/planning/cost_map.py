@@ -30,7 +30,7 @@ from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
-from tcpipe.formats.seals import broken_checksums, checksums_to_json, read_sealed, write_sealed
+from tcpipe.formats.seals import Checksum, broken_checksums, file_checksums, read_sealed_as, write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
@@ -56,27 +56,68 @@ _GREATEST_IS_BEST = "velocity"
 
 
 @dataclass(frozen=True, slots=True)
+class Nav2Scale:
+    """What the least and the greatest cost of a Nav2 map stand for, a metre of ground."""
+
+    lowest: float
+    highest: float
+
+
+@dataclass(frozen=True, slots=True)
+class CellCounts:
+    """Cells of the grid, those with a cost along some course, and those of them on ground that the model knows."""
+
+    all: int
+    with_cost: int
+    trusted: int
+
+
+@dataclass(frozen=True, slots=True)
+class CostMapCard:
+    """All of cost-map.json but its seal."""
+
+    key: str
+    """Of what it is made from: model, map and step."""
+    map: str
+    model: str
+    """The model's checksum."""
+    robot: str
+    grid: MapGrid
+    courses_deg: tuple[float, ...]
+    bands: Mapping[str, tuple[str, ...]]
+    units: Mapping[str, str]
+    reasons: Mapping[str, str]
+    """Name of each bit of reasons.tif."""
+    nav2_scale: Mapping[str, Nav2Scale]
+    cells: CellCounts
+    reason_share: Mapping[str, float]
+    """Of cells and courses."""
+    barred_by: tuple[str, ...]
+    checksums: Mapping[str, Checksum]
+    kind: str = KIND
+    version: str = VERSION
+
+
+@dataclass(frozen=True, slots=True)
 class CostMapResult:
     """What became of a cost map; ``str`` of it is what the command prints."""
 
     path: Path
     status: str
     """``done`` or ``unchanged``."""
-    card: Mapping[str, Any]
+    card: CostMapCard
 
     def __str__(self) -> str:
         """Return where it is and what it holds, as plain lines."""
-        grid, cells = self.card["grid"], self.card["cells"]
-        head = f"{self.path}: {grid['rows']} x {grid['cols']} cells of {grid['pitch_m']:g} m, {COURSES} courses"
+        grid, cells = self.card.grid, self.card.cells
+        head = f"{self.path}: {grid.rows} x {grid.cols} cells of {grid.pitch_m:g} m, {COURSES} courses"
         if self.status == "unchanged":
             head += "; nothing to do: it is made from the same model, map and step"
-        reasons = ", ".join(
-            f"{name.replace('_', ' ')} {share:.1%}" for name, share in self.card["reason_share"].items()
-        )
+        reasons = ", ".join(f"{name.replace('_', ' ')} {share:.1%}" for name, share in self.card.reason_share.items())
         return plain_lines(
             (
                 head,
-                f"{cells['with_cost']} cells with a cost, {cells['trusted']} of them on ground the model knows along some course",
+                f"{cells.with_cost} cells with a cost, {cells.trusted} of them on ground the model knows along some course",
                 *((f"cells and courses: {reasons}",) if reasons else ()),
             )
         )
@@ -123,37 +164,35 @@ def make_cost_map(
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claimed(out) as place:
         found = read_cost_map_card(out)  # another process may have been first
-        if found is not None and found["key"] == key and not any(broken_checksums(out, found["checksums"])):
+        if found is not None and found.key == key and not any(broken_checksums(out, found.checksums)):
             rmtree(place)
             return CostMapResult(out, "unchanged", found)
         spool = _spool(place, key, grid)
         _fill(model, source, spool, step)
-        about = {"kind": KIND, "version": VERSION, "key": key, "map": source.name, "model": model.checksum}
         with atomic_directory(out) as directory:
-            card = {**about, "robot": model.robot, **_write(directory, spool.costs)}
-            card["checksums"] = checksums_to_json(directory)
+            card = _card(model, source, key, directory, spool.costs)
             write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(out, "done", card)
 
 
-def read_cost_map_card(path: Path) -> dict[str, Any] | None:
+def read_cost_map_card(path: Path) -> CostMapCard | None:
     """Return the card of a cost map, or None where there is none, or one that is not as it was written."""
     try:
-        card = read_sealed(path / CARD, {"key": str, "grid": {"pitch_m": float}, "checksums": dict})
+        card = read_sealed_as(path / CARD, CostMapCard)
     except StoreError:
         return None
-    return card if card.get("kind") == KIND else None
+    return card if card.kind == KIND else None
 
 
-def open_cost_map(path: Path, card: Mapping[str, Any]) -> CostGrid:
+def open_cost_map(path: Path, card: CostMapCard) -> CostGrid:
     """Read the costs of a cost map into memory; `MapError` names every file that is damaged."""
-    read = {f"{name}.tif": card["checksums"][f"{name}.tif"] for name in ("power", "velocity", "reasons", "height")}
+    read = {f"{name}.tif": card.checksums[f"{name}.tif"] for name in ("power", "velocity", "reasons", "height")}
     if problems := list(broken_checksums(path, read)):
         raise MapError(*(f"{problem}; make the cost map again" for problem in problems))
     courses = range(1, COURSES + 1)
     power, velocity, reasons = (read_bands(path / f"{name}.tif", courses) for name in ("power", "velocity", "reasons"))
-    return CostGrid(MapGrid(**card["grid"]), power, velocity, reasons, read_bands(path / "height.tif", (1,))[0])
+    return CostGrid(card.grid, power, velocity, reasons, read_bands(path / "height.tif", (1,))[0])
 
 
 _ARRAYS = ("power_watt", "velocity_mps", "reasons", "height_m")
@@ -245,8 +284,30 @@ def _fill(model: CostModel, source: MapFile, spool: _Spool, step: Callable[[int,
         step(number, len(todo))
 
 
-def _write(directory: Path, costs: CostGrid) -> dict[str, Any]:
-    """Write all files but the card; return what the card says of them."""
+def _card(model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid) -> CostMapCard:
+    """Write all files but the card; return it."""
+    scales = _write(directory, costs)
+    cells, shares = _shares(costs)
+    return CostMapCard(
+        key=key,
+        map=source.name,
+        model=model.checksum,
+        robot=model.robot,
+        grid=costs.grid,
+        courses_deg=tuple(ANGLES_DEG.tolist()),
+        bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course")),
+        units=_QUANTITIES,
+        reasons={str(int(reason)): name_of(reason) for reason in Reason},
+        nav2_scale=scales,
+        cells=cells,
+        reason_share=shares,
+        barred_by=tuple(name_of(reason) for reason in Reason if reason & BARRED),
+        checksums=file_checksums(directory),
+    )
+
+
+def _write(directory: Path, costs: CostGrid) -> dict[str, Nav2Scale]:
+    """Write all files but the card; return the scales of the Nav2 maps."""
     grid = costs.grid
     layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}
     layout["affine"] = (grid.pitch_m, 0.0, grid.x_min_m, 0.0, -grid.pitch_m, grid.y_max_m)
@@ -265,16 +326,7 @@ def _write(directory: Path, costs: CostGrid) -> dict[str, Any]:
         bands=height,
         **layout,
     )
-    scales = {name: _write_nav2(directory / f"{name}.yaml", costs, name) for name in ("duration", "energy")}
-    return {
-        "grid": {field: getattr(grid, field) for field in MapGrid.__slots__},
-        "courses_deg": ANGLES_DEG,
-        "bands": {name: [*_BAND_NAMES, "min", "mean", "best course"] for name in _QUANTITIES},
-        "units": _QUANTITIES,
-        "reasons": {str(int(reason)): name_of(reason) for reason in Reason},
-        "nav2_scale": scales,
-        **_shares(costs),
-    }
+    return {name: _write_nav2(directory / f"{name}.yaml", costs, name) for name in ("duration", "energy")}
 
 
 def _values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
@@ -324,7 +376,7 @@ def _row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
     yield from ((first, min(first + _ROWS_TOGETHER, rows)) for first in range(0, rows, _ROWS_TOGETHER))
 
 
-def _write_nav2(path: Path, costs: CostGrid, name: str) -> dict[str, float]:
+def _write_nav2(path: Path, costs: CostGrid, name: str) -> Nav2Scale:
     """Write the mean over the trusted courses from 0 to `HIGHEST`; return what these two stand for."""
     means = []
     for first, last in _row_strips(costs):
@@ -338,10 +390,10 @@ def _write_nav2(path: Path, costs: CostGrid, name: str) -> dict[str, float]:
     unit = _QUANTITIES[name]
     meaning = f"{name} a metre, mean over the courses: 0 is {low:.6g} {unit}, {HIGHEST} is {high:.6g} {unit}, {LETHAL} is not crossed"
     write_nav2_map(path, cost, costs.grid, meaning=meaning)
-    return {"lowest": low, "highest": high}
+    return Nav2Scale(low, high)
 
 
-def _shares(costs: CostGrid) -> dict[str, Any]:
+def _shares(costs: CostGrid) -> tuple[CellCounts, dict[str, float]]:
     """Return how many cells have a cost, and the share of cells and courses that each reason holds."""
     counts, with_cost, trusted = dict.fromkeys(Reason, 0), 0, 0
     for first, last in _row_strips(costs):
@@ -351,5 +403,4 @@ def _shares(costs: CostGrid) -> dict[str, Any]:
         for reason in counts:
             counts[reason] += int(np.count_nonzero(bits & reason))
     shares = {name_of(reason): count / costs.reasons.size for reason, count in counts.items() if count}
-    cells = {"all": costs.grid.rows * costs.grid.cols, "with_cost": with_cost, "trusted": trusted}
-    return {"cells": cells, "reason_share": shares, "barred_by": [name_of(r) for r in Reason if r & BARRED]}
+    return CellCounts(costs.grid.rows * costs.grid.cols, with_cost, trusted), shares

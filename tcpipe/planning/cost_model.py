@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +81,7 @@ class CostModel(Protocol):
         """Smallest and largest ``slope_rad``, ``cross_slope_rad`` [rad] and ``relief_m`` [m] of the training patches."""
 
     @property
-    def residuals(self) -> Mapping[str, NDArray[Any]]:
+    def residuals(self) -> Mapping[str, NDArray[np.generic]]:
         """Held-out samples, one row each.
 
         ``run_id``, ``start_ns``, ``terrain_class``, labels ``power_watt`` and ``velocity_mps``, and what the model said of them:

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,7 +72,7 @@ class Errors:
         return float(np.sqrt(max(pairs[0] + 2.0 * float(pairs[1:] @ correlation[1:]), 0.0)))
 
 
-def errors_of(residuals: Mapping[str, NDArray[Any]]) -> dict[str, Errors] | None:
+def errors_of(residuals: Mapping[str, NDArray[np.generic]]) -> dict[str, Errors] | None:
     """Return the errors of ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     Parameters
@@ -91,7 +90,9 @@ def errors_of(residuals: Mapping[str, NDArray[Any]]) -> dict[str, Errors] | None
     if np.count_nonzero(usable) < FEWEST:
         return None
     class_id = residuals["terrain_class"][usable].astype(np.int64)
-    first, second, lag_m = _pairs(residuals["run_id"][usable], residuals["start_ns"][usable], velocity[usable])
+    first, second, lag_m = _pairs(
+        residuals["run_id"][usable], residuals["start_ns"][usable].astype(np.int64), velocity[usable]
+    )
     return {name: _errors(ratio[usable] - 1.0, class_id, first, second, lag_m) for name, ratio in ratios.items()}
 
 
@@ -124,7 +125,7 @@ def _correlation(products: Floats, lag_m: Floats) -> Floats:
 
 
 def _pairs(
-    run_id: NDArray[Any], start_ns: NDArray[np.int64], velocity_mps: Floats
+    run_id: NDArray[np.generic], start_ns: NDArray[np.int64], velocity_mps: Floats
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Floats]:
     """Return pairs of rows of one run, and how far apart they were driven [m]; so many neighbours of each row that bins fill."""
     order = np.lexsort((start_ns, run_id))

@@ -100,7 +100,7 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
     summary = {"model": model.name, "map": source.name, "robot": model.robot, **cost.summary()}
     if out is not None:
         write_pieces(out, cost.pieces)
-        write_sealed(summary_path(out), {"key": key, "sha256": file_checksum(out)[1], **summary})
+        write_sealed(summary_path(out), {"key": key, "sha256": file_checksum(out).sha256, **summary})
     return PathResult(path, out, "done", summary)
 
 
@@ -117,5 +117,5 @@ def _summary_of(out: Path, key: str) -> dict[str, Any] | None:
         found = read_sealed(summary_path(out))
     except StoreError:
         return None
-    same = found.get("key") == key and found.get("sha256") == file_checksum(out)[1]
+    same = found.get("key") == key and found.get("sha256") == file_checksum(out).sha256
     return found if same else None

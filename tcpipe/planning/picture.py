@@ -9,6 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib import patheffects
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import Normalize
@@ -22,7 +23,7 @@ from tcpipe.planning.plan import Plan
 from tcpipe.tables.columns import floats
 from tcpipe.terrain.tiles import MapReader, level_for, read_window
 
-Array = NDArray[Any]
+Array = NDArray[np.float64]
 
 _INK, _FAINT = "#1d2830", "#7b8893"
 _COLOURS = {"energy": "#d4600c", "time": "#1668b8", "distance": "#4a4f55"}
@@ -135,7 +136,7 @@ class _Backdrop:
         row = ((top - xy_m[:, 1]) / (top - bottom) * rows).astype(np.int64)
         return np.asarray(self._height[np.clip(row, 0, rows - 1), np.clip(col, 0, cols - 1)])
 
-    def draw(self, axes: Any) -> None:
+    def draw(self, axes: Axes) -> None:
         """Draw it."""
         axes.imshow(self._picture, extent=self._extent, interpolation="bilinear")
         known = self._height[np.isfinite(self._height)]
@@ -192,7 +193,7 @@ def _blend(layers: dict[str, Array], light: Array) -> Array:
     return np.where(missing[..., None], 1.0, picture)
 
 
-def _draw_path(axes: Any, plan: Plan, values: Array, scale: Normalize) -> LineCollection:
+def _draw_path(axes: Axes, plan: Plan, values: Array, scale: Normalize) -> LineCollection:
     """Draw the path, coloured by what its metres cost; return the coloured line."""
     points = plan.xy_m
     length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
@@ -207,7 +208,7 @@ def _draw_path(axes: Any, plan: Plan, values: Array, scale: Normalize) -> LineCo
     return line
 
 
-def _draw_ends(axes: Any, plan: Plan) -> None:
+def _draw_ends(axes: Axes, plan: Plan) -> None:
     (x0, y0), (x1, y1) = plan.xy_m[[0, -1]].tolist()
     axes.plot(x0, y0, "o", ms=11, color="white", mec=_INK, mew=2.2, zorder=5)
     axes.plot(x1, y1, "*", ms=19, color="white", mec=_INK, mew=1.6, zorder=5)
@@ -225,7 +226,7 @@ def _draw_ends(axes: Any, plan: Plan) -> None:
         )
 
 
-def _title(axes: Any, plan: Plan, plans: Sequence[Plan]) -> None:
+def _title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
     colour = _COLOURS[plan.objective]
     axes.set_title(f"Least {plan.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
     best = {name: min(other.cost.summary()[name] for other in plans) for name in _SHOWN}
@@ -247,7 +248,7 @@ def _said(name: str, value: float, best: float) -> str:
     return f"{text} (+{more:.1%})" if more >= 0.0005 else text
 
 
-def _scale_bar(axes: Any, bounds: tuple[float, float, float, float]) -> None:
+def _scale_bar(axes: Axes, bounds: tuple[float, float, float, float]) -> None:
     left, bottom, right, top = bounds
     length = _nice((right - left) / 4.0)
     x, y = left + 0.04 * (right - left), bottom + 0.05 * (top - bottom)
@@ -265,7 +266,7 @@ def _nice(value: float) -> float:
     return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= value * (1.0 + 1e-9)))
 
 
-def _draw_profiles(axes: Any, backdrop: _Backdrop, plans: Sequence[Plan]) -> None:
+def _draw_profiles(axes: Axes, backdrop: _Backdrop, plans: Sequence[Plan]) -> None:
     """Draw height over distance along every path."""
     for plan in plans:
         length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(plan.xy_m, axis=0), axis=1))]

@@ -15,7 +15,7 @@ from tcpipe.formats.geojson_lines import check_lonlat, write_lines
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import broken_seal, file_checksum
-from tcpipe.planning.cost_map import CARD, cost_map_key, open_cost_map, read_cost_map_card
+from tcpipe.planning.cost_map import CARD, CostMapCard, cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_files import cost_text
 from tcpipe.planning.plan import OBJECTIVES, Objective, plan_path
@@ -95,7 +95,7 @@ def plan(
     check_model(model, source)
     drawn = picture is not None
     card = None if request.cost_map is None else _card_of(request.cost_map, model, source)
-    rules = replace(request, cost_map=None, step_m=card["grid"]["pitch_m"] if card else request.step_m)
+    rules = replace(request, cost_map=None, step_m=card.grid.pitch_m if card else request.step_m)
     made_from = {"model": model.checksum, "map": source.summary(), "request": rules, "drawn": drawn}
     key = digest({**made_from, "cost_map": card is not None, "version": VERSION})
     if (found := _plans_of(out, picture, key)) is not None:
@@ -111,7 +111,7 @@ def plan(
         from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw
 
         draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
-        about["picture_sha256"] = file_checksum(picture)[1]
+        about["picture_sha256"] = file_checksum(picture).sha256
     asked = plans[request.objective]
     who = {"model": model.name, "map": source.name, "robot": model.robot, "allow_unseen": request.allow_unseen}
     write_lines(out, [(asked.lonlat_deg, {**asked.properties(), **who})], {"tcpipe": about})
@@ -125,21 +125,21 @@ def _check_names(out: Path, picture: Path | None) -> None:
         raise UsageError(f"{picture}: wanted the name of a file that ends in .png")
 
 
-def _card_of(path: Path, model: CostModel, source: MapFile) -> Mapping[str, Any]:
+def _card_of(path: Path, model: CostModel, source: MapFile) -> CostMapCard:
     """Return the card of a cost map of this model and map; `ModelError` if it is none."""
     card = read_cost_map_card(path)
     if card is None:
         if not (path / CARD).is_file():
             raise UsageError(f"{path}: not a cost map; make one with tcpipe cost-map")
         raise ModelError(f"{broken_seal(path / CARD)}; make one with tcpipe cost-map")
-    if card["key"] != cost_map_key(model, source, card["grid"]["pitch_m"]):
+    if card.key != cost_map_key(model, source, card.grid.pitch_m):
         raise ModelError(
             f"{path}: is made from another model or map than {model.name} and {source.name}; make it again with tcpipe cost-map"
         )
     return card
 
 
-def _survey(model: CostModel, source: MapFile, request: PlanRequest, card: Mapping[str, Any] | None) -> Survey:
+def _survey(model: CostModel, source: MapFile, request: PlanRequest, card: CostMapCard | None) -> Survey:
     """Return what a cost map knows, or nothing yet."""
     if request.cost_map is None or card is None:
         return new_survey(model, source, request.step_m)
@@ -158,6 +158,6 @@ def _plans_of(out: Path, picture: Path | None, key: str) -> dict[str, Any] | Non
         raise UsageError(f"{out}: exists and is no plan; it is left alone; give another --out")
     if about.get("key") != key:
         return None
-    if picture is not None and not (picture.is_file() and file_checksum(picture)[1] == about.get("picture_sha256")):
+    if picture is not None and not (picture.is_file() and file_checksum(picture).sha256 == about.get("picture_sha256")):
         return None
     return {name: about["plans"][name] for name in about["order"]}

@@ -300,9 +300,9 @@ class Recipe:
     sample: SampleConfig = field(default_factory=SampleConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    robots: dict[str, Robot] = field(default_factory=dict)
+    robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
     """Robots of your own by name; one that is called as one of tcpipe's takes its place."""
-    power_sources: list[PowerSource] = field(default_factory=list)
+    power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)
     """What message types of your own tell of power, a table a rail; those of a type take the place of tcpipe's of that type."""
 
     def __post_init__(self) -> None:

@@ -2,37 +2,33 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from tcpipe.balance.cells import SLOPE_NAMES
+from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.report.page import Section
 
 _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
 
-def balance_sections(card: Mapping[str, Any]) -> Iterator[Section]:
-    """Yield the sections; nothing for a dataset of before."""
-    balance = card.get("balance")
-    if balance:
-        yield _by_class(balance)
-        yield _by_speed(balance)
-        yield _repeatability(balance)
+def balance_sections(balance: Balance) -> list[Section]:
+    """Return the sections."""
+    return [_by_class(balance), _by_speed(balance), _repeatability(balance)]
 
 
-def _by_class(balance: Mapping[str, Any]) -> Section:
-    cells = balance["by_class_and_slope"]
+def _by_class(balance: Balance) -> Section:
+    cells = balance.by_class_and_slope
     text = (
         f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_alike(balance)}). "
-        f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells are worth fewer than {balance['enough_effective']:g} and marked "
+        f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells are worth fewer than {balance.enough_effective:g} and marked "
         "with *; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them; open it in a GIS."
     )
     header, rows = _table(cells, "class", [(cell["class"] or "any",) for cell in cells])
     return Section("Balance of class and slope", text, header=header, rows=rows)
 
 
-def _by_speed(balance: Mapping[str, Any]) -> Section:
-    cells = balance["cells"]
+def _by_speed(balance: Balance) -> Section:
+    cells = balance.cells
     keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in cells]
     header, rows = _table(cells, "class, speed [m/s]", keys)
     return Section(
@@ -40,9 +36,7 @@ def _by_speed(balance: Mapping[str, Any]) -> Section:
     )
 
 
-def _table(
-    cells: Sequence[Mapping[str, Any]], name: str, keys: Sequence[tuple[str, ...]]
-) -> tuple[list[str], list[list[str]]]:
+def _table(cells: Sequence[CellRow], name: str, keys: Sequence[tuple[str, ...]]) -> tuple[list[str], list[list[str]]]:
     """Return header and rows: one row a key, in order of appearance, one column a range of slope."""
     seen = {cell["slope"] for cell in cells}
     slopes = [slope for slope in SLOPE_NAMES if slope in seen]
@@ -63,7 +57,7 @@ def _lower_end(speeds: str) -> tuple[float, bool]:
     return float(words[-1] if words[0] == "above" else words[0]), words[0] == "above"
 
 
-def _cell_text(row: Mapping[str, Any]) -> str:
+def _cell_text(row: CellRow) -> str:
     count = sum(row["samples"].values())
     if not count:
         return "–"
@@ -71,24 +65,24 @@ def _cell_text(row: Mapping[str, Any]) -> str:
     return f"{count}{worth}{'*' if row['rare'] else ''}"
 
 
-def _alike(balance: Mapping[str, Any]) -> str:
+def _alike(balance: Balance) -> str:
     found = [
-        f"{_name(label)} over {entry['length_m']:.1f} m, {100 * entry['share']:.0f} % of its variance"
-        for label, entry in balance["correlation"].items()
+        f"{_name(label)} over {entry.length_m:.1f} m, {100 * entry.share:.0f} % of its variance"
+        for label, entry in balance.correlation.items()
         if entry is not None
     ]
     return "; ".join(found) or "how far cannot be told from so few"
 
 
-def _repeatability(balance: Mapping[str, Any]) -> Section:
+def _repeatability(balance: Balance) -> Section:
     rows = []
-    for label, entry in balance["repeatability"].items():
+    for label, entry in balance.repeatability.items():
         unit = _UNITS[label.rsplit("_", 1)[1]]
         if entry is not None:
-            ends = (entry["std_low"], entry["std_high"])
+            ends = (entry.std_low, entry.std_high)
             interval = "too few places" if None in ends else f"{ends[0]:.3g} to {ends[1]:.3g}"
-            rows.append((_name(label), f"{entry['std']:.3g} {unit}", interval, entry["pairs"], entry["places"],
-                         f"{100 * (1 - min(entry['share_of_variance'], 1.0)):.1f} %"))  # fmt: skip
+            rows.append((_name(label), f"{entry.std:.3g} {unit}", interval, entry.pairs, entry.places,
+                         f"{100 * (1 - min(entry.share_of_variance, 1.0)):.1f} %"))  # fmt: skip
     text = (
         "Places that were driven again in the same direction: no model can predict a single label better than it repeats itself."
         if rows

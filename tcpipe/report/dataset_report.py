@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import Transformer
 
+from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
 from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_current_card, read_samples, rows_in_files
+from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.report.balance import balance_sections
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import (
@@ -26,7 +27,6 @@ from tcpipe.report.overview import Bounds, joint_bounds_m, read_overview
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.quality import quality_sections
 from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.findings import EnergyBudget
 
 _GALLERY = 10
 
@@ -48,29 +48,29 @@ _COLUMNS = (
 def dataset_report(directory: Path) -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model."""
     card, samples = read_current_card(directory), read_samples(directory, _COLUMNS)
-    driven = sum(card["ledger_m"].values())
-    splits = {split: card["splits"][split] for split in SPLIT_COLOURS}
+    driven = sum(card.ledger_m.values())
+    splits = {split: card.splits[split] for split in SPLIT_COLOURS}
     return render_page(
-        title=f"Dataset {card['name']}",
-        lead=card["description"] or f"{card['format']} format, data model {card['data_model_version']}",
+        title=f"Dataset {card.name}",
+        lead=card.description or f"{card.format} format, data model {card.data_model_version}",
         numbers=[
-            Number(f"{card['samples']}", "samples"),
+            Number(f"{card.samples}", "samples"),
             *(Number(f"{count}", split) for split, count in splits.items()),
-            Number(f"{len(card['runs'])}", "runs"),
+            Number(f"{len(card.runs)}", "runs"),
             Number(f"{driven:.0f} m", "driven"),
         ],
-        warnings=[*card.get("problems", ()), *card["warnings"]],
+        warnings=[*card.problems, *card.warnings],
         sections=[
             _split_section(directory, card, samples),
             _gallery_section(directory, card, samples),
             *_label_sections(card, samples),
             *quality_sections(_quality_counts(samples), "samples"),
-            *budget_sections(None if card.get("energy_budget") is None else EnergyBudget(**card["energy_budget"])),
+            *budget_sections(card.energy_budget),
             Section(
-                "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card["ledger_m"])
+                "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card.ledger_m)
             ),
             *_removal_sections(card),
-            *balance_sections(card),
+            *balance_sections(card.balance),
             _audit_section(card),
             *_table_sections(card),
         ],
@@ -82,15 +82,13 @@ def _floats(samples: pa.Table, name: str) -> NDArray[np.float64]:
     return values
 
 
-def _split_section(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Section:
-    crs = card["maps"][0]["crs"]
-    x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(grid["crs"], _bounds_m(grid)) for grid in card["maps"]])
-    to_map = Transformer.from_crs(card["recipe"]["read"]["gnss_crs"], crs, always_xy=True)
+def _split_section(directory: Path, card: DatasetCard, samples: pa.Table) -> Section:
+    crs = card.maps[0].crs
+    x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(grid.crs, _bounds_m(grid)) for grid in card.maps])
+    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, crs, always_xy=True)
     region_to_map = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
     x, y = to_map.transform(_floats(samples, "start_lon_deg"), _floats(samples, "start_lat_deg"))
-    outlines = [
-        np.column_stack(region_to_map.transform(ring[:, 0], ring[:, 1])) for ring in _rings(card["split"]["region"])
-    ]
+    outlines = [np.column_stack(region_to_map.transform(ring[:, 0], ring[:, 1])) for ring in _rings(card.split.region)]
     svg = path_on_map(
         np.asarray(x),
         np.asarray(y),
@@ -105,28 +103,28 @@ def _split_section(directory: Path, card: Mapping[str, Any], samples: pa.Table) 
     return Section("The split on the map", text, svg)
 
 
-def _bounds_m(grid: Mapping[str, Any]) -> Bounds:
-    width_m, height_m = grid["cols"] * grid["pitch_m"], grid["rows"] * grid["pitch_m"]
-    return grid["x_min_m"], grid["y_max_m"] - height_m, grid["x_min_m"] + width_m, grid["y_max_m"]
+def _bounds_m(grid: MapSource) -> Bounds:
+    width_m, height_m = grid.cols * grid.pitch_m, grid.rows * grid.pitch_m
+    return grid.x_min_m, grid.y_max_m - height_m, grid.x_min_m + width_m, grid.y_max_m
 
 
-def _rings(region: Mapping[str, Any] | None) -> list[NDArray[np.float64]]:
+def _rings(region: Mapping[str, PolygonGeometry] | None) -> list[NDArray[np.float64]]:
     """Return every ring of every polygon of the region, lon and lat, each of shape (M, 2)."""
     rings = []
     for geometry in (region or {}).values():
-        polygons = [geometry["coordinates"]] if geometry["type"] == "Polygon" else geometry["coordinates"]
+        polygons = (geometry.coordinates,) if geometry.type == "Polygon" else geometry.coordinates
         rings += [np.array(ring, dtype=float)[:, :2] for polygon in polygons for ring in polygon]
     return rings
 
 
-def _gallery_section(directory: Path, card: Mapping[str, Any], samples: pa.Table) -> Section:
+def _gallery_section(directory: Path, card: DatasetCard, samples: pa.Table) -> Section:
     chosen = _spread(samples)
     files = open_patches(directory, card)
     splits = samples.column("split").to_numpy(zero_copy_only=False)
     place = np.empty(samples.num_rows, dtype=np.int64)  # where each row of samples lies in the files
     for name, rows in rows_in_files(card, splits).items():
         place[splits == name] = rows
-    stacks: dict[str, list[NDArray[Any]]] = {layer: [] for layer in files.layers}
+    stacks: dict[str, list[NDArray[np.generic]]] = {layer: [] for layer in files.layers}
     for row in chosen:
         piece = int(np.searchsorted(files.starts, place[row], side="right")) - 1
         pixels = files.read(piece, list(stacks))
@@ -159,10 +157,10 @@ def _spread(samples: pa.Table) -> list[int]:
     return chosen[:_GALLERY]
 
 
-def _label_sections(card: Mapping[str, Any], samples: pa.Table) -> list[Section]:
+def _label_sections(card: DatasetCard, samples: pa.Table) -> list[Section]:
     labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
     ids = np.nan_to_num(_floats(samples, "terrain_class")).astype(int)
-    names = {entry["id"]: entry["name"] for entry in card["classes"]}
+    names = {entry.id: entry.name for entry in card.classes}
     series = {"power w [W]": _floats(samples, "power_watt"), "velocity v [m/s]": _floats(samples, "velocity_mps")}
     return [
         Section(
@@ -183,18 +181,18 @@ def _quality_counts(samples: pa.Table) -> dict[str, int]:
     return {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
 
 
-def _audit_section(card: Mapping[str, Any]) -> Section:
+def _audit_section(card: DatasetCard) -> Section:
     rows = [
         (
-            part["split"],
-            part["samples"],
-            part["overlapping_samples"],
-            part["same_track_pairs"],
-            part["repeated_place_samples"],
-            "none" if part["nearest_train_min_m"] is None else f"{part['nearest_train_min_m']:.1f} m",
-            "none" if part["nearest_train_median_m"] is None else f"{part['nearest_train_median_m']:.1f} m",
+            part.split,
+            part.samples,
+            part.overlapping_samples,
+            part.same_track_pairs,
+            part.repeated_place_samples,
+            "none" if part.nearest_train_min_m is None else f"{part.nearest_train_min_m:.1f} m",
+            "none" if part.nearest_train_median_m is None else f"{part.nearest_train_median_m:.1f} m",
         )
-        for part in card["split"]["audit"]
+        for part in card.split.audit
     ]
     header = (
         "split",
@@ -208,18 +206,18 @@ def _audit_section(card: Mapping[str, Any]) -> Section:
     return Section("Leakage audit", "How much of what tests has been seen in training.", header=header, rows=rows)
 
 
-def _removal_sections(card: Mapping[str, Any]) -> list[Section]:
+def _removal_sections(card: DatasetCard) -> list[Section]:
     """Return what of each class and slope is in samples; nothing for datasets of before, and where nothing was driven."""
     found = []
-    for key, what in (("by_class", "class"), ("by_slope", "slope along travel")):
+    for groups, what in ((card.removal.by_class, "class"), (card.removal.by_slope, "slope along travel")):
         rows = [
             (
-                group["name"],
-                f"{group['driven_m']:.0f}",
-                f"{100 * group['used_share']:.0f} %",
-                ", ".join(f"{name.replace('_', ' ')} {metres:.0f}" for name, metres in _largest(group["removed_m"])),
+                group.name,
+                f"{group.driven_m:.0f}",
+                f"{100 * group.used_share:.0f} %",
+                ", ".join(f"{name.replace('_', ' ')} {metres:.0f}" for name, metres in _largest(group.removed_m)),
             )
-            for group in card.get("removal", {}).get(key, [])
+            for group in groups
         ]
         if rows:
             text = "Where the shares differ, what is removed depends on the ground."
@@ -233,17 +231,16 @@ def _largest(metres: Mapping[str, float]) -> list[tuple[str, float]]:
     return sorted(((n, m) for n, m in metres.items() if m >= 0.5), key=lambda item: (-item[1], item[0]))[:3]
 
 
-def _table_sections(card: Mapping[str, Any]) -> list[Section]:
+def _table_sections(card: DatasetCard) -> list[Section]:
     sections = []
-    if card["terrain"]:
-        names = sorted({name for counts in card["terrain"].values() for name in counts})
-        rows = [(name, *(card["terrain"][split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
+    if card.terrain:
+        names = sorted({name for counts in card.terrain.values() for name in counts})
+        rows = [(name, *(card.terrain[split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
         sections.append(Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows))
-    runs = [(run["run_id"], run["robot"], run["recipe_id"], _floor(run)) for run in card["runs"]]
+    runs = [(run.run_id, run.robot, run.recipe_id, _floor(run)) for run in card.runs]
     sections.append(Section("Runs", header=("run", "robot", "recipe", "noise floor of E"), rows=runs, figures_from=3))
     return sections
 
 
-def _floor(run: Mapping[str, Any]) -> str:
-    budget = run.get("energy_budget")
-    return "none" if budget is None else f"{100 * budget['total']:.1f} %"
+def _floor(run: RunSource) -> str:
+    return "none" if run.energy_budget is None else f"{100 * run.energy_budget.total:.1f} %"

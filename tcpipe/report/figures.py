@@ -5,16 +5,18 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeVar
 
 import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-Array = NDArray[Any]
+Array = NDArray[np.float64]
+Stored = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
+S = TypeVar("S", bound=np.generic)
 
 INK = "#22303c"
 FAINT = "#8a97a3"
@@ -56,18 +58,17 @@ def figure_svg(width: float, height: float) -> Iterator[tuple[Figure, list[str]]
     out.append(text[text.index("<svg") :])
 
 
-def _thin(*arrays: Array) -> tuple[Array, ...]:
-    step = max(1, len(arrays[0]) // _MAX_POINTS)
-    return tuple(array[::step] for array in arrays)
+def _thin(array: NDArray[S]) -> NDArray[S]:
+    return array[:: max(1, len(array) // _MAX_POINTS)]
 
 
 def path_on_map(
     x_m: Array,
     y_m: Array,
-    groups: Array,
+    groups: NDArray[np.object_],
     colours: Mapping[str, str],
     *,
-    backdrop: Array | None = None,
+    backdrop: NDArray[np.uint8] | None = None,
     extent_m: tuple[float, float, float, float] | None = None,
     outlines_m: Sequence[Array] = (),
     labels: tuple[str, str] = ("east [m]", "north [m]"),
@@ -95,7 +96,7 @@ def path_on_map(
         for name, colour in colours.items():
             mask = groups == name
             if mask.any():
-                x, y = _thin(x_m[mask], y_m[mask])
+                x, y = _thin(x_m[mask]), _thin(y_m[mask])
                 axes.plot(
                     x, y, ".", ms=2.6, color=colour, label=f"{name} ({int(mask.sum())})", rasterized=len(x) > 1500
                 )
@@ -108,13 +109,13 @@ def path_on_map(
     return out[0]
 
 
-def over_distance(distance_m: Array, series: Mapping[str, tuple[Array, str]], kept: Array) -> str:
+def over_distance(distance_m: Array, series: Mapping[str, tuple[Array, str]], kept: NDArray[np.bool_]) -> str:
     """Draw series (label → values, colour) over the distance driven, one panel each; what is not kept is shaded."""
     with figure_svg(8.2, 1.7 * len(series) + 0.3) as (figure, out):
         panels = np.atleast_1d(figure.subplots(len(series), 1, sharex=True))
-        distance, keep = _thin(distance_m, kept)
+        distance, keep = _thin(distance_m), _thin(kept)
         for axes, (label, (values, colour)) in zip(panels, series.items(), strict=True):
-            (thin,) = _thin(values)
+            thin = _thin(values)
             axes.fill_between(
                 distance, 0, 1, where=~keep, transform=axes.get_xaxis_transform(), color="#00000012", lw=0
             )
@@ -157,7 +158,7 @@ def histograms(values: Mapping[str, Array], *, of_what: str = "segments") -> str
 
 
 def against_slope(
-    slope_rad: Array, series: Mapping[str, Array], class_ids: Array, class_names: Mapping[int, str]
+    slope_rad: Array, series: Mapping[str, Array], class_ids: NDArray[np.int64], class_names: Mapping[int, str]
 ) -> str:
     """Draw each series against the slope, coloured by terrain class as in the patches; id 0 is unknown."""
     with figure_svg(8.2, 2.9) as (figure, out):
@@ -166,7 +167,7 @@ def against_slope(
             for number in np.unique(class_ids).tolist():
                 mask = class_ids == number
                 name, colour = class_names.get(number, "unknown"), CLASS_COLOURS[(number - 1) % len(CLASS_COLOURS)]
-                x, y = _thin(np.degrees(slope_rad[mask]), data[mask])
+                x, y = _thin(np.degrees(slope_rad[mask])), _thin(data[mask])
                 axes.plot(x, y, ".", ms=3, alpha=0.7, color=colour, label=name)
             axes.set_xlabel("slope along travel [deg]")
             axes.set_ylabel(label)
@@ -174,7 +175,7 @@ def against_slope(
     return out[0]
 
 
-def patch_gallery(layers: Mapping[str, Array], titles: Sequence[str]) -> str:
+def patch_gallery(layers: Mapping[str, Stored], titles: Sequence[str]) -> str:
     """Draw patches: one column a sample, one row a layer (N, S, S); travel is to the right.
 
     Orthophotos share one contrast, classes one colour each; a height patch spans its own relief.
@@ -194,7 +195,7 @@ def patch_gallery(layers: Mapping[str, Array], titles: Sequence[str]) -> str:
     return out[0]
 
 
-def _layer_look(name: str, stack: Array) -> dict[str, Any]:
+def _layer_look(name: str, stack: Stored) -> dict[str, str | float | Colormap]:
     if name.startswith("ortho"):
         low, high = np.percentile(stack, (1, 99))
         return {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1)}

@@ -87,7 +87,7 @@ def _level(source: MapFile) -> tuple[MapFile, int]:
     return source.at(factor), max(1, -(-(longer // factor) // _SIDE_PX))
 
 
-def _thinned(level: MapFile, layer: str, step: int) -> NDArray[Any]:
+def _thinned(level: MapFile, layer: str, step: int) -> NDArray[np.generic]:
     """Return every ``step``-th pixel of a layer."""
     side = max(step, level.tile_px * 4 // step * step)
     rows, cols = level.grid.rows, level.grid.cols
@@ -101,7 +101,7 @@ def _thinned(level: MapFile, layer: str, step: int) -> NDArray[Any]:
     return np.block(blocks)
 
 
-def _shaded(height_m: NDArray[Any], pitch_m: float) -> NDArray[np.uint8]:
+def _shaded(height_m: NDArray[np.generic], pitch_m: float) -> NDArray[np.uint8]:
     """Return Lambert shading of a height field lit from the north-west, 45° above the horizon; no data is white."""
     down, right = np.gradient(height_m.astype(float), pitch_m)
     light = (1.0 + right / np.sqrt(2.0) + down / np.sqrt(2.0)) / np.sqrt(2.0 * (1.0 + right**2 + down**2))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -69,8 +68,13 @@ def _source_line(known: RunJson | None) -> str:
     return f"from {', '.join(known.source.paths)} ({known.source.size_bytes / 1e6:.1f} MB)"
 
 
-def _column(table: pa.Table, name: str) -> NDArray[Any]:
-    values: NDArray[Any] = table.column(name).to_numpy(zero_copy_only=False)
+def _column(table: pa.Table, name: str) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = table.column(name).to_numpy(zero_copy_only=False)
+    return values
+
+
+def _bits(table: pa.Table, name: str) -> NDArray[np.uint32]:
+    values: NDArray[np.uint32] = table.column(name).to_numpy()
     return values
 
 
@@ -79,7 +83,7 @@ def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
     return f"{values.mean():.{digits}f} {unit}" if len(values) else "none"
 
 
-def _first_reason(dropped_by: NDArray[Any]) -> NDArray[Any]:
+def _first_reason(dropped_by: NDArray[np.uint32]) -> NDArray[np.object_]:
     """Return each row's reason by precedence, ``kept`` where there is none."""
     reasons = np.full(len(dropped_by), "kept", dtype=object)
     for bit in reversed(list(DropReason)):
@@ -91,7 +95,7 @@ def _track_sections(store: Store, run: RunDirectory, track: pa.Table) -> list[Se
     if not track.num_rows:
         return []
     x, y = _column(track, "x_m"), _column(track, "y_m")
-    dropped = _column(track, "dropped_by")
+    dropped = _bits(track, "dropped_by")
     distance = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
     series = {"speed [m/s]": (_column(track, "forward_velocity_mps"), "#2a6fb0")}
     if track.column("power_watt").null_count < track.num_rows:
@@ -104,7 +108,7 @@ def _track_sections(store: Store, run: RunDirectory, track: pa.Table) -> list[Se
 
 
 def _path_section(store: Store, run: RunDirectory, track: pa.Table) -> Section:
-    reasons = _first_reason(_column(track, "dropped_by"))
+    reasons = _first_reason(_bits(track, "dropped_by"))
     text = "The fused track; colour says why a row is not used."
     found, lost = _map_under(store, run, track)
     text += "".join(f" Map {name} cannot be shown: {why}." for name, why in lost)
@@ -125,7 +129,7 @@ def _path_section(store: Store, run: RunDirectory, track: pa.Table) -> Section:
     return Section("Path on the map", text, svg)
 
 
-_Under = tuple[MapFile, NDArray[np.uint8], NDArray[Any], NDArray[Any]]
+_Under = tuple[MapFile, NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]
 
 
 def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under | None, list[tuple[str, str]]]:
@@ -168,7 +172,7 @@ def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: 
         data = {label: _column(segments, name).astype(float) for label, name in labels.items()}
         sections.append(Section("Labels", "One value a segment.", histograms(data)))
         sections += _physics_sections(segments, physics)
-        quality = _column(segments, "quality")
+        quality = _bits(segments, "quality")
         sections += quality_sections(
             {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}, "segments"
         )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 F = TypeVar("F")
 
 LEFT_OUT = {"json": "left out"}
-"""Metadata of a field which, while it is None, is no key of the JSON object."""
+"""Metadata of a field which, while it is None or empty, is no key of the JSON object."""
 
 Vector = tuple[float, float, float]
 

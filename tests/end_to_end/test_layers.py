@@ -103,7 +103,7 @@ def test_every_pixel_is_what_lies_there(datasets, name):
     red, green, blue = (stored[f"ortho_{colour}"].astype(int) for colour in ("red", "green", "blue"))
     assert np.abs(red + green - 255).max() <= 1
     assert (blue == 200).all()
-    low, high = train._card["layers"]["moisture"]["actual_range"]
+    low, high = train._card.layers["moisture"]["actual_range"]
     np.testing.assert_allclose(train.patches[..., 0], (stored["moisture"] - low) / (high - low), atol=1e-6)
     np.testing.assert_array_equal(train.patches[..., 2], stored["canopy"] - 1.0)
     batch, _ = next(iter(train.batches(8, from_disk=True)))

@@ -33,7 +33,7 @@ from pyproj import CRS
 from tcpipe.errors import MapError, StoreError
 from tcpipe.formats.layer_descriptions import described, flags, layers_described
 from tcpipe.formats.maps.class_table import table_from_json, table_to_json
-from tcpipe.formats.seals import CHECKSUMS, prove_files, read_sealed
+from tcpipe.formats.seals import prove_files, read_checksums
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
 from tcpipe.terrain.classes import ClassScheme, ClassTable
@@ -168,11 +168,11 @@ def open_map(path: Path, *, proved: bool = True) -> MapFile:
 def _prove(path: Path) -> None:
     """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
     try:
-        listed = read_sealed(path / CHECKSUMS, {"checksums": dict})["checksums"]
+        listed = read_checksums(path)
         prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
-    lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry["size_bytes"])]
+    lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry.size_bytes)]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
         raise MapError(f"{lost[0]}{more}: gone or cut short; add the map again")

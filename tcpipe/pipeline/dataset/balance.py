@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -26,6 +25,8 @@ from tcpipe.balance.cells import (
 from tcpipe.balance.correlation import correlations, residuals
 from tcpipe.balance.repeats import Floor, repeatability, repeated_pairs
 from tcpipe.balance.thin_ground import CELL_M, CLOSED, Ground, Patch, cell_classes, cell_gradients, offered, thin_ground
+from tcpipe.formats.dataset_card import Balance, CellRow
+from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.regions import Regions
@@ -64,14 +65,6 @@ class _Samples:
     xy_m: Floats
 
 
-@dataclass(frozen=True, slots=True)
-class Balance:
-    """The balance as JSON values for the card, and the GeoJSON document of `DRIVE_NEXT`."""
-
-    facts: Mapping[str, Any]
-    drive_next: Mapping[str, Any]
-
-
 def measure_balance(
     table: pa.Table,
     xy_m: Floats,
@@ -81,8 +74,8 @@ def measure_balance(
     chord_m: float,
     regions: Regions | None,
     buffer_m: float,
-) -> Balance:
-    """Measure what the samples cover.
+) -> tuple[Balance, FeatureCollection]:
+    """Measure what the samples cover, and where to drive next.
 
     Parameters
     ----------
@@ -119,16 +112,16 @@ def measure_balance(
     ]
     names = dict(enumerate(sources[0].classes.names().tolist()))
     rows, features = _by_ground(pairs, grounds, samples, slopes, names)
-    facts = {
-        "slope_edges_deg": list(SLOPE_EDGES_DEG),
-        "speed_edges_mps": list(edges),
-        "enough_effective": ENOUGH,
-        "correlation": {name: None if found is None else asdict(found) for name, found in alike.items()},
-        "by_class_and_slope": rows,
-        "cells": [_cell_json(cell, names, edges) for cell in cells],
-        "repeatability": {name: _floor_json(found) for name, found in _floors(samples, left, chord_m)},
-    }
-    return Balance(facts, {"type": "FeatureCollection", "features": features})
+    balance = Balance(
+        slope_edges_deg=SLOPE_EDGES_DEG,
+        speed_edges_mps=tuple(edges),
+        enough_effective=ENOUGH,
+        correlation=alike,
+        by_class_and_slope=tuple(rows),
+        cells=tuple(_row(cell, names, edges) for cell in cells),
+        repeatability=dict(_floors(samples, left, chord_m)),
+    )
+    return balance, FeatureCollection(tuple(features))
 
 
 def _samples(table: pa.Table, xy_m: Floats, velocity_column: str) -> _Samples:
@@ -152,16 +145,12 @@ def _floors(samples: _Samples, left: Mapping[str, Floats], chord_m: float) -> It
         yield name, repeatability(values, left[name], pairs, samples.xy_m, chord_m=chord_m)
 
 
-def _floor_json(found: Floor | None) -> dict[str, Any] | None:
-    return None if found is None else asdict(found)
-
-
-def _cell_json(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> dict[str, Any]:
-    found: dict[str, Any] = {
+def _row(cell: Cell, names: Mapping[int, str], edges: Sequence[float]) -> CellRow:
+    found: CellRow = {
         "class": names[cell.terrain_class] or None,
         "class_id": cell.terrain_class,
         "slope": SLOPE_NAMES[cell.slope],
-        "samples": dict(cell.samples),
+        "samples": cell.samples,
         "effective": cell.effective,
         "effective_train": cell.effective_train,
         "rare": cell.rare,
@@ -250,18 +239,18 @@ def _ground(source: MapFile) -> Ground:
 
 def _by_ground(
     pairs: Sequence[Cell], grounds: Sequence[_OpenGround], samples: _Samples, slopes: Ints, names: Mapping[int, str]
-) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+) -> tuple[list[CellRow], list[Feature]]:
     """Return a row for each class and slope that was driven or that the maps offer, and the features of where to drive next."""
     driven = {(cell.terrain_class, cell.slope): cell for cell in pairs}
     kinds = {int(kind) for part in grounds for kind in np.unique(part.ground.terrain_class)} - {CLOSED}
-    rows, thin = [], []
+    rows, thin = list[CellRow](), []
     for kind in sorted(kinds | {kind for kind, _ in driven}):
         for slope in range(len(SLOPE_NAMES)):
             cell = driven.get((kind, slope)) or Cell(kind, slope, None, dict.fromkeys(_USED, 0), 0.0, 0.0)
             area_m2 = sum(part.area_m2(kind, slope) for part in grounds)
             if area_m2 == 0.0 and (kind, slope) not in driven:
                 continue
-            rows.append({**_cell_json(cell, names, ()), "offered_m2": area_m2})
+            rows.append({**_row(cell, names, ()), "offered_m2": area_m2})
             if cell.rare and area_m2 > 0.0:
                 here = samples.xy_m[(samples.terrain == kind) & (slopes == slope) & (samples.split != "buffer")]
                 thin += [(cell, patch, lonlat) for part in grounds for patch, lonlat in part.patches(kind, slope, here)]
@@ -270,18 +259,14 @@ def _by_ground(
     return rows, features
 
 
-def _feature(rank: int, cell: Cell, patch: Patch, lonlat: BaseGeometry, names: Mapping[int, str]) -> dict[str, Any]:
-    """Return a feature of RFC 7946: rings to the right-hand rule, lon before lat."""
-    return {
-        "type": "Feature",
-        "properties": {
-            "rank": rank,
-            "class": names[cell.terrain_class] or None,
-            "slope": SLOPE_NAMES[cell.slope],
-            "drive_towards": patch.towards,
-            "samples": sum(cell.samples.values()),
-            "effective_samples": None if cell.effective is None else round(cell.effective, 1),
-            "area_m2": round(patch.area_m2, 1),
-        },
-        "geometry": shapely.geometry.mapping(lonlat),
+def _feature(rank: int, cell: Cell, patch: Patch, lonlat: BaseGeometry, names: Mapping[int, str]) -> Feature:
+    properties = {
+        "rank": rank,
+        "class": names[cell.terrain_class] or None,
+        "slope": SLOPE_NAMES[cell.slope],
+        "drive_towards": patch.towards,
+        "samples": sum(cell.samples.values()),
+        "effective_samples": None if cell.effective is None else round(cell.effective, 1),
+        "area_m2": round(patch.area_m2, 1),
     }
+    return Feature(properties, PolygonGeometry(**shapely.geometry.mapping(lonlat)))

@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 
@@ -15,6 +14,7 @@ from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
+from tcpipe.formats.dataset_card import DatasetCard, Shard
 from tcpipe.formats.dataset_files import (
     CARD,
     CROISSANT,
@@ -31,26 +31,24 @@ from tcpipe.formats.dataset_files import (
     write_patches_zarr,
 )
 from tcpipe.formats.geojson import read_regions
-from tcpipe.formats.json_files import plain, write_json
+from tcpipe.formats.json_files import write_json
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
-from tcpipe.formats.seals import file_checksum, file_checksums, sealed_page, write_sealed
+from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, DRIVE_NEXT, measure_balance
 from tcpipe.pipeline.dataset.card import (
     CARD_COLUMNS,
     VELOCITY_COLUMN,
-    CardFacts,
     dataset_card,
     is_whole,
-    map_to_json,
 )
 from tcpipe.pipeline.dataset.content import Content, gather_content
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.runs import gone_runs
 from tcpipe.pipeline.dataset.segments import KEPT
-from tcpipe.pipeline.dataset.splitting import empty_splits, regions_to_json
+from tcpipe.pipeline.dataset.splitting import empty_splits
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import maps_overview, write_overview
@@ -81,11 +79,10 @@ class BuildResult:
     problems: tuple[str, ...] = ()
     """Runs that belong in and are left out, and splits that were asked for and are empty: the dataset is not what it should be."""
     energy_budget: EnergyBudget | None = None
-
-    @property
-    def exit_code(self) -> int:
-        """Return 3 if the dataset is not what it should be, else 0."""
-        return 3 if self.problems else 0
+    exit_code: int = 0
+    """3 if the dataset is not what it should be."""
+    recipe: str = ""
+    """Which recipe ruled, as a command found it."""
 
     def __str__(self) -> str:
         """Return counts, the audit, where the metres went and how wrong a label may be, as plain lines."""
@@ -176,7 +173,7 @@ def build_dataset(
     )
     problems, warnings = _left_out(inputs, known, robot=robot, tags=tags or {}, min_runs=min_runs)
     inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
-    if proved and known is not None and known["inputs"] == inputs.digest and is_whole(place, known):
+    if proved and known is not None and known.inputs == inputs.digest and is_whole(place, known):
         return _result(place, "unchanged", known, problems)
     with atomic_directory(place.absolute()) as directory:
         card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
@@ -184,11 +181,11 @@ def build_dataset(
 
 
 def _left_out(
-    inputs: Inputs, known: Mapping[str, Any] | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
+    inputs: Inputs, known: DatasetCard | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Return what is wrong with the choice of runs, and what is worth a warning; `DatasetError` where there are too few."""
     chosen = inputs.chosen
-    fewer = (*chosen.missing, *(() if known is None else gone_runs(known, chosen, robot=robot, tags=tags)))
+    fewer = (*chosen.missing, *(() if known is None else gone_runs(known.runs, chosen, robot=robot, tags=tags)))
     if min_runs is None:
         return (*chosen.damaged, *fewer), ()
     if len(inputs.runs) < min_runs:
@@ -197,17 +194,19 @@ def _left_out(
     return chosen.damaged, fewer
 
 
-def _result(place: Path, status: str, card: Mapping[str, Any], problems: Sequence[str]) -> BuildResult:
+def _result(place: Path, status: str, card: DatasetCard, problems: Sequence[str]) -> BuildResult:
+    said = (*problems, *empty_splits(card))
     return BuildResult(
         path=place,
         status=status,
-        samples=card["samples"],
-        splits={name: card["splits"][name] for name in SPLITS},
-        ledger_m=card["ledger_m"],
-        audit=tuple(HeldOut(**part) for part in card["split"]["audit"]),
-        warnings=tuple(card["warnings"]),
-        problems=(*problems, *empty_splits(card)),
-        energy_budget=None if card.get("energy_budget") is None else EnergyBudget(**card["energy_budget"]),
+        samples=card.samples,
+        splits={name: card.splits[name] for name in SPLITS},
+        ledger_m=card.ledger_m,
+        audit=card.split.audit,
+        warnings=card.warnings,
+        problems=said,
+        energy_budget=card.energy_budget,
+        exit_code=3 if said else 0,
     )
 
 
@@ -223,7 +222,7 @@ def _ruling(recipe: Recipe | str | Path | None, *, holdout: Holdout | None, seed
     return replace(recipe, split=rules)
 
 
-def _card_in_place(place: Path) -> tuple[Mapping[str, Any] | None, bool]:
+def _card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     """Return the card of the dataset that is there, if one is, and whether it is as it was written; `DatasetError` for anything else."""
     if not place.exists() or (place.is_dir() and not any(place.iterdir())):
         return None, False
@@ -237,7 +236,7 @@ def _card_in_place(place: Path) -> tuple[Mapping[str, Any] | None, bool]:
     except DatasetError as error:
         proved = False
         logger.warning("%s; it is built again", error.problems[0])
-    ours = {*card.get("checksums", {}), CARD, CROISSANT, REPORT}
+    ours = {*card.checksums, CARD, CROISSANT, REPORT}
     others = sorted({path.relative_to(place).as_posix() for path in place.rglob("*") if path.is_file()} - ours)
     if others:
         more = f" and {len(others) - 1} more" if len(others) > 1 else ""
@@ -254,7 +253,7 @@ def _build(
     *,
     file_format: FileFormat,
     jobs: int,
-) -> dict[str, Any]:
+) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
     waiting = directory / "spool"
     waiting.mkdir()
@@ -266,7 +265,7 @@ def _build(
     shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
     shutil.rmtree(waiting)
     write_overview(directory / OVERVIEW, maps_overview(content.sources))
-    balance = measure_balance(
+    balance, drive_next = measure_balance(
         read_samples(directory, BALANCE_COLUMNS),
         content.samples.centres_xy_m(),
         content.sources,
@@ -275,44 +274,30 @@ def _build(
         regions=regions,
         buffer_m=content.drawn.buffer_m,
     )
-    write_json(directory / DRIVE_NEXT, balance.drive_next)
+    write_json(directory / DRIVE_NEXT, drive_next)
     files = file_checksums(directory)
     spool = content.spool
     patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
-    write_json(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches))
-    facts = CardFacts(
-        inputs=inputs.digest,
+    write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches))
+    card = dataset_card(
+        read_samples(directory, CARD_COLUMNS),
+        recipe,
+        inputs,
+        content,
         file_format=file_format,
-        layers=spool.layers,
-        classes=content.sources[0].classes,
-        region=None if regions is None else regions_to_json(regions),
-        buffer_m=content.drawn.buffer_m,
-        audit=content.drawn.audit,
-        kept=content.drawn.kept,
-        runs=inputs.sources,
-        maps=[
-            {**map_to_json(source), "sha256": sha256, "registration": registration}
-            for source, sha256, registration in zip(
-                content.sources, inputs.map_sha256, content.registrations, strict=True
-            )
-        ],
-        ledger_m=content.ledger_m,
-        removal=content.removal.to_json(),
-        balance=balance.facts,
-        problems=inputs.problems,
-        warnings=content.warnings,
+        regions=regions,
+        balance=balance,
         shards=shards,
         checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},
     )
-    card = plain(dataset_card(read_samples(directory, CARD_COLUMNS), recipe, facts))
     write_sealed(directory / CARD, card)
     write_text(directory / REPORT, sealed_page(dataset_report(directory)))
-    return dict(card)
+    return card
 
 
 def _write_patches(
     directory: Path, content: Content, file_format: FileFormat, *, compression: Compression, threads: int
-) -> list[dict[str, Any]]:
+) -> list[Shard]:
     """Write the layers; return the shards, where the format has any."""
     samples, spool = content.samples, content.spool
     pixels = Pixels(spool.layers, spool.patch_px, samples.slots(), spool.read)
@@ -323,8 +308,8 @@ def _write_patches(
 
 
 def _croissant(
-    files: Mapping[str, tuple[int, str]], recipe: Recipe, inputs: str, patches: Mapping[str, tuple[int, str]] | None
-) -> dict[str, Any]:
+    files: Mapping[str, Checksum], recipe: Recipe, inputs: str, patches: Mapping[str, tuple[int, str]] | None
+) -> str:
     about = recipe.dataset
     return croissant(
         name=about.name,

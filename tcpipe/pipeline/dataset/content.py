@@ -13,10 +13,11 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_card import MapRegistration, Removal
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
-from tcpipe.pipeline.dataset.removal import Removal, removed_by_ground
+from tcpipe.pipeline.dataset.removal import removed_by_ground
 from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
 from tcpipe.pipeline.dataset.segments import move_out, pool_segments
 from tcpipe.pipeline.dataset.splitting import Drawn, draw_splits
@@ -106,7 +107,7 @@ class Content:
     sources: tuple[MapFile, ...]
     drawn: Drawn
     ledger_m: Mapping[str, float]
-    registrations: Sequence[Sequence[Mapping[str, Any]]]
+    registrations: Sequence[tuple[MapRegistration, ...]]
     """How each map lies against each run's track."""
     removal: Removal
     """What of each class and slope is in samples."""
@@ -145,7 +146,7 @@ def gather_content(
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     off = [line for _, lines in registered for line in lines]
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]
-    removal = removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
+    removal, uneven = removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
     order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
     return Content(
@@ -165,7 +166,7 @@ def gather_content(
         ledger_m=move_out(pool.ledger_m, {**lost_m, **unused_m}),
         registrations=[found for found, _ in registered],
         removal=removal,
-        warnings=(*inputs.warnings, *pool.warnings, *off, *sampled.warnings, *removal.warnings),
+        warnings=(*inputs.warnings, *pool.warnings, *off, *sampled.warnings, *uneven),
     )
 
 

@@ -8,7 +8,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,16 +15,16 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
+from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import (
     FileFormat,
     read_card,
     read_samples,
     sample_columns,
 )
-from tcpipe.formats.json_files import digest
-from tcpipe.formats.recipe_toml import plain_recipe
+from tcpipe.formats.json_files import digest, plain
 from tcpipe.formats.run_documents import LogOrigin
-from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_sealed
+from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_checksums
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
@@ -38,7 +37,7 @@ class Inputs:
     """Runs by id and what the card says of each, the maps, the hash over all inputs, and what was noticed on the way."""
 
     runs: tuple[RunDirectory, ...]
-    sources: tuple[dict[str, Any], ...]
+    sources: tuple[RunSource, ...]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap."""
     map_paths: tuple[Path, ...]
@@ -75,8 +74,8 @@ def choose_inputs(
     fingerprint = digest(
         {
             "versions": [__version__, TABLES_VERSION],
-            "recipe": plain_recipe(recipe),
-            "runs": sources,
+            "recipe": recipe,
+            "runs": [{key: value for key, value in plain(run).items() if key != "samples"} for run in sources],
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
             "format": file_format,
@@ -91,10 +90,7 @@ def _map_digest(name: str, path: Path) -> str:
     """Return one hash over a map's files; `MapError` if they are not as they were written: a lost one would read as no data."""
     found, wrong = file_checksums(path), list[str]()
     try:
-        recorded = {
-            name: (entry["size_bytes"], entry["sha256"])
-            for name, entry in read_sealed(path / CHECKSUMS, {"checksums": dict})["checksums"].items()
-        }
+        recorded = read_checksums(path)
         names = {*found, *recorded} - {CHECKSUMS}
         wrong = [str(path / name) for name in sorted(names) if found.get(name) != recorded.get(name)]
     except StoreError as error:
@@ -104,7 +100,7 @@ def _map_digest(name: str, path: Path) -> str:
         raise MapError(
             f"map {name}: not as it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
         )
-    return digest(found)
+    return digest({name: (entry.size_bytes, entry.sha256) for name, entry in found.items()})
 
 
 def earlier_splits(directory: Path) -> pa.Table:
@@ -133,20 +129,21 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names)) or (maps[0],)
 
 
-def run_source(run: RunDirectory, log: LogOrigin) -> dict[str, Any]:
+def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
     """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, warnings and error budget."""
-    return {
-        "run_id": run.run_id,
-        "recipe_id": run.recipe_id,
-        "robot": run.manifest.robot,
-        "tags": dict(run.manifest.tags),
-        "logs": [Path(path).name for path in log.paths],
-        "sha256": log.sha256,
-        "segments_sha256": run.manifest.checksums["segments.parquet"].sha256,
-        "driven_m": math.fsum(run.manifest.ledger_m.values()),
-        "warnings": list(run.manifest.warnings),
-        "energy_budget": run.energy_budget,
-    }
+    told = run.manifest
+    return RunSource(
+        run_id=run.run_id,
+        recipe_id=run.recipe_id,
+        robot=told.robot,
+        tags=told.tags,
+        logs=tuple(Path(path).name for path in log.paths),
+        sha256=log.sha256,
+        segments_sha256=told.checksums["segments.parquet"].sha256,
+        driven_m=math.fsum(told.ledger_m.values()),
+        warnings=tuple(told.warnings),
+        energy_budget=run.energy_budget,
+    )
 
 
 def _table_digest(table: pa.Table) -> str:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.formats.dataset_card import MapRegistration
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory
@@ -23,8 +23,8 @@ _COLUMNS = ["lon_deg", "lat_deg", "alt_m", "x_std_m", "y_std_m"]
 
 def register_runs(
     runs: Sequence[RunDirectory], source: MapFile, recipe: Recipe
-) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return how the map lies against each run that crosses enough of it, as JSON values, and a line for each that is off.
+) -> tuple[tuple[MapRegistration, ...], list[str]]:
+    """Return how the map lies against each run that crosses enough of it, and a line for each that is off.
 
     Parameters
     ----------
@@ -39,15 +39,15 @@ def register_runs(
     crs = parse_crs(source.grid.crs, where=f"map {source.name}")
     gnss_crs = parse_crs(recipe.read.gnss_crs, where="gnss_crs")
     projection = Projection(gnss_crs, crs, area_of(crs, source.grid.bounds_m))
-    found, warnings = [], []
+    found, warnings = list[MapRegistration](), list[str]()
     for run in runs:
         registration = _register(run, source, projection, max_std_m=recipe.sample.max_position_std_m)
         if registration is None:
             continue
-        found.append({"run_id": run.run_id, **_values(registration)})
+        found.append(_told(run.run_id, registration))
         if registration.significant and registration.shift_m > _WARN_M:
             warnings.append(f"run {run.run_id}: {_said(registration, source.name)}")
-    return found, warnings
+    return tuple(found), warnings
 
 
 def _register(run: RunDirectory, source: MapFile, projection: Projection, *, max_std_m: float) -> Registration | None:
@@ -58,18 +58,19 @@ def _register(run: RunDirectory, source: MapFile, projection: Projection, *, max
     return register_track(source, projection.forward(lonlat), height_m[sure])
 
 
-def _values(registration: Registration) -> dict[str, Any]:
+def _told(run_id: str, found: Registration) -> MapRegistration:
     """Return what the card says: no shift where the ground cannot tell one."""
-    told = bool(np.isfinite(registration.shift_std_m))
-    return {
-        "points": registration.points,
-        "shift_xy_m": list(registration.shift_xy_m) if told else None,
-        "shift_std_m": registration.shift_std_m if told else None,
-        "significant": registration.significant,
-        "height_offset_m": registration.height_offset_m,
-        "misfit_m": registration.misfit_m,
-        "shifted_misfit_m": registration.shifted_misfit_m if told else None,
-    }
+    told = bool(np.isfinite(found.shift_std_m))
+    return MapRegistration(
+        run_id=run_id,
+        points=found.points,
+        shift_xy_m=found.shift_xy_m if told else None,
+        shift_std_m=found.shift_std_m if told else None,
+        significant=found.significant,
+        height_offset_m=found.height_offset_m,
+        misfit_m=found.misfit_m,
+        shifted_misfit_m=found.shifted_misfit_m if told else None,
+    )
 
 
 def _said(registration: Registration, name: str) -> str:

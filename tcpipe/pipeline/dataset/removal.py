@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.formats.dataset_card import Removal
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.motion.ledger import interval_length_m, interval_reason
 from tcpipe.motion.pieces import piece_of_rows
@@ -37,30 +37,14 @@ _REASONS = (
 _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
 
 
-@dataclass(frozen=True, slots=True)
-class Removal:
-    """Metres by class and by slope: driven, in samples, and removed by reason; warnings where the removal is not even."""
-
-    by_class: tuple[Group, ...]
-    by_slope: tuple[Group, ...]
-    warnings: tuple[str, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return both tables for the card."""
-        return {
-            name: [{**asdict(group), "used_share": group.used_share} for group in groups]
-            for name, groups in (("by_class", self.by_class), ("by_slope", self.by_slope))
-        }
-
-
 def removed_by_ground(
     runs: Sequence[RunDirectory],
     segments: pa.Table,
     used: NDArray[np.int64],
     sources: Sequence[MapFile],
     recipe: Recipe,
-) -> Removal:
-    """Return where the metres of all runs went, by the class under them and the slope along them.
+) -> tuple[Removal, tuple[str, ...]]:
+    """Return where the metres of all runs went, by the class under them and the slope along them, and warnings where that is not even.
 
     Parameters
     ----------
@@ -89,7 +73,7 @@ def removed_by_ground(
     classes = named_groups(by_class, names, _REASONS) if grounds else ()
     traversable = set(table.names()[table.traversable()].tolist())
     lines = _warnings([group for group in classes if group.name in traversable], "class")
-    return Removal(classes, slopes, (*lines, *_warnings(slopes, "slope")))
+    return Removal(classes, slopes), (*lines, *_warnings(slopes, "slope"))
 
 
 class _Spans:
@@ -115,7 +99,7 @@ def _metres(
     run: RunDirectory,
     spans: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]],
     grounds: Sequence[_Ground],
-) -> tuple[NDArray[Any], ...]:
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return length [m], reason, slope and class (ids as `classes_at`) of every interval of a run's track."""
     track = run.table("track", _COLUMNS)
     stamp_ns, epoch = integers(track, "stamp_ns"), integers(track, "epoch")

@@ -7,10 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tcpipe.errors import DatasetError, StoreError
-from tcpipe.formats.json_files import misfit, typed
+from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import LogOrigin, Manifest, ManifestHead, RunJson
 from tcpipe.pipeline.unknown_robots import alike, in_words
@@ -161,7 +160,9 @@ def _known(store: Store, run_id: str) -> RunJson | None:
     return None
 
 
-def _belongs(known: RunJson | Manifest | ManifestHead | None, robot: str | None, tags: Mapping[str, str]) -> bool:
+def _belongs(
+    known: RunJson | Manifest | ManifestHead | RunSource | None, robot: str | None, tags: Mapping[str, str]
+) -> bool:
     """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
     if known is None:
         return True
@@ -186,15 +187,10 @@ def _logs_of(store: Store, run_ids: Iterable[str]) -> str:
 
 
 def gone_runs(
-    known: Mapping[str, Any], chosen: Chosen, *, robot: str | None, tags: Mapping[str, str]
+    before: Sequence[RunSource], chosen: Chosen, *, robot: str | None, tags: Mapping[str, str]
 ) -> tuple[str, ...]:
     """Return a line about the runs of the dataset that is replaced which the store no longer has, if any were not left out by choice."""
     here = {run.run_id for run in chosen.runs} | chosen.left_out
-    before = [run for run in known.get("runs", ()) if misfit(run, {"run_id": str}) is None]
-    gone = [
-        run["run_id"]
-        for run in before
-        if run["run_id"] not in here and _belongs(typed(run, ManifestHead, Path("dataset.json")), robot, tags)
-    ]
+    gone = [run.run_id for run in before if run.run_id not in here and _belongs(run, robot, tags)]
     count = f"{len(gone)} of the {len(before)} runs of the dataset that is replaced"
     return (f"{count} are no longer in the store: {_named(gone)}",) if gone else ()

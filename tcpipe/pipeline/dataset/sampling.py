@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all
+from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled
@@ -61,7 +62,7 @@ class Spool:
             with self._path(layer).open("wb") as file:
                 file.truncate(self.slots * self._slot_bytes(layer))
 
-    def write(self, layer: str, slots: NDArray[np.int64], pixels: NDArray[Any]) -> None:
+    def write(self, layer: str, slots: NDArray[np.int64], pixels: LayerPixels) -> None:
         """Write patches, shape (n, px, px), to their slots, (n,)."""
         order = np.argsort(slots)
         stretches = np.split(order, np.flatnonzero(np.diff(slots[order]) != 1) + 1)
@@ -71,7 +72,7 @@ class Spool:
                     file.seek(int(slots[stretch[0]]) * self._slot_bytes(layer))
                     file.write(np.ascontiguousarray(pixels[stretch]).data)
 
-    def read(self, layer: str, slots: NDArray[np.int64]) -> NDArray[Any]:
+    def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
         """Return the patches in ``slots``, shape (n, px, px); the file is mapped only while they are copied."""
         shape = (self.slots, self.patch_px, self.patch_px)
         return np.asarray(np.memmap(self._path(layer), self.layers[layer].stored, "r", shape=shape)[slots])

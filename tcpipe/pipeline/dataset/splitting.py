@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -15,6 +13,8 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_card import DatasetCard, KeptSplit
+from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.recipe import Recipe
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
 from tcpipe.splits.audit import HeldOut, audit_leakage
@@ -36,7 +36,7 @@ class Drawn:
     assigned: Assignment
     buffer_m: float
     audit: tuple[HeldOut, ...]
-    kept: Mapping[str, int] | None
+    kept: KeptSplit | None
     """Samples whose split is an earlier dataset's, and those of it that are gone; None where none was to be kept."""
 
 
@@ -100,7 +100,7 @@ def draw_splits(
     counts = None
     if kept is not None and earlier is not None:
         found = int((kept.split != "").sum())
-        counts = {"samples": found, "gone": earlier.num_rows - found}
+        counts = KeptSplit(found, earlier.num_rows - found)
     return Drawn(assigned, buffer_m, audit, counts)
 
 
@@ -130,14 +130,14 @@ def _kept(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignment:
     return Assignment(split, fold)
 
 
-def regions_to_json(regions: Regions) -> dict[str, Any]:
+def regions_to_json(regions: Regions) -> dict[str, PolygonGeometry]:
     """Return the regions as GeoJSON geometries by kind, as the card keeps them."""
-    kinds: Mapping[str, Any] = {
-        "train_test": regions.train_test,
-        "unseen": regions.unseen,
-        "exclude": regions.exclude,
+    kinds = {"train_test": regions.train_test, "unseen": regions.unseen, "exclude": regions.exclude}
+    return {
+        kind: PolygonGeometry(**shapely.geometry.mapping(area))
+        for kind, area in kinds.items()
+        if not shapely.is_empty(area)
     }
-    return {kind: shapely.geometry.mapping(area) for kind, area in kinds.items() if not shapely.is_empty(area)}
 
 
 def _in_plane(regions: Regions, grid: MapGrid, footprint_lonlat_deg: NDArray[np.float64]) -> Regions:
@@ -183,18 +183,18 @@ def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: ND
     )
 
 
-def empty_splits(card: Mapping[str, Any]) -> tuple[str, ...]:
+def empty_splits(card: DatasetCard) -> tuple[str, ...]:
     """Return a line for each split of a dataset that was asked for and holds no sample, by its card."""
-    counts, rules, found = card["splits"], card["split"], list[str]()
+    counts, rules, found = card.splits, card.split, list[str]()
     if not counts["train"]:
         found.append("no sample trains: too few lie inside the region; draw it larger")
-    if not counts["test"] and rules["test_fraction"] > 0:
-        one = {"run": "one run", "block": "one block"}.get(rules["holdout"], "too few samples")
+    if not counts["test"] and rules.test_fraction > 0:
+        one = {"run": "one run", "block": "one block"}.get(rules.holdout, "too few samples")
         found.append(
             f"no sample tests: all inside samples are {one}; try --holdout sample, or a smaller split.block_m, "
             "or want none with split.test_fraction = 0"
         )
-    if not counts["unseen"] and rules["region"] is not None:
+    if not counts["unseen"] and rules.region is not None:
         found.append(
             "no sample is unseen: all lie inside the region (--split), or near it; draw it smaller, or give none"
         )

@@ -55,7 +55,7 @@ def test_labels_are_power_and_velocity(path):
 def test_it_is_a_mapping_of_splits(path):
     dataset = open_dataset(path)
     assert list(dataset) == ["train", "test", "unseen", "buffer"]
-    assert sum(len(part) for part in dataset.values()) == dataset.card["samples"] == 448
+    assert sum(len(part) for part in dataset.values()) == dataset.card.samples == 448
     with pytest.raises(KeyError, match="no split 'validation'"):
         dataset["validation"]
 

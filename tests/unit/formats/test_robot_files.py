@@ -5,7 +5,8 @@ from importlib.resources import files
 import pytest
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.recipe_toml import commented_toml, parse_recipe, plain_recipe
+from tcpipe.formats.json_files import plain
+from tcpipe.formats.recipe_toml import commented_toml, parse_recipe
 from tcpipe.formats.robot_files import profiles_of, shipped_profiles
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC, PowerSource, Robot, fields_of
@@ -93,5 +94,5 @@ def test_a_robot_made_in_python_is_checked_where_a_recipe_takes_it():
 
 
 def test_a_recipe_without_tables_of_its_own_is_written_as_before_there_were_any():
-    assert not {"robots", "power_sources"} & set(plain_recipe(Recipe()))
-    assert plain_recipe(Recipe(robots={"mine": Robot()}))["robots"]["mine"]["width_m"] is None
+    assert not {"robots", "power_sources"} & set(plain(Recipe()))
+    assert plain(Recipe(robots={"mine": Robot()}))["robots"]["mine"]["width_m"] is None

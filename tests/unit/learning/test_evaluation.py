@@ -14,11 +14,12 @@ from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError, UsageError
 from tcpipe.learning.evaluation import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
+from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import load_model
 from tcpipe.learning.predictions import predicted_costs
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+from tcpipe.terrain.classes import PAPER_CLASSES
 
 pytest.importorskip("torch")
 pytest.importorskip("keras")
@@ -28,7 +29,8 @@ CONFIG = EvaluateConfig(draws=2, baselines=False)
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory):
-    training = {"config": {"epochs": 1, "width": 16}, "samples": {"fitted": 100, "held out": 20}}
+    config = FitConfig(epochs=1, width=16)
+    training = replace(CARD.training, config=config, samples={"fitted": 100, "held out": 20})
     return made_model(tmp_path_factory.mktemp("made") / "model", training=training)
 
 
@@ -111,7 +113,7 @@ def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch)
 
 def test_a_model_that_does_not_fit_is_told_every_reason(dataset, tmp_path):
     grass = replace(PAPER_CLASSES.classes[3], name="lawn")
-    classes = ClassTable((*PAPER_CLASSES.classes[:3], grass, *PAPER_CLASSES.classes[4:]))
+    classes = (*PAPER_CLASSES.classes[:3], grass, *PAPER_CLASSES.classes[4:])
     place = made_model(tmp_path / "other", classes=classes, chord_m=2.0, label_velocity="fused")
     with pytest.raises(ModelError) as told:
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
@@ -135,7 +137,7 @@ def test_a_network_of_energy_alone_is_no_model_to_evaluate(dataset, tmp_path):
 
 def test_a_card_that_does_not_say_how_it_was_trained(dataset, tmp_path):
     place = made_model(tmp_path / "made", training={})
-    with pytest.raises(ModelError, match="made: its card does not say how it was trained; train the model again"):
+    with pytest.raises(ModelError, match=r"training\.key is missing; remove the folder and train the model again"):
         run_evaluation(place, dataset, tmp_path / "evaluation", config=CONFIG)
 
 

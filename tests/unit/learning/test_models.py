@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def _refused(place, match):
 
 def test_it_predicts_the_same_in_any_company(place):
     model = load_model(place)
-    assert model.card == CARD
+    assert replace(model.card, checksums={}) == CARD
     patches = np.random.default_rng(3).random((300, 40, 40, 3), np.float32)
     whole = model.predict(patches)
     assert whole.shape == (300, 2)
@@ -70,7 +71,10 @@ def test_no_model_and_half_a_model(tmp_path, place):
     [
         ({"schema_version": 99}, "written by model schema 99, wanted 2; train the model again"),
         ({"kind": "tcpipe dataset"}, "not the card of a tcpipe model"),
-        ({"scale": None}, "model.json: incomplete"),
+        (
+            {"scale": None},
+            "model.json: is not what this version writes: scale: wanted a list, got null; remove the folder and",
+        ),
     ],
 )
 def test_another_card(tmp_path, change, match):

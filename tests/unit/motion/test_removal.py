@@ -13,11 +13,10 @@ def test_metres_are_summed_by_group_and_reason():
     tally = tally_m(group, reason, np.array([1.0, 2.0, 3.0, 4.0, 5.0]), shape=(3, 3))
     np.testing.assert_array_equal(tally, [[1, 2, 0], [0, 0, 0], [3, 0, 9]])
     first, last = named_groups(tally, ("grass", "mud", "paved"), REASONS)
-    assert first == Group("grass", 3.0, 1.0, {"gap": 2.0})
-    assert last == Group("paved", 12.0, 3.0, {"stuck": 9.0})
-    assert last.used_share == 0.25
+    assert first == Group("grass", 3.0, 1.0, {"gap": 2.0}, 1.0 / 3.0)
+    assert last == Group("paved", 12.0, 3.0, {"stuck": 9.0}, 0.25)
     assert main_reason(first) == "gap"
-    assert main_reason(Group("mud", 1.0, 1.0, {})) == ""
+    assert main_reason(Group("mud", 1.0, 1.0, {}, 1.0)) == ""
 
 
 def test_nothing_driven_gives_no_group():
@@ -26,7 +25,10 @@ def test_nothing_driven_gives_no_group():
 
 
 def groups(**used_of_driven):
-    return [Group(name, driven, used, {"gap": driven - used}) for name, (used, driven) in used_of_driven.items()]
+    return [
+        Group(name, driven, used, {"gap": driven - used}, used / driven)
+        for name, (used, driven) in used_of_driven.items()
+    ]
 
 
 @pytest.mark.parametrize(
@@ -65,9 +67,8 @@ def test_a_sure_but_small_difference_is_none():
     assert uneven(groups(grass=(32_000.0, 40_000.0), mud=(7_000.0, 10_000.0))) == []
 
 
-def test_half_a_metre_is_a_group_with_a_reason_and_nothing_has_no_share():
+def test_half_a_metre_is_a_group_with_a_reason_and_a_share_and_nothing_is_none():
     tally = tally_m(np.array([1, 1]), np.array([0, 2]), np.array([0.25, 0.25]), shape=(2, 3))
     np.testing.assert_array_equal(tally, [[0, 0, 0], [0.25, 0, 0.25]])
     (only,) = named_groups(tally, ("grass", "mud"), REASONS)
-    assert only == Group("mud", 0.5, 0.25, {"stuck": 0.25})
-    assert (only.used_share, Group("mud", 0.0, 0.0, {}).used_share) == (0.5, 0.0)
+    assert only == Group("mud", 0.5, 0.25, {"stuck": 0.25}, 0.5)

@@ -31,7 +31,7 @@ def store(tmp_path):
 
 def runs(store, tmp_path, **tags):
     build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tags=tags)
-    return [run["run_id"] for run in open_dataset(tmp_path / "out").card["runs"]]
+    return [run.run_id for run in open_dataset(tmp_path / "out").card.runs]
 
 
 def test_a_run_needs_all_of_the_tags(store, tmp_path):
@@ -59,12 +59,12 @@ def make_outdated(store, *run_ids):
 def test_runs_of_another_data_model_are_named(store, tmp_path):
     make_outdated(store, "a")
     assert runs(store, tmp_path) == ["b", "c"]
-    assert open_dataset(tmp_path / "out").card["problems"] == [
+    assert open_dataset(tmp_path / "out").card.problems == (
         (
             f"1 of 3 runs have no ingestion of data model {DATA_MODEL_VERSION} (they have 0.9): a; "
             "ingest their logs again: tcpipe ingest /logs/a.mcap"
-        )
-    ]
+        ),
+    )
     found = inspect(store.root, recipe=Recipe())
     assert (found["outdated"], found["unfinished"]) == ({"a": "0.9"}, [])
     with pytest.raises(

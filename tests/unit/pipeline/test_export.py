@@ -130,7 +130,7 @@ def test_a_log_that_has_changed_is_exported_again(tmp_path, log):
     export(log, tmp_path / "out")
     write_mcap(log, random_messages(2, count=30, types=TYPES))
     again = export(log, tmp_path / "out")
-    assert (again.status, {of.rows for of in again.topics}) == ("done", {30})
+    assert (again.status, {of.messages for of in again.topics}) == ("done", {30})
 
 
 def test_files_of_another_log_are_not_overwritten(tmp_path, log):

@@ -43,7 +43,7 @@ def build(store, **how):
 
 
 def runs(store):
-    return [run["run_id"] for run in open_dataset(store.root.parent / "out").card["runs"]]
+    return [run.run_id for run in open_dataset(store.root.parent / "out").card.runs]
 
 
 def edit(path, change):

@@ -94,8 +94,8 @@ def test_every_sample_lies_on_the_first_map_that_has_it_and_shows_the_world(stor
 def test_the_card_names_the_maps_in_their_order_and_a_second_call_does_nothing(store, tmp_path):
     build(store, tmp_path / "out", ["east", "west"])
     card = read_card(tmp_path / "out")
-    assert [entry["name"] for entry in card["maps"]] == ["east", "west"]
-    assert [entry["crs"] for entry in card["maps"]] == ["EPSG:31256", "EPSG:32633"]
+    assert [entry.name for entry in card.maps] == ["east", "west"]
+    assert [entry.crs for entry in card.maps] == ["EPSG:31256", "EPSG:32633"]
     assert build(store, tmp_path / "out", ["east", "west"]).status == "unchanged"
     assert build(store, tmp_path / "out", ["west", "east"]).status == "done"
 
@@ -123,7 +123,7 @@ def test_the_same_bytes_however_the_segments_are_cut_into_batches(store, tmp_pat
     build(store, tmp_path / "cut", ("west", "east"))
     monkeypatch.undo()
     build(store, tmp_path / "whole", ("west", "east"))
-    assert read_card(tmp_path / "cut")["checksums"] == read_card(tmp_path / "whole")["checksums"]
+    assert read_card(tmp_path / "cut").checksums == read_card(tmp_path / "whole").checksums
 
 
 def test_what_cannot_be_built_from_is_said_in_one_line(store, tmp_path):

@@ -64,4 +64,4 @@ def test_what_differs_is_refused_and_what_settles_it_does(store, tmp_path):
     ]
     build_dataset(tmp_path / "one", store=store.root, tags={"robot": "other"})
     build_dataset(tmp_path / "all", store=store.root, robot="generic")
-    assert [len(open_dataset(tmp_path / name).card["runs"]) for name in ("one", "all")] == [1, 3]
+    assert [len(open_dataset(tmp_path / name).card.runs) for name in ("one", "all")] == [1, 3]

@@ -121,10 +121,10 @@ def test_nav2_finds_a_scale_map_with_trees_that_are_lethal(made):
     assert cost[5, 20] == 100
     assert cost[12, 12] < 100
     assert cost[12, 4] > cost[12, 12]
-    scale = result.card["nav2_scale"]["energy"]
+    scale = result.card.nav2_scale["energy"]
     angle = np.radians(ANGLES_DEG)
     mean = energy_joule(4, (0.2 * np.cos(angle) + 0.1 * np.sin(angle)) * 0.9996).mean()
-    assert scale["lowest"] + cost[12, 12] / 99 * (scale["highest"] - scale["lowest"]) == pytest.approx(mean, rel=0.02)
+    assert scale.lowest + cost[12, 12] / 99 * (scale.highest - scale.lowest) == pytest.approx(mean, rel=0.02)
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ def test_an_interrupted_map_goes_on_where_it_was_and_ends_the_same(made, tmp_pat
     again = make_cost_map(going_on, source, tmp_path / "cost-map", step_m=1.0)
     asked = int(np.count_nonzero(~np.isnan(open_cost_map(again.path, again.card).velocity_mps)))
     assert sum(stopped.patches) + sum(going_on.patches) == asked
-    assert again.card["key"] == whole.card["key"]
+    assert again.card.key == whole.card.key
     for path in sorted(whole.path.iterdir()):
         assert (again.path / path.name).read_bytes() == path.read_bytes(), path.name
     assert [entry.name for entry in tmp_path.iterdir()] == ["cost-map"]
@@ -166,7 +166,7 @@ def test_a_second_call_does_nothing_and_another_step_replaces_it(tmp_path: Path)
     assert second.status == "unchanged"
     assert "nothing to do" in str(second)
     assert (out / "cost-map.json").stat().st_mtime_ns == before
-    assert make_cost_map(MODEL, source, out, step_m=3.0).card["grid"]["rows"] == 2
+    assert make_cost_map(MODEL, source, out, step_m=3.0).card.grid.rows == 2
     assert (
         cost_map_key(replace(MODEL, checksum="1" * 64), source, 3.0)
         != json.loads((out / "cost-map.json").read_text())["key"]

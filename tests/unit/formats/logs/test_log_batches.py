@@ -107,5 +107,5 @@ def test_export_writes_the_tables_row_group_by_row_group(tmp_path, monkeypatch):
     assert max(pq.read_metadata(of.path).num_row_groups for of in exported.topics) > 1
     for of in exported.topics:
         read = pq.read_table(of.path)
-        assert read.num_rows == of.rows == tables[of.topic].num_rows
+        assert read.num_rows == of.messages == tables[of.topic].num_rows
         assert json.dumps(read.to_pylist()) == json.dumps(tables[of.topic].to_pylist())

@@ -7,6 +7,7 @@ from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file,
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, MapError, RecipeError, RegionError, StoreError, UsageError
+from tcpipe.formats.dataset_card import KeptSplit
 from tcpipe.formats.recipe_toml import recipe_id
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
@@ -119,7 +120,7 @@ def test_one_drive_recorded_twice_counts_once(store, tmp_path):
     result = build(store, tmp_path)
     assert result.samples == 20
     assert "run b: all 20 segments lie when and where those of run a do: the same drive; used once" in result.warnings
-    assert [run["run_id"] for run in open_dataset(tmp_path / "out").card["runs"]] == ["a"]
+    assert [run.run_id for run in open_dataset(tmp_path / "out").card.runs] == ["a"]
 
 
 @pytest.mark.parametrize(("names", "skew_ns"), [(("a", "b"), 0), (("b", "a"), 300_000_000), (("a", "b"), -900_000_000)])
@@ -389,7 +390,7 @@ def test_a_kept_split_moves_nothing_whatever_the_rules_are_now(store, tmp_path, 
     assert {sample: now[sample] for sample in before} == before
     assert len(now) == 80
     assert {"unseen", "buffer"} <= {split for sample, (split, _) in now.items() if sample.startswith("c-")}
-    assert open_dataset(result.path).card["split"]["kept"] == {"samples": 40, "gone": 0}
+    assert open_dataset(result.path).card.split.kept == KeptSplit(40, 0)
 
 
 def test_a_split_to_keep_must_be_a_dataset(store, tmp_path):

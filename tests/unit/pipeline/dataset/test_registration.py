@@ -63,10 +63,10 @@ def test_a_run_whose_ground_lies_elsewhere_on_the_map_is_a_warning(built):
 
 def test_the_card_keeps_every_runs_registration(built):
     _, card = built
-    found = {entry["run_id"]: entry for entry in card["maps"][0]["registration"]}
+    found = {entry.run_id: entry for entry in card.maps[0].registration}
     assert sorted(found) == ["fits", "off"]  # the third is never sure enough of its place
-    assert found["fits"]["shift_xy_m"] == pytest.approx([0.0, 0.0], abs=0.03)
-    assert not found["fits"]["significant"]
-    assert found["off"]["shift_xy_m"] == pytest.approx([-1.5, 0.8], abs=0.03)
-    assert found["off"]["height_offset_m"] == pytest.approx(GEOID_M, abs=0.02)
-    assert found["off"]["misfit_m"] > 3.0 * found["off"]["shifted_misfit_m"]
+    assert found["fits"].shift_xy_m == pytest.approx([0.0, 0.0], abs=0.03)
+    assert not found["fits"].significant
+    assert found["off"].shift_xy_m == pytest.approx([-1.5, 0.8], abs=0.03)
+    assert found["off"].height_offset_m == pytest.approx(GEOID_M, abs=0.02)
+    assert found["off"].misfit_m > 3.0 * found["off"].shifted_misfit_m

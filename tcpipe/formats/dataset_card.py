@@ -1,0 +1,229 @@
+"""The card of a dataset, ``dataset.json``: everything needed to use it, to cite it, and to check it, as one tree of dataclasses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import NotRequired, TypedDict
+
+from tcpipe.balance.correlation import Correlation
+from tcpipe.balance.repeats import Floor
+from tcpipe.formats.geojson import PolygonGeometry
+from tcpipe.formats.layer_descriptions import Description
+from tcpipe.formats.seals import Checksum
+from tcpipe.motion.removal import Group
+from tcpipe.recipe import Recipe
+from tcpipe.splits.audit import HeldOut
+from tcpipe.splits.holdouts import Holdout
+from tcpipe.tables.findings import LEFT_OUT, EnergyBudget
+from tcpipe.terrain.classes import TerrainClass
+
+KIND = "tcpipe dataset"
+
+
+@dataclass(frozen=True, slots=True)
+class LabelColumns:
+    """Which columns of samples.parquet train, and which velocity that is."""
+
+    columns: tuple[str, ...]
+    velocity: str
+
+
+@dataclass(frozen=True, slots=True)
+class LabelStatistics:
+    """A label over train alone: what a normaliser may know, in the label's unit; null where nothing trains."""
+
+    count: int
+    mean: float | None
+    std: float | None
+    min: float | None
+    max: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class KeptSplit:
+    """Of an earlier dataset whose split was kept: samples that have it, and those that are gone."""
+
+    samples: int
+    gone: int
+
+
+@dataclass(frozen=True, slots=True)
+class SplitRules:
+    """How the split was drawn (the recipe's section, its buffer as it was used), and what the audit found."""
+
+    holdout: Holdout
+    test_fraction: float
+    block_m: float
+    buffer_m: float
+    folds: int
+    seed: int
+    region: Mapping[str, PolygonGeometry] | None
+    """By kind: train_test, unseen, exclude."""
+    audit: tuple[HeldOut, ...]
+    kept: KeptSplit | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class RunSource:
+    """A run that the dataset is made from."""
+
+    run_id: str
+    recipe_id: str
+    robot: str
+    logs: tuple[str, ...]
+    """Names of its log's files."""
+    sha256: str
+    """Of its log."""
+    segments_sha256: str | None = None
+    driven_m: float | None = None
+    tags: Mapping[str, str] | None = None
+    warnings: tuple[str, ...] = ()
+    energy_budget: EnergyBudget | None = None
+    samples: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class MapRegistration:
+    """How a map lies against a run's track (`tcpipe.terrain.registration`); no shift where the ground cannot tell one."""
+
+    run_id: str
+    points: int
+    shift_xy_m: tuple[float, float] | None
+    shift_std_m: float | None
+    significant: bool
+    height_offset_m: float
+    misfit_m: float
+    shifted_misfit_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class MapInputs:
+    """What a map was made from: the sha256 of each file of each role, and the CRS that was asked for."""
+
+    files: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    crs: str | None = None
+    categorical: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
+    ortho_bands: str | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True, slots=True)
+class MapSource:
+    """A map that the dataset was sampled from: where it lies and what it was made from."""
+
+    name: str
+    layers: tuple[str, ...]
+    crs: str
+    x_min_m: float
+    y_max_m: float
+    pitch_m: float
+    rows: int
+    cols: int
+    sha256: str | None = None
+    """Over the checksums of its files."""
+    sources: Mapping[str, str] | None = None
+    covered: Mapping[str, float] | None = None
+    height_min_m: float | None = None
+    height_max_m: float | None = None
+    class_share: Mapping[str, float] | None = None
+    class_shares: Mapping[str, Mapping[str, float]] | None = field(default=None, metadata=LEFT_OUT)
+    """By layer, of a user's own categorical ones."""
+    classes_from: str | None = None
+    inputs: MapInputs | None = None
+    warnings: tuple[str, ...] = ()
+    registration: tuple[MapRegistration, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Removal:
+    """Metres by class and by slope: driven, in samples, and removed by reason."""
+
+    by_class: tuple[Group, ...] = ()
+    by_slope: tuple[Group, ...] = ()
+
+
+CellRow = TypedDict(  # a dataclass has no field called class
+    "CellRow",
+    {
+        "class": str | None,
+        "class_id": int,
+        "slope": str,
+        "samples": Mapping[str, int],
+        "effective": float | None,
+        "effective_train": float | None,
+        "rare": bool,
+        "offered_m2": NotRequired[float],
+        "speed_mps": NotRequired[str],
+    },
+)
+"""Samples of one class and range of slope, by split, and how many independent ones they are worth; over all speeds what the maps offer."""
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """What the samples cover, how far neighbours are alike, and how well each label repeats itself."""
+
+    slope_edges_deg: tuple[float, ...]
+    speed_edges_mps: tuple[float, ...]
+    enough_effective: float
+    correlation: Mapping[str, Correlation | None]
+    by_class_and_slope: tuple[CellRow, ...]
+    cells: tuple[CellRow, ...]
+    repeatability: Mapping[str, Floor | None]
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """A Parquet file of patches: where it lies in the dataset, its split and rows."""
+
+    path: str
+    split: str
+    rows: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetCard:
+    """All of dataset.json but its seal."""
+
+    kind: str = KIND
+    data_model_version: str
+    tcpipe_version: str
+    inputs: str
+    """Hash of everything the dataset is made from; the same inputs make the same dataset."""
+    name: str
+    description: str
+    licence: str = ""
+    creator: str = ""
+    samples: int
+    robots: tuple[str, ...] = ()
+    splits: Mapping[str, int]
+    """Samples by split."""
+    folds_of_train: tuple[int, ...] = ()
+    terrain: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    """Samples by split and terrain name."""
+    label_statistics_of_train: Mapping[str, LabelStatistics] = field(default_factory=dict)
+    recipe: Recipe
+    format: str
+    """``zarr`` or ``parquet``."""
+    patch_m: float
+    patch_px: int
+    layers: Mapping[str, Description]
+    """By layer: its numpy type, what stands for no data, and its CF attributes (`tcpipe.formats.layer_descriptions`)."""
+    tensor: Mapping[str, str | tuple[str, ...]]
+    """``channels``, and by layer how what is stored becomes a channel from 0 to 1."""
+    classes: tuple[TerrainClass, ...]
+    label: LabelColumns
+    energy_budget: EnergyBudget | None = None
+    split: SplitRules
+    ledger_m: Mapping[str, float]
+    """Where every metre of the runs went [m]."""
+    removal: Removal
+    balance: Balance
+    runs: tuple[RunSource, ...]
+    maps: tuple[MapSource, ...]
+    problems: tuple[str, ...] = ()
+    """What is wrong with the choice of runs."""
+    warnings: tuple[str, ...]
+    shards: tuple[Shard, ...]
+    checksums: Mapping[str, Checksum]
+    """By path inside the dataset."""
