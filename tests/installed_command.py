@@ -30,7 +30,7 @@ def tcpipe(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = No
     """Run the command; nothing of the caller's TCPIPE_ environment reaches it."""
     clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")} | dict(env or {})
     command = [str(COMMAND), *map(str, arguments)]
-    if _ANEW:
+    if _ANEW or "PYTHONPATH" in (env or {}):  # which Python reads when it starts
         done = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, timeout=HANGS_S, check=False)
         return _as_promised(done)
     server = _server("learning" if arguments[0] in _LEARNING else "other")

@@ -10,6 +10,7 @@ from synthetic_store import box, region_file, small_store
 from tcpipe.dataset import open_dataset
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import DatasetConfig, Recipe
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 not_ours = pytest.mark.filterwarnings("ignore")
 """mlcroissant and the libraries under it warn of each other."""
@@ -70,7 +71,7 @@ def test_mlcroissant_reads_every_patch_of_the_shards(built):
 def test_the_croissant_document_says_where_patches_are_and_how_large(built):
     document = json.loads((built / "parquet" / "croissant.json").read_text())
     assert (document["license"], document["creator"]["name"]) == ("CC-BY-4.0", "somebody")
-    assert document["version"].startswith("1.0.0+")
+    assert document["version"].startswith(f"{DATA_MODEL_VERSION}.0+")
     samples, patches = document["recordSet"]
     assert [field["name"] for field in patches["field"]] == ["sample_id", "split", "ortho", "terrain", "height"]
     assert {field.get("arrayShape") for field in patches["field"][2:]} == {"1600"}

@@ -111,7 +111,9 @@ def test_two_robots_of_a_recipe_are_not_pooled_unasked(drive, tmp_path):
     store = Store(tmp_path / "store")
     with pytest.raises(DatasetError, match="runs of 2 robots \\(rover, scout\\)"):
         choose_runs(store, load_recipe(two), robot=None, tags={})
-    assert {run.robot for run in choose_runs(store, load_recipe(two), robot="rover", tags={}).runs} == {"rover"}
+    assert {run.manifest.robot for run in choose_runs(store, load_recipe(two), robot="rover", tags={}).runs} == {
+        "rover"
+    }
 
 
 def test_a_name_that_neither_the_recipe_nor_the_package_has(drive, tmp_path):
