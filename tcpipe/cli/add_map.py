@@ -34,12 +34,14 @@ from tcpipe.errors import UsageError
     "--layer",
     "layers",
     multiple=True,
+    type=ONE_OF_SEVERAL,
     metavar="NAME=FILE",
     help="Another raster of one band, as a layer NAME; repeat it for more layers.",
 )
 @click.option(
     "--categorical",
     multiple=True,
+    type=ONE_OF_SEVERAL,
     metavar="NAME[=FILE]",
     help="Layer NAME holds classes: those of FILE, like --classes, or as the raster itself names its values.",
 )
