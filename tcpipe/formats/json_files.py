@@ -9,6 +9,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from inspect import cleandoc
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -143,7 +144,11 @@ def _from_text(kind: type, text: str) -> Path:
 
 def schema_of(cls: type) -> str:
     """Return the JSON Schema of a dataclass as text: of what `to_json` writes of it, and `read_as` reads."""
-    return to_json({"$schema": DIALECT, **msgspec.json.schema(cls, schema_hook=lambda _: {"type": "string"})})
+    schema = msgspec.json.schema(cls, schema_hook=lambda _: {"type": "string"})
+    for of in (schema, *schema.get("$defs", {}).values()):
+        if "description" in of:  # a docstring, whose indentation Python 3.13 takes away when it compiles it
+            of["description"] = cleandoc(of["description"])
+    return to_json({"$schema": DIALECT, **schema})
 
 
 def digest(value: Any) -> str:
