@@ -3,18 +3,19 @@
 Every message has a log time (when the recorder received it); most have a header stamp (when it was measured). The header's rules where it
 is set and follows the log time, within 10 s, up to a constant offset; otherwise log time; topic by topic. A *lasting* step (> 0.5 s) of
 header minus log time opens a new clock epoch, common to all topics. Lasting means 10 s, or to the log's end: delays, bursts and single
-wrong stamps are no steps.
+wrong stamps are no steps. Where a simulation's clock is counted it rules, and no epoch is opened (`tcpipe.logs.simulated_clock`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.logs.simulated_clock import SimulatedClock, find_simulated_clock
 from tcpipe.tables.findings import ClockStep
 
 Ints = NDArray[np.int64]
@@ -30,9 +31,6 @@ LATE_NS = SECOND_NS
 APART_NS = SECOND_NS
 """Offsets closer than this are delays; topics further apart run on different clocks."""
 
-SIMULATED_NS = 10**9 * SECOND_NS
-"""Times before this (September 2001) are not the wall clock's: simulated time begins near 0."""
-
 _LASTING_NS = 10 * SECOND_NS
 _MOST_BACK = 0.2
 _TOGETHER_NS = 5 * SECOND_NS
@@ -42,6 +40,7 @@ _MOST_UNSET = 0.5
 _MOST_STRAY = 0.01
 _MOST_REPEATED = 0.2
 _NEIGHBOURS = 11
+_COUNTED = "it counts simulated time, which runs forward"
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,13 +76,31 @@ class Timeline:
     moved_s: tuple[float, ...] = ()
 
 
-def settle_clocks(topics: Mapping[str, TopicTimes]) -> tuple[dict[str, Timeline], list[ClockStep]]:
-    """Return each topic's timeline, and the clock steps that divide them into epochs.
+@dataclass(frozen=True, slots=True)
+class Settled:
+    """Each topic's timeline, the clock steps that divide them into epochs, and the simulation's clock where that rules."""
+
+    timelines: dict[str, Timeline]
+    steps: list[ClockStep]
+    simulated: SimulatedClock | None = None
+
+
+def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> Settled:
+    """Return each topic's timeline, and what the clocks did.
 
     Parameters
     ----------
     topics : times of every topic that plays a role, by topic.
+    clock_published : whether the log holds a /clock topic with messages.
     """
+    stamped = {
+        name: (of.log_time_ns, of.header_ns)
+        for name, of in topics.items()
+        if of.header_ns is not None and of.prefer != "log"
+    }
+    simulated = find_simulated_clock(stamped, published=clock_published)
+    if simulated is not None:
+        return Settled({name: _simulated(name, times, simulated) for name, times in topics.items()}, [], simulated)
     steps_of = {name: _steps(times) for name, times in topics.items()}
     reasons = {name: _why_not_header(times, steps_of[name]) for name, times in topics.items()}
     # A header that does not rule has no say about the others' clock either.
@@ -94,26 +111,36 @@ def settle_clocks(topics: Mapping[str, TopicTimes]) -> tuple[dict[str, Timeline]
         for name, times in topics.items()
     }
     reference = [_reference_offset(drafts, epoch) for epoch in range(len(steps) + 1)]
-    return {name: _timeline(topics[name], draft, reference) for name, draft in drafts.items()}, steps
+    moves = {name: _moves(topics[name], draft, reference) for name, draft in drafts.items()}
+    return Settled({name: _timeline(topics[name], draft, moves[name]) for name, draft in drafts.items()}, steps)
 
 
-def is_simulated(log_time_ns: Ints, header_ns: Ints | None) -> bool:
-    """Return whether headers count simulated time while the log counts the wall clock's; times [ns], shape (N,)."""
-    known = np.zeros(0, np.int64) if header_ns is None else header_ns[header_ns > 0]
-    return bool(len(known) and np.median(known) < SIMULATED_NS < np.median(log_time_ns))
+def _simulated(name: str, times: TopicTimes, clock: SimulatedClock) -> Timeline:
+    """Return the timeline of a topic in a simulation: by its header, or by what the clock told when it was received."""
+    known, epoch = _is_set(times), np.zeros(len(times.log_time_ns), np.int64)
+    median, every = _median_offset(times, known), np.ones(len(epoch), bool)
+    if times.prefer == "header" and times.header_ns is not None:
+        draft = _Draft("header", "the recipe says so", times.header_ns, known, epoch, {}, median, 0)
+        return _timeline(times, draft, [0])
+    told = clock.at(times.log_time_ns)
+    why = _why_not_simulated(name, times, clock)
+    if why is None and times.header_ns is not None:
+        stamps = np.where(known, times.header_ns, told)
+        draft = _Draft("header", _COUNTED, stamps, every, epoch, {}, median, int(np.count_nonzero(~known)))
+        return _timeline(times, draft, [0])
+    draft = _Draft("log", f"{why}; brought to the simulation's clock", told, every, epoch, {}, median, 0)
+    return replace(_timeline(times, draft, [0]), moved_s=(float(np.median(told - times.log_time_ns)) / SECOND_NS,))
 
 
-def about_simulated_time(log_time_ns: Ints, header_ns: Ints | None, ruling: Literal["header", "log"]) -> str | None:
-    """Return what a topic's durations mean where one of its clocks is simulated, None where none is; times [ns], shape (N,)."""
-    if is_simulated(log_time_ns, header_ns):
-        whose = "of the simulation (header)" if ruling == "header" else "of the wall clock (log time)"
-        return (
-            f"its headers count simulated time, the log the wall clock's: durations are those {whose}; if the simulation did not run "
-            "in real time, settle it in the recipe under [read.time]"
-        )
-    if ruling == "log" and len(log_time_ns) and np.median(log_time_ns) < SIMULATED_NS:
-        return "log time rules, and it is simulated: durations are those of the simulation"
-    return None
+def _why_not_simulated(name: str, times: TopicTimes, clock: SimulatedClock) -> str | None:
+    """Return why a topic's header does not rule in a simulation, or None where it does."""
+    if times.prefer == "log":
+        return "the recipe says so"
+    if name not in clock.topics:
+        return "its messages have no header stamp that counts simulated time"
+    share = _repeated_share(times)
+    repeats = f"{100 * share:.0f} % of its messages repeat the header stamp before with other content"
+    return repeats if share > _MOST_REPEATED else None
 
 
 def _is_set(times: TopicTimes) -> Mask:
@@ -296,9 +323,13 @@ def _reference_offset(drafts: Mapping[str, _Draft], epoch: int) -> int:
     return best[len(best) // 2]
 
 
-def _timeline(times: TopicTimes, draft: _Draft, reference: Sequence[int]) -> Timeline:
+def _moves(times: TopicTimes, draft: _Draft, reference: Sequence[int]) -> list[int]:
+    """Return what brings a topic to the clock of the others [ns], by epoch."""
     apart = [target - draft.offset_ns.get(epoch, 0) for epoch, target in enumerate(reference)]
-    moves = [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in apart]
+    return [move if abs(move) > APART_NS and times.prefer != "header" else 0 for move in apart]
+
+
+def _timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Timeline:
     stamps = draft.stamp_ns + np.array(moves, np.int64)[draft.epoch] + times.offset_ns
     late = _lateness(stamps, draft.epoch, draft.usable)
     keep = draft.usable & (late < LATE_NS)

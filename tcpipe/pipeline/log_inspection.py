@@ -7,8 +7,9 @@ from typing import Any
 
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.robot_files import profiles_of
-from tcpipe.logs.clocks import SIMULATED_NS, is_simulated, settle_clocks
+from tcpipe.logs.clocks import settle_clocks
 from tcpipe.logs.roles import assign_roles
+from tcpipe.logs.simulated_clock import CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic
 from tcpipe.pipeline.log_stamps import TopicStamps
 from tcpipe.recipe import Recipe
@@ -74,8 +75,11 @@ def _read(log: Log) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
     facts = {name: stamps.facts() for name, stamps in found.items()}
     times = {name: stamps.topic_times() for name, stamps in found.items()}
     clocks = {name: of for name, of in times.items() if of.header_ns is not None and len(of.log_time_ns)}
-    timelines, steps = settle_clocks(clocks)
-    for name, timeline in timelines.items():
+    published = any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values())
+    settled = settle_clocks(clocks, clock_published=published)
+    clock = settled.simulated
+    counting = clock.topics if clock is not None and clock.remark() is not None else frozenset()
+    for name, timeline in settled.timelines.items():
         wrong = timeline.notes.get("stamps_replaced", 0) * found[name].every - facts[name]["zero_stamps"]
         facts[name] |= {
             "time": timeline.source,
@@ -83,12 +87,13 @@ def _read(log: Log) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
             "header_minus_log_s": timeline.offset_s,
             "moved_s": [moved for moved in timeline.moved_s if moved],
             "wrong_stamps": max(wrong, 0),
-            "simulated_time": is_simulated(clocks[name].log_time_ns, clocks[name].header_ns),
+            "simulated_time": name in counting,
         }
     return facts, {
-        "clock_epochs": len(steps) + 1,
+        "clock_epochs": len(settled.steps) + 1,
         "clock_steps": [
-            {"log_time_ns": step.log_time_ns, "step_s": step.step_s, "topics": list(step.topics)} for step in steps
+            {"log_time_ns": step.log_time_ns, "step_s": step.step_s, "topics": list(step.topics)}
+            for step in settled.steps
         ],
     }
 
@@ -101,9 +106,7 @@ def _simulated(topics: Iterable[Topic]) -> list[str]:
     if starts_ns and max(starts_ns) < SIMULATED_NS:
         said.append(f"the log's own times are simulated: they begin {min(starts_ns) / 1e9:.3f} s after 0")
     said += [
-        f"{topic.name} publishes simulated time ({topic.type_name})"
-        for topic in listed
-        if topic.type_name == "rosgraph_msgs/msg/Clock"
+        f"{topic.name} publishes simulated time ({topic.type_name})" for topic in listed if topic.type_name == CLOCK
     ]
     return said
 

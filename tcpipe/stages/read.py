@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import RoleError
 from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
 from tcpipe.logs.roles import MOTION_ROLES, assign_roles
+from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots.profiles import Profiles
@@ -49,9 +50,11 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     tables = log.tables([*played, *assignment.static_transforms])
     every, power, unread = read_sources(tables, log.topics, assignment, config, known=known)
     # 3. Every stamp on one clock, every epoch common to all.
-    timelines, steps = settle_clocks(
-        {source.topic: _times(source, config) for source in every if len(source.readings.row)}
+    clocks = settle_clocks(
+        {source.topic: _times(source, config) for source in every if len(source.readings.row)},
+        clock_published=any(topic.type_name == CLOCK and topic.message_count for topic in topics),
     )
+    timelines = clocks.timelines
     # 4. One checked table a role, and where its sensor sits.
     sources = [source for source in every if source.topic in timelines]
     streams: dict[str, pa.Table] = {
@@ -59,7 +62,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     }
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
-    findings = read_findings(assignment, every, timelines, steps, power=power, sensors=sensors, offset_s=offset_s)
+    findings = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     findings = replace(findings, warnings=(*findings.warnings, *unread, *unplaced))
     if not any(role in streams for role in MOTION_ROLES):
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry and gnss have no usable row"

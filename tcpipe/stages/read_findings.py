@@ -6,12 +6,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from tcpipe.logs.clocks import Timeline, about_simulated_time
+from tcpipe.logs.clocks import Settled, Timeline
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.findings import (
-    ClockStep,
     Findings,
     PowerSign,
     RobotChoice,
@@ -28,15 +27,16 @@ _MANY_DROPPED = 0.01
 def read_findings(
     assignment: RoleAssignment,
     sources: Sequence[TopicReadings],
-    timelines: Mapping[str, Timeline],
-    steps: Sequence[ClockStep],
+    clocks: Settled,
     *,
     power: PowerReadings,
     sensors: Mapping[str, Sensor],
     offset_s: Mapping[str, float],
 ) -> Findings[RunFacts]:
     """Return the warnings and facts of a read log; ``offset_s`` [s] is what the recipe adds to a role's stamps."""
-    warnings = [*assignment.warnings, *power.warnings]
+    timelines, steps = clocks.timelines, clocks.steps
+    simulated = clocks.simulated.remark() if clocks.simulated else None
+    warnings = [*assignment.warnings, *([simulated] if simulated else []), *power.warnings]
     for source in sources:
         warnings += _warnings(source, timelines.get(source.topic))
     warnings += [
@@ -69,8 +69,6 @@ def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]
         yield lost + (": the track lies in a local frame and cannot be placed on a map" if nowhere else "")
     if timeline is None:
         return
-    if simulated := about_simulated_time(source.readings.log_time_ns, source.readings.header_ns, timeline.source):
-        yield f"{name}: {simulated}"
     if timeline.source == "log" and source.readings.header_ns is not None:
         yield f"{name}: log time rules, since {timeline.why}"
     if timeline.notes.get("stamps_replaced"):

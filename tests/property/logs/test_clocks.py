@@ -32,9 +32,10 @@ def topic_times(draw) -> TopicTimes:
 
 
 @settings(max_examples=200, deadline=None)
-@given(st.dictionaries(st.sampled_from("abc"), topic_times(), min_size=1))
-def test_rows_are_ordered_unique_and_accounted_for(topics: dict[str, TopicTimes]) -> None:
-    found, steps = settle_clocks(topics)
+@given(topics=st.dictionaries(st.sampled_from("abc"), topic_times(), min_size=1), published=st.booleans())
+def test_rows_are_ordered_unique_and_accounted_for(*, topics: dict[str, TopicTimes], published: bool) -> None:
+    settled = settle_clocks(topics, clock_published=published)
+    found, steps = settled.timelines, settled.steps
     assert set(found) == set(topics)
     assert all(later.log_time_ns >= step.log_time_ns for step, later in itertools.pairwise(steps))
     for name, timeline in found.items():
@@ -57,7 +58,7 @@ def test_stamps_shuffled_within_a_second_come_back_in_order(order: np.ndarray, s
     stamps = BASE + np.arange(40) * step_ms * 1_000_000  # less than a second in all
     arrived = stamps[order]
     log = BASE + S + np.arange(40) * 1_000_000
-    found, _ = settle_clocks({"t": TopicTimes(log, arrived, np.arange(40.0)[:, None])})
+    found = settle_clocks({"t": TopicTimes(log, arrived, np.arange(40.0)[:, None])}).timelines
     np.testing.assert_array_equal(found["t"].stamp_ns, stamps)
     np.testing.assert_array_equal(order[found["t"].row], np.arange(40))
 
@@ -74,7 +75,8 @@ def test_a_step_is_found_where_it_is_whatever_the_jitter(step_ms: int, at_s: int
     jitter = np.random.default_rng(seed).integers(-40_000_000, 0, len(log))
     after = log >= BASE + at_s * S
     header = log + jitter + np.where(after, step_ms * 1_000_000, 0)
-    found, steps = settle_clocks({"t": TopicTimes(log, header, np.arange(len(log), dtype=float)[:, None])})
+    settled = settle_clocks({"t": TopicTimes(log, header, np.arange(len(log), dtype=float)[:, None])})
+    found, steps = settled.timelines, settled.steps
     assert len(steps) == 1
     assert abs(steps[0].step_s - step_ms / 1000) < 0.1
     np.testing.assert_array_equal(found["t"].epoch, after.astype(int))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import Timeline, TopicTimes, about_simulated_time, settle_clocks
+from tcpipe.logs.clocks import Timeline, TopicTimes, settle_clocks
 
 S = 1_000_000_000
 START = 1_700_000_000 * S
@@ -19,7 +19,8 @@ def times(log: np.ndarray, header: np.ndarray | None, **options) -> TopicTimes:
 
 
 def settle(**topics: TopicTimes):
-    return settle_clocks(topics)
+    found = settle_clocks(topics)
+    return found.timelines, found.steps
 
 
 def one(topic: TopicTimes) -> tuple[Timeline, int]:
@@ -200,20 +201,47 @@ def test_a_header_that_does_not_rule_opens_no_epoch() -> None:
     assert (found["bad"].source, found["good"].source) == ("log", "header")
 
 
-@pytest.mark.parametrize(
-    ("log_s", "header_s", "ruling", "said"),
-    [
-        (1_700_000_000, 5, "header", "durations are those of the simulation (header)"),
-        (1_700_000_000, 5, "log", "durations are those of the wall clock (log time)"),
-        (5, None, "log", "log time rules, and it is simulated"),
-        (5, 1_700_000_000, "header", None),
-        (1_700_000_000, 1_700_000_000, "header", None),
-        (1_700_000_000, 0, "log", None),
-        (1_700_000_000, None, "log", None),
-    ],
-)
-def test_simulated_time_is_told_from_the_wall_clock(log_s, header_s, ruling, said):
-    log_ns = log_s * 10**9 + np.arange(100) * 10**7
-    header_ns = None if header_s is None else np.where(header_s, header_s * 10**9 + np.arange(100) * 10**7, 0)
-    found = about_simulated_time(log_ns, header_ns, ruling)
-    assert found is None if said is None else said in found
+@pytest.mark.parametrize("rate", [0.34, 3.0])
+def test_in_a_simulation_the_headers_rule_at_whatever_rate_it_runs(rate):
+    """Two minutes of the log are 41 s, or 360 s, of the simulation, which pauses for 20 s of the log; no epoch begins."""
+    log = log_times(duration_s=120.0)
+    wall_s = (log - START) / S
+    running_s = wall_s - np.clip(wall_s - 60.0, 0.0, 20.0)
+    simulated = np.round((5.0 + rate * running_s) * S).astype(np.int64)
+    unset = np.where(np.arange(len(log)) < 4, 0, simulated)
+    found, steps = settle(
+        odom=times(log, simulated), imu=times(log + 1_000_000, unset), wall=times(log, log), command=times(log, None)
+    )
+    assert steps == []
+    assert [found[name].source for name in ("odom", "imu", "wall", "command")] == ["header", "header", "log", "log"]
+    np.testing.assert_array_equal(found["odom"].stamp_ns, np.unique(simulated))
+    for name in ("wall", "command"):
+        assert len(found[name].row) == len(log)
+        assert (
+            abs(found[name].stamp_ns - simulated).max() <= rate * 0.05 * S + 1
+        )  # what the clock did within one period
+    assert found["imu"].notes["stamps_replaced"] == 4
+    assert abs(found["imu"].stamp_ns[:4] - simulated[:4]).max() < 0.01 * S
+
+
+def test_a_clock_topic_makes_late_times_simulated_too():
+    log = log_times(duration_s=120.0)
+    slow = log - (log - START) // 2
+    topics = {"odom": times(log, slow)}
+    assert settle_clocks(topics).timelines["odom"].source == "log"
+    found = settle_clocks(topics, clock_published=True)
+    assert found.timelines["odom"].source == "header"
+    assert "ran at 0.5 of the log's rate" in found.simulated.remark()
+
+
+def test_a_simulation_that_is_reset_or_a_board_that_counts_from_its_start_is_no_clock_of_the_log():
+    log = log_times()
+    again = 10 * S + (log - START) % (30 * S)
+    assert settle_clocks({"odom": times(log, again)}).simulated is None
+    uptime = 10 * S + (log - START)
+    assert settle_clocks({"imu": times(log, uptime), "gnss": times(log, log)}).simulated is None
+
+
+def test_a_log_on_the_clock_of_its_simulation_has_nothing_to_say():
+    log = log_times() - START + 47 * S
+    assert settle_clocks({"odom": times(log, log - 1_000_000)}).simulated.remark() is None
