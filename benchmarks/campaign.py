@@ -25,9 +25,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from campaign_drives import FIRST_SEED, Outcome, outcome_of, simulated
 from campaign_faults import Cell, cells
-from campaign_figures import Result, figures_of, page, row
+from campaign_figures import Result, figures_of, map_figures, page, row
+from campaign_map import NAME as MAP
+from campaign_map import MapResult, map_in_feet
 
-LENGTH_M, QUICK_LENGTH_M = 170.0, 60.0
+LENGTH_M, QUICK_LENGTH_M = 170.0, 120.0
 
 
 def made(cell: Cell, seed: int, *, length_m: float) -> Result:
@@ -43,16 +45,34 @@ def made(cell: Cell, seed: int, *, length_m: float) -> Result:
 
 def kept(out: Path, cell: Cell, seed: int, *, length_m: float) -> Result:
     """Return what is on disk of a cell, made where it is not."""
-    path = out / "cells" / re.sub(r"[^\w.]+", "_", cell.name) / f"{seed}_{length_m:g}.json"
+    path = _place(out, cell.name, f"{seed}_{length_m:g}")
     if path.exists():
         known = json.loads(path.read_text())
         return Result(known["seed"], Outcome(**known["outcome"]), known["oracle"])
     result = made(cell, seed, length_m=length_m)
+    _keep(path, asdict(result))
+    return result
+
+
+def kept_map(out: Path) -> MapResult:
+    """Return the result of the map's cell, made where it is not on disk."""
+    path = _place(out, MAP, "1")
+    if path.exists():
+        return MapResult(**json.loads(path.read_text()))
+    result = map_in_feet()
+    _keep(path, asdict(result))
+    return result
+
+
+def _place(out: Path, cell: str, name: str) -> Path:
+    return out / "cells" / re.sub(r"[^\w.]+", "_", cell) / f"{name}.json"
+
+
+def _keep(path: Path, result: dict[str, object]) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     half = path.with_suffix(".half")
-    half.write_text(json.dumps(asdict(result)))
+    half.write_text(json.dumps(result))
     half.rename(path)
-    return result
 
 
 def chosen(pattern: str) -> list[Cell]:
@@ -81,17 +101,20 @@ def main() -> None:
     parser.add_argument("--cells", default="", metavar="PATTERN", help="a regular expression that names of cells hold")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=FIRST_SEED)
-    parser.add_argument("--quick", action="store_true", help="drives of a minute and a half, one seed")
+    parser.add_argument("--quick", action="store_true", help="shorter drives, one seed")
     parser.add_argument("--list", action="store_true", help="only name the cells")
     given = parser.parse_args()
     wanted = chosen(given.cells)
-    if given.list or given.out is None or not wanted:
-        print("\n".join(cell.name for cell in wanted) or f"no cell is called {given.cells!r}; --list names them")
+    names = [*(cell.name for cell in wanted), *[MAP] * bool(re.search(given.cells, MAP))]
+    if given.list or given.out is None or not names:
+        print("\n".join(names) or f"no cell is called {given.cells!r}; --list names them")
         sys.exit(0 if given.list else 2)
     seeds = range(given.first_seed, given.first_seed + (1 if given.quick else given.seeds))
     found = results(given.out, wanted, seeds, length_m=QUICK_LENGTH_M if given.quick else LENGTH_M)
     clean = next(cells()).fault
     figures = [figures_of(cell, found[cell.name], found[replace(cell, fault=clean).name]) for cell in wanted]
+    if MAP in names:
+        figures.append(map_figures(kept_map(given.out)))
     (given.out / "campaign.json").write_text(json.dumps([asdict(figure) for figure in figures], indent=1))
     (given.out / "campaign.md").write_text(page(figures))
     print("\n".join(row(figure) for figure in figures))

@@ -243,9 +243,11 @@ def _few_rows(m: MessageStream, rows: np.ndarray) -> MessageStream:
 
 
 def _three_messages_beside(messages: Messages, _: Drive) -> Messages:
-    """Give the wheels a name that tells little, and three messages the name that tells most."""
-    found = [replace(m, topic="/a200_0000/odom") if m.topic == _TOPICS["wheels"] else m for m in messages]
-    return [*found, *(_few_rows(m, np.arange(3)) for m in messages if m.topic == _TOPICS["wheels"])]
+    """Give the wheels a name that tells little, and three messages, over the whole log, the name that tells most."""
+    wheels = [m for m in messages if m.topic == _TOPICS["wheels"]]
+    others = [m for m in messages if m.topic != _TOPICS["wheels"]]
+    few = [_few_rows(m, np.array([0, m.log_time_ns.size // 2, m.log_time_ns.size - 1])) for m in wheels]
+    return [*others, *few, *(replace(m, topic="/a200_0000/odom") for m in wheels)]
 
 
 def _five_seconds(messages: Messages, drive: Drive) -> Messages:

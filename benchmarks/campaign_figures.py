@@ -9,7 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from campaign_drives import QUANTITIES, Outcome, bit_names
-from campaign_faults import Cell
+from campaign_faults import SETS, Cell
+from campaign_map import NAME, MapResult
 
 from tcpipe.tables.bits import Quality
 
@@ -134,6 +135,12 @@ def figures_of(cell: Cell, results: Sequence[Result], clean: Sequence[Result]) -
     return made
 
 
+def map_figures(result: MapResult) -> Figures:
+    """Return the figures of the map's cell: what was said, and the verdict."""
+    said = [_plain(line) for line in result.said]
+    return Figures(NAME, 1, {}, refused=int(result.refused), said=said, failures=result.failures)
+
+
 def _measure(made: Figures, pool: _Pool, sure: np.ndarray) -> None:
     for name in QUANTITIES:
         rows = sure & np.isfinite(pool.error[name]) & np.isfinite(pool.claimed[name])
@@ -180,13 +187,14 @@ def _failures(made: Figures, cell: Cell, outcomes: Sequence[Outcome]) -> list[st
             found.append(f"{name} {beyond:.0%} beyond 2 sigma")
     found += [f"{name} sigma {w:.1f} RMS" for name, w in made.width.items() if w > _WIDEST]
     if cell.fault.name == "clean":
-        found += _uncalibrated(made)
+        found += _uncalibrated(made) if len(SETS[cell.sensors]) <= 1 else []
         if made.doubted > _MOST_DOUBT:
             found.append(f"{made.doubted:.0%} doubted")
     elif made.kept_good < _FEWEST_KEPT and made.good >= 0.5:  # else most is rightly doubted
         found.append(f"{made.kept_good:.0%} of good metres kept")
-    missing = [o for o in outcomes if cell.fault.said and not re.search(cell.fault.said, "\n".join(o.said).lower())]
-    if missing:
+    harmed = bool(found) or made.refused > 0 or made.doubted > _MOST_DOUBT
+    missing = [o for o in outcomes if not re.search(cell.fault.said, "\n".join(o.said).lower())]
+    if harmed and missing:
         found.append(f"nothing said in {len(missing)} of {made.seeds}")
     return found
 

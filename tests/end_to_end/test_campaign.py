@@ -1,0 +1,79 @@
+"""A quick part of the campaign (docs/explanation/campaign.md): no label is sure and wrong, whatever is wrong with the log."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+import campaign
+from campaign_drives import FIRST_SEED, Fault, outcome_of, simulated
+from campaign_faults import FAULTS, Cell, cells
+from campaign_figures import LABELS, Figures, Result, figures_of
+
+LENGTH_M = campaign.QUICK_LENGTH_M
+
+
+@pytest.fixture(scope="session")
+def clean() -> Result:
+    """Return what all sensors without a fault give on a short drive."""
+    return campaign.made(Cell("all", 10.0, FAULTS["clean"]), FIRST_SEED, length_m=LENGTH_M)
+
+
+def figures(cell: Cell, clean: Result) -> Figures:
+    return figures_of(cell, [campaign.made(cell, FIRST_SEED, length_m=LENGTH_M)], [clean])
+
+
+def test_labels_of_a_clean_log_are_true_and_not_doubted(clean):
+    found = figures_of(Cell("all", 10.0, FAULTS["clean"]), [clean], [clean])
+    assert found.ladder["labelled"] > 0.8 * found.ladder["true"]
+    assert found.doubted <= 0.02
+    for name in LABELS:
+        assert found.inside[name][2].value > 0.9
+
+
+@pytest.mark.parametrize("name", ["GNSS 0.2 s late", "wrong fix", "metres, none claimed"])
+def test_no_label_is_sure_and_wrong(name, clean):
+    """Of the labels that no bit doubts, few lie beyond two deviations."""
+    found = figures(Cell("all", 10.0, FAULTS[name]), clean)
+    assert not found.traces
+    for label in LABELS:
+        assert 1.0 - found.inside[label][2].value <= 0.1 if label in found.inside else found.doubted > 0.5
+
+
+@pytest.mark.parametrize("name", ["5 s", "never moves", "GNSS covariance NaN"])
+def test_odd_logs_end_in_words(name):
+    fault = FAULTS[name]
+    found = outcome_of(simulated(fault.route, FIRST_SEED, LENGTH_M), Cell("all", 10.0, fault).fitted, fault)
+    assert not found.trace
+    assert found.bits or found.said
+
+
+def test_a_label_that_is_sure_and_wrong_is_found(clean):
+    """The campaign itself: deviations that are a tenth of what they were, or doubt of everything, fail."""
+    sure = replace_claimed(clean, 0.1)
+    cell = Cell("all", 10.0, Fault("made up"))
+    assert any("beyond 2 sigma" in line for line in figures_of(cell, [sure], [clean]).failures)
+    wide = replace_claimed(clean, 10.0)
+    assert any("RMS" in line for line in figures_of(cell, [wide], [clean]).failures)
+    doubted = Result(0, replace(clean.outcome, bits=[1 << 8] * len(clean.outcome.bits)))
+    assert figures_of(cell, [doubted], [clean]).failures == ["0% of good metres kept"]
+    refused = Result(0, replace(clean.outcome, bits=[], start_s=[], placed=[], error=empty(), claimed=empty()), 40)
+    assert figures_of(cell, [refused], [clean]).failures == ["1 of 1 runs refused needlessly"]
+
+
+def replace_claimed(result: Result, factor: float) -> Result:
+    claimed = {name: (factor * np.array(values)).tolist() for name, values in result.outcome.claimed.items()}
+    return Result(0, replace(result.outcome, claimed=claimed))
+
+
+def empty():
+    return {name: [] for name in (*LABELS, "start")}
+
+
+def test_cells_are_many_and_named_once():
+    names = [cell.name for cell in cells()]
+    assert len(names) == len(set(names)) >= 80
