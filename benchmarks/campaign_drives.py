@@ -71,7 +71,8 @@ class Fault:
     """What is wrong with a log, as what it changes on the way from the robot to the log; a new fault is one of these.
 
     ``sensors`` changes the sensors as they really are, ``told`` what the log says of them (places, variances), ``readings`` what
-    they measured, ``messages`` what was recorded; ``route`` names the drive, ``true_ns`` leads from the track's time to the truth's.
+    they measured, ``messages`` what was recorded; ``route`` names the drive, ``recorder`` what records it, ``true_ns`` leads from the
+    track's time to the truth's.
     """
 
     name: str
@@ -84,6 +85,9 @@ class Fault:
     may_refuse: bool = False
     """Whether a run without a segment is right: no sensor is left that could tell who is wrong, or nothing is to be labelled."""
     route: str = "hills"
+    recorder: Recorder = HUSKY
+    calibrated: bool = False
+    """Whether nothing is wrong at all: then deviations are to be as large as errors, and bits rare."""
     sensors: Callable[[Sensors], Sensors] = lambda sensors: sensors
     told: Callable[[Sensors], Sensors] = lambda sensors: sensors
     readings: Callable[[Readings, Drive], Readings] = lambda readings, _: readings
@@ -98,7 +102,6 @@ class Fault:
         return Fault(
             f"{self.name} and {other.name}", (*self.at_fault, *other.at_fault), window_s,
             may_refuse=self.may_refuse or other.may_refuse,
-            route=max(self.route, other.route, key=lambda route: route != "hills"),
             sensors=lambda sensors: other.sensors(self.sensors(sensors)),
             told=lambda sensors: other.told(self.told(sensors)),
             readings=lambda readings, drive: other.readings(self.readings(readings, drive), drive),
@@ -178,10 +181,11 @@ def _fields(type_name: str) -> tuple[str, ...]:
 
 def log_of(drive: Drive, sensors: Sensors, fault: Fault) -> MemoryLog:
     """Return what is recorded of a drive where a fault is."""
-    real = HUSKY.heard(fault.sensors(sensors)).mounted(WHOLE)
+    real = fault.recorder.heard(fault.sensors(sensors)).mounted(WHOLE)
     readings = fault.readings(record(drive.truth, drive.site, real, WHOLE, drive.noise), drive)
-    messages = streams(readings, fault.told(real), HUSKY, geoid_m=drive.site.geoid_m)
-    return MemoryLog(fault.messages(messages, drive))
+    messages = streams(readings, fault.told(real), fault.recorder, geoid_m=drive.site.geoid_m)
+    recorded = fault.messages(messages, drive)
+    return MemoryLog([m for m in recorded if m.constants.get("transforms") != []])
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from campaign_drives import Drive, Fault, Messages, Readings
+from campaign_drives import HUSKY, Drive, Fault, Messages, Readings
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation.messages import TOPICS
+from tcpipe.simulation.messages import TOPICS, Recorder
 from tcpipe.simulation.sensors import Gnss, Mounting, Power, Reading, Sensors
 
 MINUTE_S = (90.0, 150.0)
@@ -279,6 +279,10 @@ def _gnss(**changes: Any) -> Callable[[Sensors], Sensors]:
     return lambda sensors: sensors if sensors.gnss is None else replace(sensors, gnss=replace(sensors.gnss, **changes))
 
 
+def _power(rate_hz: float) -> Callable[[Sensors], Sensors]:
+    return lambda sensors: replace(sensors, power=Power(rate_hz=rate_hz))
+
+
 _DEG = float(np.radians(1.0))
 _NAN, _BAD = float("nan"), np.diag([-0.01, -1.0, -2.0, float("nan"), float("inf"), -1.0]).ravel()
 _DIS = r"sensors_disagree|disagree|contradict|not fused|refused|beyond their claim|wrong"
@@ -286,10 +290,13 @@ _DIS = r"sensors_disagree|disagree|contradict|not fused|refused|beyond their cla
 FAULTS: dict[str, Fault] = {
     fault.name: fault
     for fault in (
-        Fault("clean"),
-        Fault("RTK of 5 cm", sensors=_gnss(std_m=0.05, vertical_std_m=0.08)),
-        Fault("power at 1 Hz", sensors=lambda sensors: replace(sensors, power=Power(rate_hz=1.0))),
-        Fault("power at 5 Hz", sensors=lambda sensors: replace(sensors, power=Power(rate_hz=5.0))),
+        Fault("clean", calibrated=True),
+        Fault("RTK of 5 cm", calibrated=True, sensors=_gnss(std_m=0.05, vertical_std_m=0.08)),
+        *(
+            Fault(f"power {how} at {rate_hz:g} Hz", recorder=recorder, calibrated=True, sensors=_power(rate_hz))
+            for how, recorder in (("averaged", HUSKY), ("sampled", Recorder("ros2", "husky_status")))
+            for rate_hz in (1.0, 5.0, 20.0)[: 2 if how == "averaged" else 3]
+        ),
         Fault("10 s without GNSS", ("gnss",), (100.0, 110.0), readings=_of("gnss", _holes)),
         # Fixes that lie
         Fault("wrong fix", ("gnss",), MINUTE_S, "gnss", readings=_of("gnss", _wrong_fix(0.0))),

@@ -88,7 +88,12 @@ class _Pool:
     block: np.ndarray
 
 
-def _pool(results: Sequence[Result], window_s: tuple[float, float] | None) -> _Pool:
+def _no_doubt(cell: Cell) -> int:
+    """Return the bits that doubt nothing here: without GNSS no place is claimed."""
+    return int(OF_THE_DRIVE | (Quality.WEAK_GNSS if "gnss" in SETS[cell.sensors] else 0))
+
+
+def _pool(results: Sequence[Result], window_s: tuple[float, float] | None, *, no_doubt: int) -> _Pool:
     def joined(parts: list[list[float]]) -> np.ndarray:
         return np.concatenate([np.asarray(part, float) for part in parts]) if parts else np.zeros(0)
 
@@ -99,7 +104,7 @@ def _pool(results: Sequence[Result], window_s: tuple[float, float] | None) -> _P
     return _Pool(
         {name: np.abs(joined([o.error[name] for o in outcomes])) for name in QUANTITIES},
         {name: joined([o.claimed[name] for o in outcomes]) for name in QUANTITIES},
-        (bits & ~int(OF_THE_DRIVE)) != 0,
+        (bits & ~no_doubt) != 0,
         (at_s > low - 2.0) & (at_s < high + 1.0),
         joined([o.placed for o in outcomes]).astype(bool),
         joined(blocks),
@@ -108,7 +113,8 @@ def _pool(results: Sequence[Result], window_s: tuple[float, float] | None) -> _P
 
 def figures_of(cell: Cell, results: Sequence[Result], clean: Sequence[Result]) -> Figures:
     """Return the figures of a cell; ``clean`` are the results of the same sensors at the same rate without a fault."""
-    pool, outcomes = _pool(results, cell.fault.window_s), [result.outcome for result in results]
+    no_doubt, outcomes = _no_doubt(cell), [result.outcome for result in results]
+    pool = _pool(results, cell.fault.window_s, no_doubt=no_doubt)
     sure = ~pool.doubt
     ladder = {
         "true": sum(o.true_m for o in outcomes),
@@ -121,10 +127,10 @@ def figures_of(cell: Cell, results: Sequence[Result], clean: Sequence[Result]) -
     made = Figures(cell.name, len(results), ladder)
     if pool.doubt.size:
         made.doubted = float(pool.doubt.mean())
-        counted = Counter(name for o in outcomes for bits in o.bits for name in bit_names(bits & ~int(OF_THE_DRIVE)))
+        counted = Counter(name for o in outcomes for bits in o.bits for name in bit_names(bits & ~no_doubt))
         made.bits = {name: count / pool.doubt.size for name, count in counted.items()}
         _measure(made, pool, sure)
-        _yield(made, pool, _pool(clean, None))
+        _yield(made, pool, _pool(clean, None, no_doubt=no_doubt))
     made.refused = sum(not o.bits for o in outcomes)
     made.needlessly = sum(r.oracle is None or r.oracle > 0 for r in results if not r.outcome.bits)
     lengths = [o.driven_m / o.wheels_m for o in outcomes if np.isfinite(o.wheels_m) and o.wheels_m > 1.0]
@@ -186,7 +192,7 @@ def _failures(made: Figures, cell: Cell, outcomes: Sequence[Outcome]) -> list[st
         if (beyond := 1.0 - shares[2].value) > _MOST_BEYOND[name]:
             found.append(f"{name} {beyond:.0%} beyond 2 sigma")
     found += [f"{name} sigma {w:.1f} RMS" for name, w in made.width.items() if w > _WIDEST]
-    if cell.fault.name == "clean":
+    if cell.fault.calibrated:
         found += _uncalibrated(made) if len(SETS[cell.sensors]) <= 1 else []
         if made.doubted > _MOST_DOUBT:
             found.append(f"{made.doubted:.0%} doubted")
