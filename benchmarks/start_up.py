@@ -3,8 +3,8 @@
 Run by hand, on idle cores: ``python benchmarks/start_up.py [--quick]``. Each line is CPU time of a process (and of what it starts) beside
 that of ``import numpy, pyarrow, numba`` in the same run, the least of some times: the floor that nothing can go below. ``kernel`` is that
 floor with one cached kernel called, for which numba loads much more. ``ingest`` is half a minute of driving less what the same ingest takes
-once more in the same process. The last line is the wall time of two logs of twelve minutes with one worker against two, in turns;
-``--quick`` leaves it out.
+once more in the same process. The last two lines are wall times of two logs of twelve minutes, the least of some turns: with one worker
+against two, and by two processes that are started at once, which is what two cores of this machine can do; ``--quick`` leaves them out.
 """
 
 from __future__ import annotations
@@ -63,14 +63,29 @@ def main() -> None:
 
 def second_worker(here: Path, turns: int) -> None:
     logs = [simulated(here / f"hills{seed}", "hills12", seed) for seed in (1, 2)]
-    wall_s: dict[int, list[float]] = {1: [], 2: []}
+    ways = {"one": [[*logs, "--jobs", 1]], "two": [[*logs, "--jobs", 2]], "apart": [[log] for log in logs]}
+    wall_s: dict[str, list[float]] = {way: [] for way in ways}
     for turn in range(turns):
-        for jobs in (1, 2):
-            began = time.perf_counter()
-            run("-m", "tcpipe", "ingest", *logs, "--store", here / f"store-{turn}-{jobs}", "-q", "--jobs", jobs)
-            wall_s[jobs].append(time.perf_counter() - began)
-    one, two = min(wall_s[1]), min(wall_s[2])
+        for way, shares in ways.items():
+            wall_s[way].append(wall_of(shares, here / f"{way}-{turn}"))
+    one, two, apart = (min(seconds) for seconds in wall_s.values())
     print(f"workers  {one:5.2f} s with one, {two:.2f} s with two: {one / two:.2f} x")
+    print(f"apart    {apart:5.2f} s by two processes started at once: two workers take {two / apart:.2f} x that")
+
+
+def wall_of(shares: list[list[object]], here: Path) -> float:
+    """Return the wall time of ingests that begin at once, each into a store of its own."""
+    began = time.perf_counter()
+    running = [
+        subprocess.Popen(
+            [sys.executable, "-m", "tcpipe", "ingest", *map(str, share), "--store", here / str(number), "-q"],
+            stdout=subprocess.DEVNULL,
+        )
+        for number, share in enumerate(shares)
+    ]
+    codes = [process.wait() for process in running]
+    assert codes == [0] * len(shares), codes
+    return time.perf_counter() - began
 
 
 def simulated(place: Path, scenario: str, seed: int) -> Path:

@@ -1,45 +1,77 @@
-"""The installed ``tcpipe`` command, run as a user runs it.
+"""The ``tcpipe`` command as a user types it, and what it prints.
 
-``make test`` runs it in forks of a process that has loaded the libraries (`command_server`); with ``TEST_START=anew``, as in CI, each
-call starts Python anew.
+`tcpipe` runs the console script's own entry point in the process of the tests, which has loaded the libraries, with a directory,
+environment and standard files of its own. Where the start of a process, signals, limits or workers that die are the thing under test,
+tests start `COMMAND`, the installed one.
 """
 
-import atexit
 import json
 import os
-import socket
+import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
-from functools import cache
+from collections.abc import Iterator, Mapping
+from contextlib import chdir, contextmanager
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
+from tcpipe.cli import main
 from tcpipe.cli.answers import answers
 from tcpipe.formats.json_files import plain, typed
 
 COMMAND = Path(sys.executable).parent / "tcpipe"
 HANGS_S = 3600.0
 """After this long a command hangs; a machine that others use takes its time."""
-_ANEW = os.environ.get("TEST_START") == "anew"
-_LEARNING = {"train", "evaluate", "reproduce", "predict-path", "cost-map", "plan-path"}
 
 
 def tcpipe(*arguments: str | Path, cwd: Path, env: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
     """Run the command; nothing of the caller's TCPIPE_ environment reaches it."""
     clean = {key: value for key, value in os.environ.items() if not key.startswith("TCPIPE_")} | dict(env or {})
     command = [str(COMMAND), *map(str, arguments)]
-    if _ANEW or "PYTHONPATH" in (env or {}):  # which Python reads when it starts
+    if "PYTHONPATH" in (env or {}):  # which Python reads when it starts
         done = subprocess.run(command, cwd=cwd, env=clean, capture_output=True, text=True, timeout=HANGS_S, check=False)
         return _as_promised(done)
-    server = _server("learning" if arguments[0] in _LEARNING else "other")
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        request = json.dumps({"arguments": command, "cwd": str(cwd), "env": clean})
-        socket.send_fds(server, [request.encode()], [out.fileno(), err.fileno()])
-        code = json.loads(server.recv(100))
+        with chdir(cwd), patch.dict(os.environ, clean, clear=True), _standard_files(out.fileno(), err.fileno()):
+            code = _exit_code(command)
         printed = [os.pread(stream.fileno(), os.fstat(stream.fileno()).st_size, 0).decode() for stream in (out, err)]
     return _as_promised(subprocess.CompletedProcess(command, code, *printed))
+
+
+@contextmanager
+def _standard_files(out: int, err: int) -> Iterator[None]:
+    """Let what is printed, by Python or by a library beneath it, go to these files; their streams begin anew."""
+    kept = {number: os.dup(number) for number in (1, 2)}
+    os.dup2(out, 1)
+    os.dup2(err, 2)
+    try:
+        with (
+            open(1, "w", encoding="utf-8", closefd=False) as stdout,
+            open(2, "w", encoding="utf-8", closefd=False, buffering=1) as stderr,
+            patch.multiple(sys, stdout=stdout, stderr=stderr),
+        ):
+            yield
+    finally:
+        for number, file in kept.items():
+            os.dup2(file, number)
+            os.close(file)
+
+
+def _exit_code(command: list[str]) -> int:
+    """Run the entry point; what it sets for its process is set back."""
+    numbers = signal.SIGTERM, signal.SIGHUP
+    handlers = [signal.getsignal(number) for number in numbers]
+    try:
+        with patch.multiple(sys, argv=command, unraisablehook=sys.unraisablehook):
+            main()
+    except SystemExit as ended:
+        return int(ended.code or 0)
+    finally:
+        for number, handler in zip(numbers, handlers, strict=True):
+            signal.signal(number, handler)
+    raise AssertionError("the entry point returned instead of exiting")
 
 
 def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.CompletedProcess[str]:
@@ -51,19 +83,6 @@ def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.Completed
         said = json.loads(done.stdout)
         assert plain(typed(said, cls, Path(done.args[1]))) == said
     return done
-
-
-@cache
-def _server(kind: str) -> socket.socket:
-    """Start a server of commands, which ends with this process."""
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    ours.settimeout(HANGS_S)
-    program = [sys.executable, Path(__file__).with_name("command_server.py"), str(theirs.fileno()), kind]
-    with theirs:
-        process = subprocess.Popen(program, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL)
-    atexit.register(process.wait)
-    atexit.register(ours.close)
-    return ours
 
 
 def told(done: subprocess.CompletedProcess[str]) -> dict[str, Any]:

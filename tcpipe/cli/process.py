@@ -17,8 +17,9 @@ class Ended(BaseException):
 
 def prepare_process() -> None:
     """Open standard files that are closed, print what is no text as escapes, and end in order on SIGTERM and SIGHUP."""
-    while os.open(os.devnull, os.O_RDWR) <= 2:  # else a data file could become standard error
+    while (opened := os.open(os.devnull, os.O_RDWR)) <= 2:  # else a data file could become standard error
         pass
+    os.close(opened)
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, PTH123

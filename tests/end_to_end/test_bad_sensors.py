@@ -245,15 +245,15 @@ def scattered(size: int, share: float = 0.05) -> np.ndarray:
     return np.random.default_rng(8).random(size) < share
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize("what", [(np.nan, np.inf, -np.inf), (1e30,)], ids=["none", "huge"])
 @pytest.mark.parametrize("sensor", ["gnss", "imu", "wheels", "visual", "power", "command"])
-def test_values_that_are_no_numbers_cost_only_themselves(drive, tmp_path, sensor, value):
+def test_values_that_are_no_numbers_cost_only_themselves(drive, tmp_path, sensor, what):
     def broken(columns: Columns) -> Columns:
         found = {}
         for name, values in columns.items():
             if np.issubdtype(values.dtype, np.floating) and not name.startswith("header") and "covariance" not in name:
                 hit = scattered(len(values), 0.03 if sensor != "power" else 0.003)
-                values[hit] = value
+                values[hit] = np.resize(what, np.count_nonzero(hit))
                 found[name] = values
         return found
 

@@ -264,8 +264,11 @@ def _patched(directory: Path, program: str) -> dict[str, str]:
 
 
 def test_it_is_a_module_too(tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-m", "tcpipe", "--version"], cwd=tmp_path, capture_output=True, check=True)
-    assert done.stdout == tcpipe("--version", cwd=tmp_path).stdout.encode()
+    said = [
+        subprocess.run([*command, "--version"], cwd=tmp_path, capture_output=True, check=True).stdout
+        for command in ([sys.executable, "-m", "tcpipe"], [COMMAND])
+    ]
+    assert said[0] == said[1] == tcpipe("--version", cwd=tmp_path).stdout.encode() != b""
 
 
 # --- names, twins and parts -----------------------------------------------------------------------------------------
