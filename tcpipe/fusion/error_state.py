@@ -24,14 +24,25 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion.course import course_of
 from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements, part
-from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD, process_noise, turn_scale_std, turn_sources
+from tcpipe.fusion.process import (
+    GROUND,
+    SLOPE_RAD,
+    UNSEEN_TURN_RADPS,
+    VISUAL_SCALE_STD,
+    WHEEL_SCALE_STD,
+    glides,
+    process_noise,
+    scale_stds,
+    turn_scale_std,
+)
 from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.timeline import EventTimeline, build_timeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
-from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
 from tcpipe.tables.findings import StretchFacts, vector
 
 _WIDTH = 30  # of a row of outputs, see `error_state_kernel._saved`; 81 more with covariances
@@ -51,6 +62,7 @@ _LASTS_S = 30.0
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _LEVELLING_NS = 60_000_000_000
 _NEVER = 1e18
+_FIXED = 1e-6
 _MANY_REFUSED = 0.1
 _GNSS_FACTORS = (16.0, 256.0)
 _LOCK_OUT = {
@@ -246,10 +258,15 @@ class _Run:
         self.unseen_scale_std = 0.0
         # From positions alone forward and reverse look the same: yaw is the course, and may be anything.
         self.unseen_yaw_std = 0.0
-        self.antenna_m = self._levers[kernel.GNSS_POSITION]
-        if measurements.imu is None and not turn_sources(measurements):
+        self.antenna_m = self._levers[kernel.GNSS_POSITION].copy()
+        self.unplaced = measurements.gnss is None
+        self.along_course = glides(measurements)
+        if self.along_course:
+            self._levers[:] = 0.0
+        if measurements.imu is None and not measurements.odometries():
             self.unseen_yaw_std = _ANY_YAW_STD_RAD
         self.turn_scale_std = turn_scale_std(measurements)
+        self.scale_stds = scale_stds(measurements)
         self.last: _Memory
 
     def refused_share(self, kind: int) -> float:
@@ -260,7 +277,7 @@ class _Run:
     def filtered(self, initial: InitialState) -> NDArray[np.float64]:
         """Forward states at the wanted stamps, rows as `error_state_kernel` saves them."""
         outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
-        memory = _start(initial, self.turn_scale_std)
+        memory = _start(initial, self.scale_stds, self.turn_scale_std)
         self._forward(0, self.timeline.stamp_ns.size, memory, outputs, None)
         self.last = memory
         return outputs
@@ -271,7 +288,7 @@ class _Run:
         outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
         edges = [*range(0, count, _BLOCK), count]
         blocks = list(pairwise(edges))
-        memory = _start(initial, self.turn_scale_std)
+        memory = _start(initial, self.scale_stds, self.turn_scale_std)
         checkpoints: list[_Memory] = []
         kept: dict[int, _Store] = {}
         for index, (first, last) in enumerate(blocks):
@@ -371,7 +388,9 @@ def _links(lags: Sequence[int]) -> tuple[NDArray[Any], ...]:
     return np.eye(n), chains, np.zeros((size, n, 2)), np.zeros((size, 6)), recipe, np.array(list(nodes)), wanted
 
 
-def _start(initial: InitialState, turn_scale_std: float = 0.0) -> _Memory:
+def _start(
+    initial: InitialState, scale_stds: tuple[float, float], turn_scale_std: float = 0.0
+) -> _Memory:
     """Return the state at the start; with a scale error of the turn rate to be found in the place of the gyroscope's bias, or without."""
     x = np.zeros(kernel.NX)
     rotation = matrix_from_quat(initial.quat_xyzw)
@@ -389,7 +408,7 @@ def _start(initial: InitialState, turn_scale_std: float = 0.0) -> _Memory:
             np.full(3, 0.15**2),
             np.full(3, initial.velocity_std_mps**2),
             initial.position_std_m**2,
-            [WHEEL_SCALE_STD**2, VISUAL_SCALE_STD**2],
+            np.square(np.maximum(scale_stds, _FIXED)),
         )
     )
     return _Memory(x, P, np.zeros(8), np.zeros(8))
@@ -398,9 +417,14 @@ def _start(initial: InitialState, turn_scale_std: float = 0.0) -> _Memory:
 def _trajectory(
     timeline: EventTimeline, outputs: NDArray[np.float64], run: _Run, output_ns: NDArray[np.int64]
 ) -> Trajectory:
+    rate_radps = timeline.output_rate_radps
+    if run.along_course:
+        rate_radps = _look_along(outputs, output_ns, run.antenna_m)
     rotation = outputs[:, 0:9].reshape(-1, 3, 3)
     scale_std, speed_mps = run.unseen_scale_std, np.linalg.norm(outputs[:, 15:18], axis=1)
     outputs[:, 23:26] += run.lasting_m2
+    if run.unplaced:
+        outputs[:, 23:26] += (scale_std * (outputs[:, 18:21] - outputs[0, 18:21])) ** 2
     if run.covariances:
         for axis in range(3):
             outputs[:, _WIDTH + 10 * (6 + axis)] += run.lasting_m2[axis]
@@ -412,17 +436,43 @@ def _trajectory(
         position_enu_m=outputs[:, 18:21].copy(),
         quat_xyzw=quat_from_matrix(rotation),
         velocity_enu_mps=outputs[:, 15:18].copy(),
-        angular_velocity_radps=timeline.output_rate_radps - bias,
+        angular_velocity_radps=rate_radps - bias,
         position_std_m=np.sqrt(outputs[:, 23:26]),
         yaw_std_rad=np.sqrt(outputs[:, 26]),
         forward_velocity_std_mps=np.hypot(np.sqrt(outputs[:, 27]), scale_std * speed_mps),
         rejections=_rejections(timeline, run),
         displacement_std_m=np.hypot(
-            _displacement_std_m(run, output_ns), scale_std * speed_mps[:, None] * DISPLACEMENT_LAGS_S
+            np.hypot(_displacement_std_m(run, output_ns), _sway_m(run, speed_mps)),
+            scale_std * speed_mps[:, None] * DISPLACEMENT_LAGS_S,
         ),
         facts=_facts(timeline, run),
         covariance=outputs[:, _WIDTH:].reshape(-1, 9, 9) if run.covariances else None,
     )
+
+
+def _look_along(
+    outputs: NDArray[np.float64], output_ns: NDArray[np.int64], antenna_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Make the antenna's states the body's, level and along its course; return how fast that turns [rad/s], shape (N, 3)."""
+    yaw = course_of(outputs[:, 15:18])
+    rotation = matrix_from_quat(quat_from_rpy(0.0, 0.0, yaw))
+    outputs[:, 0:9] = rotation.reshape(-1, 9)
+    outputs[:, 18:21] -= rotation @ antenna_m
+    # The antenna sways over ground that no sensor shows.
+    outputs[:, 23:25] += (SLOPE_RAD * antenna_m[2]) ** 2
+    outputs[:, 27] += (UNSEEN_TURN_RADPS * antenna_m[2]) ** 2
+    rate = np.zeros((yaw.size, 3))
+    if yaw.size > 1:
+        rate[:, 2] = np.gradient(yaw, (output_ns - output_ns[0]) * 1e-9)
+    return rate
+
+
+def _sway_m(run: _Run, speed_mps: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return by how much an antenna on a body of unseen attitude moves otherwise than the body over each displacement, shape (N, 4)."""
+    if not run.along_course:
+        return np.zeros((speed_mps.size, 1))
+    tilt2 = np.minimum(GROUND * speed_mps[:, None] * DISPLACEMENT_LAGS_S, 2 * SLOPE_RAD**2)
+    return np.asarray(np.sqrt(tilt2) * abs(run.antenna_m[2]))
 
 
 def _doubt_yaw(
@@ -488,7 +538,8 @@ def _facts(timeline: EventTimeline, run: _Run) -> StretchFacts:
         turn_scale=float(1 + x[11]) if run.turn_scale_std else None,
         accelerometer_bias_mps2=vector(x[12:15]),
         wheel_scale=float(1 + x[21]),
-        wheel_scale_std=float(deviation[15]),
+        wheel_scale_std=float(max(deviation[15], run.unseen_scale_std)),
         visual_scale=float(1 + x[22]),
-        visual_scale_std=float(deviation[16]),
+        visual_scale_std=float(max(deviation[16], run.unseen_scale_std)),
+        common_scale_std=run.unseen_scale_std,
     )

@@ -530,13 +530,15 @@ def _lifted(kind: int, P: Matrix, y: Vector, alone: bool) -> None:  # noqa: FBT0
     """Lift P after a lock-out so that the sensor can be heard again: the state may have jumped, or the sensor's scale."""
     if kind == GNSS_POSITION:
         P[2, 2] += 0.1**2
-        P[15, 15] += 0.3**2
+        if P[15, 15] > 1e-10:
+            P[15, 15] += 0.3**2
         for i in range(3):
             P[9 + i, 9 + i] += 0.3**2
             P[12 + i, 12 + i] += y[i] * y[i]
     else:
         scale = 15 if kind == WHEEL_VELOCITY else 16
-        P[scale, scale] += 0.1**2
+        if P[scale, scale] > 1e-10:
+            P[scale, scale] += 0.1**2
         if alone:
             for i in range(3):
                 P[9 + i, 9 + i] += y[0] * y[0] + y[1] * y[1] + y[2] * y[2]

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.course import course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import integral, interval_means, seconds
@@ -146,6 +147,9 @@ def _yaw_rate_samples(
     if imu is not None and imu.stamp_ns.size:
         return seconds(imu.stamp_ns, start_ns), imu.angular_velocity_radps[:, 2:] - bias[2]
     sources = turn_sources(measurements)
+    if not sources and (odometry := _speed_source(measurements)) is not None and measurements.gnss is not None:
+        stamp_s, rate = course_rate(measurements.gnss, odometry, start_ns)
+        return stamp_s, rate[:, None]
     if not sources:
         return np.empty(0), np.empty((0, 1))
     source = sources[-1]

@@ -33,6 +33,7 @@ _MAX_FORCE_MPS2 = 1000.0
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _DATUM_FIXES = 10
 _NOISE_WINDOW_S = 2.0
+_TURNS_INTO = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,26 +121,35 @@ def body_velocities(
         remarks = ("no twist: pose increments are used",)
     else:
         yaw_rate_var = columns["yaw_rate_var"]
-    turned = rotate(quat_xyzw, velocity)
-    measured = np.isfinite(turned[:, 0] if only_forward else turned.sum(1)) & (np.abs(turned) < _MAX_VELOCITY_MPS).all(
-        1
-    )
+    rotation = matrix_from_quat(quat_xyzw)
+    turned = _turned(rotation, velocity)
+    measured = np.isfinite(turned[:, 0]) & ~(np.abs(turned) >= _MAX_VELOCITY_MPS).any(1)
     usable, repeated = _usable(stamp_ns, measured)
     # Off-diagonal terms that the rotation makes are dropped.
-    variance = variance[usable] @ (matrix_from_quat(quat_xyzw) ** 2).T
+    variance = _turned(rotation**2, variance[usable])
+    turned = turned[usable]
+    variance[np.isnan(turned)] = _NO_TRUST
     variance, replaced = _variances(variance, np.full(3, default_std_mps**2), _VELOCITY_FLOOR_MPS**2)
-    turn_rate = rotate(quat_xyzw, rate)[usable]
+    turn_rate = _turned(rotation, rate)[usable]
     yaw_rate = turn_rate[:, 2]
     floor = _YAW_RATE_FLOOR_RADPS**2
     yaw_rate_var = _variances(yaw_rate_var[usable, None], np.array([_YAW_RATE_STD_RADPS**2]), floor)[0][:, 0]
-    turned = turned[usable]
     if only_forward:
         turned[:, 1:] = np.nan
         variance[:, 1:] = np.nan
+    else:  # an axis that is not measured is zero, to within anything
+        turned[np.isnan(turned)] = 0.0
     yaw_rate_var[~np.isfinite(yaw_rate)] = np.nan
     spatial = None if only_forward or not np.isfinite(turn_rate).all() else turn_rate
     made = BodyVelocities(stamp_ns[usable], turned, variance, yaw_rate, yaw_rate_var, xyz_m, spatial)
     return made, Prepared(stamp_ns[~measured], repeated, replaced, remarks)
+
+
+def _turned(matrix: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return ``matrix`` (3, 3) times vectors (N, 3); NaN, what is not measured, makes each axis NaN into which it turns."""
+    unknown = np.isnan(values)
+    turned = np.where(unknown, 0.0, values) @ matrix.T
+    return np.where(unknown @ (np.abs(matrix).T > _TURNS_INTO), np.nan, turned)
 
 
 def inertial(
@@ -242,12 +252,12 @@ def _variances(
 
 def _has_twist(velocity_mps: NDArray[np.float64], pose_m: NDArray[np.float64]) -> bool:
     """Whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
-    known = np.isfinite(velocity_mps).all(1)
+    known = np.isfinite(velocity_mps).any(1)
     if not known.any():
         return False
     posed = pose_m[np.isfinite(pose_m).all(1)]
     moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > 0.1
-    return bool((velocity_mps[known] != 0).any()) or not moves
+    return bool(np.nansum(np.abs(velocity_mps[known])) > 0) or not moves
 
 
 def _increments(

@@ -22,16 +22,21 @@ VISUAL_SCALE_STD = 0.05
 _WHEEL_SCALE_TIME_S = 60.0
 _WHEEL_TURN_SCALE_STD, _VISUAL_TURN_SCALE_STD = 0.2, 0.03
 _TURN_SCALE_TIME_S = 60.0
-_GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
+SLOPE_RAD = 0.1  # of ground, where nothing shows it
+UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
+GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
 _ACCELERATION_WINDOW_S = 0.6
 _SLIDE_WINDOW_S = 1.0
 _ACCELERATION_LASTS_S = 0.05
+_COURSE_TURN = 0.02  # rad²/s: 8° in a second, of a turn that only the course over ground tells
 _DRIFT = 5e-7  # rad²/s: a tenth of a degree in a second
 _MAX_GAP_NS = 300_000_000
 _STEADY = 1e-4  # m²/s³: 1 cm/s in a second
 _SLIDE = 1e-4  # m²/s³
 _UNSEEN_SLIDE = 4e-4  # m²/s³
 _FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3  # the last in m²/s³
+_SHOWS_COURSE_MPS = 0.2
+_UNSEEN_MPS = 0.5  # of a velocity told by fixes: more, and they do not show how it changes
 _UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
 
 
@@ -40,14 +45,47 @@ def turn_sources(measurements: Measurements) -> list[BodyVelocities]:
     return [source for source in measurements.odometries().values() if np.isfinite(source.yaw_rate_radps).any()]
 
 
+def glides(measurements: Measurements) -> bool:
+    """Return whether positions are all there is, too noisy to show a course.
+
+    The velocity then strays over ground, and which way the body looks is not asked.
+    """
+    alone = measurements.imu is None and not measurements.odometries()
+    return alone and measurements.gnss is not None and _fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
+
+
+def _fix_velocity_std_mps(gnss: Positions) -> float:
+    """Return how well the fixes of `_window_s` show a velocity: the slope of a line through them."""
+    fixes = max(2.0, _window_s(gnss) * 1e9 / median_period_ns(gnss.stamp_ns))
+    return float(np.sqrt(12.0 / fixes * np.median(gnss.variance_m2[:, :2]))) / _window_s(gnss)
+
+
+def _window_s(gnss: Positions) -> float:
+    return max(_FIX_WINDOW_S, _FIXES * 1e-9 * median_period_ns(gnss.stamp_ns))
+
+
 def turn_scale_std(measurements: Measurements) -> float:
-    """Return how far the scale of the turn rate may be off where an odometry tells it; 0 where a gyroscope does, or nothing."""
-    if measurements.imu is not None:
+    """Return how far the scale of the turn rate may be off where an odometry tells it; 0 where a gyroscope does, or nothing.
+
+    Without fixes nothing tells it: it stays 1.
+    """
+    if measurements.imu is not None or measurements.gnss is None:
         return 0.0
     sources = turn_sources(measurements)
     if not sources:
         return 0.0
     return _VISUAL_TURN_SCALE_STD if sources[-1] is measurements.visual else _WHEEL_TURN_SCALE_STD
+
+
+def scale_stds(measurements: Measurements) -> tuple[float, float]:
+    """Return how far the scales of wheels and visual odometry may be off, to be found; 0 where nothing tells: it stays 1.
+
+    Only fixes tell how long a metre is. Without any, one odometry is the measure: the camera where there is one, else the wheels. An
+    accelerometer does not tell: what it adds up to over a minute is its tilt and its bias.
+    """
+    if measurements.gnss is not None:
+        return WHEEL_SCALE_STD, VISUAL_SCALE_STD
+    return (0.0 if measurements.visual is None else WHEEL_SCALE_STD), 0.0
 
 
 def process_noise(measurements: Measurements) -> NDArray[np.float64]:
@@ -63,12 +101,12 @@ def process_noise(measurements: Measurements) -> NDArray[np.float64]:
     density[:, 6:9] = (1.5e-3) ** 2  # a milli-g or two in a minute, as uncooled MEMS units drift
     density[:, 10:12] = _slides(measurements.visual)
     density[:, kernel.SLIDING] = measurements.visual is None and measurements.wheels is None
-    density[: kernel.GYRO_TURN, kernel.GROUND] = _GROUND
+    density[: kernel.GYRO_TURN, kernel.GROUND] = GROUND
     density[:, 12:15] = 1e-8
     density[:, 15] = 2 * WHEEL_SCALE_STD**2 / _WHEEL_SCALE_TIME_S
     density[:, 16] = 0.002**2
-    drifts = measurements.gnss is None and measurements.visual is not None
-    density[:, kernel.DECAY] = 0.0 if drifts else 1 / _WHEEL_SCALE_TIME_S
+    density[:, kernel.DECAY] = 1 / _WHEEL_SCALE_TIME_S
+    density[:, 15:17] *= np.square(scale_stds(measurements)) > 0
     _odometric_turns(measurements, density)
     imu = measurements.imu
     if imu is not None:
@@ -82,8 +120,10 @@ def process_noise(measurements: Measurements) -> NDArray[np.float64]:
 def _odometric_turns(measurements: Measurements, density: NDArray[np.float64]) -> None:
     """Fill in the noise of turning where an odometry, or nothing, tells how the robot turns."""
     sources = turn_sources(measurements)
-    if not sources:
-        density[kernel.FLAT_TURN, 2] = 0.02
+    if glides(measurements):
+        density[:, kernel.GROUND] = 0.0
+    elif not sources:
+        density[kernel.FLAT_TURN, 2] = _COURSE_TURN
     for source in sources:
         visual = source is measurements.visual
         rows = [kernel.VISUAL_TURN] if visual else [kernel.FLAT_TURN]
@@ -145,15 +185,19 @@ def _held_density(measurements: Measurements) -> _Density:
 
 
 def _unseen_density(gnss: Positions | None) -> _Density:
-    """Without odometry: the square of the acceleration of the fixes, over a second or five of them; else what is usual."""
+    """Without odometry: the square of the acceleration of the fixes, over a second or five of them; else what is usual.
+
+    Fixes that are too noisy to show a velocity over that time do not show how steady it is either.
+    """
     if gnss is None or gnss.stamp_ns.size < _FIXES:
         return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
-    window_s = max(_FIX_WINDOW_S, _FIXES * 1e-9 * median_period_ns(gnss.stamp_ns))
+    window_s = _window_s(gnss)
     found = np.zeros(gnss.stamp_ns.size)
     for axis in range(2):
         velocity = slopes(gnss.stamp_ns, gnss.position_enu_m[:, axis], window_s)
         found += np.square(slopes(gnss.stamp_ns, velocity, window_s))
-    density = np.minimum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, _UNKNOWN)
+    unseen = _UNKNOWN * min(1.0, (_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
+    density = np.minimum(np.maximum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, unseen), _UNKNOWN)
     stamp_ns = gnss.stamp_ns
     return lambda at_ns: _interpolated(stamp_ns, density, at_ns)
 

@@ -23,14 +23,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import error_state_kernel as kernel
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
-from tcpipe.fusion.process import shake_density, turn_sources
+from tcpipe.fusion.course import course_rate
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements
+from tcpipe.fusion.process import UNSEEN_TURN_RADPS, glides, shake_density, turn_sources
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 
 _MAX_STEP_NS = 50_000_000
 _NONHOLONOMIC_HZ = 10.0
 _MOVING_MPS = 0.05
-_UNSEEN_TURN_RADPS, _UNSEEN_TURN_S = 0.07, 1.0  # roll and pitch of a robot on uneven ground
+_UNSEEN_TURN_S = 1.0
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _STANDING_NS = 200_000_000
 _STANDING_STD_MPS = 0.01
@@ -146,7 +147,7 @@ def _unseen_turn_variance(visual: BodyVelocities) -> NDArray[np.float64]:
     """Variance [m²/s²], shape (3,), of what a camera off base_link sees of turns that no sensor tells; they last, as the ground does."""
     rate_hz = 1e9 / median_period_ns(visual.stamp_ns)
     x, y, z = np.square(visual.lever_arm_m)
-    lasting: NDArray[np.float64] = np.array([z, z, x + y]) * _UNSEEN_TURN_RADPS**2 * max(1.0, rate_hz * _UNSEEN_TURN_S)
+    lasting: NDArray[np.float64] = np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * max(1.0, rate_hz * _UNSEEN_TURN_S)
     return lasting
 
 
@@ -171,6 +172,8 @@ def _white_variance(velocity_mps: NDArray[np.float64]) -> float:
 
 def _constraints(measurements: Measurements, standing_ns: NDArray[np.int64], start: int, end: int) -> list[_Part]:
     parts: list[_Part] = []
+    if glides(measurements):  # which way the body looks is not known
+        return parts
     if measurements.wheels is None or measurements.wheels.stamp_ns.size == 0:
         grid = np.arange(start, end, int(1e9 / _NONHOLONOMIC_HZ), dtype=np.int64)
         std = measurements.nonholonomic_std_mps
@@ -275,8 +278,9 @@ def _odometric_turn_rate(
     mode = np.full(before_ns.size, kernel.FLAT_TURN, np.int8)
     start_s, end_s = seconds(before_ns, zero_ns), seconds(after_ns, zero_ns)
     sources = turn_sources(measurements)
-    if not sources and measurements.gnss is not None:
-        stamp_s, values = _course_rate(measurements.gnss, zero_ns)
+    odometry = next(iter(measurements.odometries().values()), None)
+    if not sources and measurements.gnss is not None and not glides(measurements):
+        stamp_s, values = course_rate(measurements.gnss, odometry, zero_ns)
         rate[:, 2] = interval_means(stamp_s, values[:, None], start_s, end_s)[:, 0]
     for rank, source in enumerate(sources):
         known = np.isfinite(source.yaw_rate_radps)
@@ -287,28 +291,3 @@ def _odometric_turn_rate(
         rate[inside] = interval_means(stamp_s, values[known], start_s[inside], end_s[inside])
         mode[inside] = kernel.VISUAL_TURN if source is measurements.visual else kernel.FLAT_TURN
     return rate, mode
-
-
-def _course_rate(gnss: Positions, zero_ns: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Turn of the course over ground [rad/s] twice a second: where no sensor tells yaw, the robot is taken to drive forward.
-
-    The course is that of the way over one second, where it is longer than the fixes are noisy; in between it turns evenly.
-    """
-    stamp_s = seconds(gnss.stamp_ns, zero_ns)
-    grid_s = np.arange(stamp_s[0], stamp_s[-1], 0.5)
-    if grid_s.size < 3:
-        return stamp_s[:1], np.zeros(1)
-    east, north = (
-        interval_means(stamp_s, gnss.position_enu_m[:, k : k + 1], grid_s - 0.5, grid_s + 0.5)[:, 0] for k in (0, 1)
-    )
-    way = (east[2:] - east[:-2]) + 1j * (north[2:] - north[:-2])
-    noise = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
-    moving = np.abs(way) > max(0.3, 3 * noise)
-    if moving.sum() < 2:
-        return stamp_s[:1], np.zeros(1)
-    course = np.unwrap(np.angle(way[moving]))
-    at_s = grid_s[1:-1][moving]
-    middle_s = 0.5 * (at_s[1:] + at_s[:-1])
-    # Before it first moves and after it last did, the robot does not turn, as far as anything tells.
-    stamp_s = np.concatenate((middle_s[:1] - 0.25, middle_s, middle_s[-1:] + 0.25))
-    return stamp_s, np.concatenate(([0.0], np.diff(course) / np.diff(at_s), [0.0]))

@@ -132,11 +132,33 @@ def _variances(columns: Columns, name: str, *diagonal: int) -> Floats:
 
 
 def _is_absent(columns: Columns, name: str) -> Mask:
-    """Whether a covariance says that its quantity is not measured: -1 in its first element (sensor_msgs/Imu)."""
+    """Whether a covariance says that its quantity is not measured: -1 in its first element (sensor_msgs/Imu), or all of it vast."""
     if name not in columns:
         return np.zeros(len(columns[LOG_TIME]), bool)
-    absent: Mask = columns[name][:, 0] == -1
+    absent: Mask = (columns[name][:, 0] == -1) | (columns[name][:, [0, 4, 8]] >= _UNMEASURED_VAR).all(1)
     return absent
+
+
+_UNMEASURED_VAR = 1e3
+"""Drivers fill in 1e3 to 1e9 [SI units squared] for what they do not measure; nobody measures as badly as that."""
+
+
+def _unmeasured(columns: Columns, name: str, twist: Floats) -> Mask:
+    """Return which components of a twist (N, 6) are no measurements: variance -1 or vast, or zero throughout while the robot moves.
+
+    Velocity ahead is left to its variance. A constant is told from a calm sensor by its last digit, and only in some rows.
+    """
+    found = np.zeros(twist.shape, bool)
+    if name in columns and columns[name].shape[1] >= 36:
+        variance = columns[name][:, ::7]
+        found = (variance == -1) | (variance >= _UNMEASURED_VAR)
+    if len(twist) >= _FEWEST_ZEROS and np.any(twist[:, 0]):
+        found |= ~np.any(twist, axis=0)
+    found[:, 0] = False
+    return found
+
+
+_FEWEST_ZEROS = 20
 
 
 def _orientation(columns: Columns, prefix: str) -> tuple[Floats, Mask]:
@@ -291,15 +313,19 @@ _POSE = ("x_m", "y_m", "z_m", "quat_x", "quat_y", "quat_z", "quat_w")
 
 
 def _body_twist(columns: Columns, prefix: str, covariance: str) -> tuple[dict[str, NDArray[Any]], Floats]:
+    """Return a twist's columns, null where it is not measured, and the twist as it was told, shape (N, 6)."""
     linear, angular = _vector(columns, f"{prefix}.linear"), _vector(columns, f"{prefix}.angular")
-    variances = _variances(columns, covariance, 0, 7, 14, 35)
+    twist = np.concatenate((linear, angular), -1)
+    unmeasured = _unmeasured(columns, covariance, twist)
+    linear, angular = (np.where(unmeasured[:, part], np.nan, twist[:, part]) for part in (slice(3), slice(3, 6)))
+    variances = np.where(unmeasured[:, [0, 1, 2, 5]], np.nan, _variances(columns, covariance, 0, 7, 14, 35))
     values = {
         **_axes("velocity", "mps", linear),
         **_axes("angular_velocity", "radps", angular),
         **_axes("velocity_var", "m2ps2", variances),
         "yaw_rate_var": variances[:, 3],
     }
-    return values, np.concatenate((linear, angular), -1)
+    return values, twist
 
 
 def _read_odometry(columns: Columns) -> Readings:

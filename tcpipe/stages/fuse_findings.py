@@ -17,6 +17,7 @@ from tcpipe.tables.findings import FuseFacts, StretchFacts
 from tcpipe.tables.levels import REJECTIONS
 
 _MANY_REFUSED = 0.2
+_COMMON = 0.02
 _LOCAL = "the track lies in a local frame that starts at 0, 0, 0 and cannot be placed on a map"
 
 
@@ -77,6 +78,12 @@ def fuse_warnings(inputs: FusionInputs, facts: FuseFacts) -> tuple[str, ...]:
         for stretch in facts.stretches
         if (factor := stretch.gnss_variance_factor or 1.0) > 1.0
     ]
+    common = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
+    if common > _COMMON:
+        found.append(
+            f"nothing tells how long a metre of odometry is: its scale stays 1, and {common:.0%} are in the deviations of velocity, "
+            "duration, power and energy as one error of the whole run; a GNSS would tell it"
+        )
     if IMU not in facts.sensors:
         found.append("no IMU is used: attitude is inferred from the path; roll and pitch are weak")
     found += [

@@ -117,6 +117,8 @@ class StretchFacts:
     wheel_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
     visual_scale: float | None = field(default=None, metadata=LEFT_OUT)
     visual_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
+    common_scale_std: float | None = field(default=None, metadata=LEFT_OUT)
+    """How long a metre is, as far as nothing tells: one error of all ways, speeds and their labels, within their deviations."""
     epoch: int = 0
     start_ns: int = 0
     end_ns: int = 0

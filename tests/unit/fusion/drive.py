@@ -189,3 +189,8 @@ def errors(drive, trajectory, *, after_s=0.0):
         "nees_forward": np.mean(forward**2 / trajectory.forward_velocity_std_mps[chosen] ** 2),
         "max_xy": np.max(np.hypot(*position[:, :2].T)),
     }
+
+
+def integral(stamp_ns, values):
+    """Return the integral from the first sample to each, by trapezia."""
+    return np.concatenate(([0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(stamp_ns) * 1e-9)))

@@ -5,12 +5,14 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
+from tcpipe.fusion.process import WHEEL_SCALE_STD
 from tcpipe.fusion.standing import standing_intervals
 
 PERIOD_NS = 50_000_000
@@ -157,6 +159,50 @@ def test_without_gnss_the_track_starts_at_the_origin_and_keeps_its_shape():
     )
     turned = a * np.exp(1j * np.angle(np.vdot(a, b)))
     assert np.sqrt(np.mean(np.abs(turned - b) ** 2)) < 0.5
+
+
+@pytest.mark.parametrize("kept", ["wheels", "wheels and imu"])
+def test_without_gnss_a_metre_of_the_wheels_stays_one(kept):
+    measurements = drive.measure(truth(), 1, gnss=False, visual=False, imu=kept != "wheels")
+    imu = measurements.imu
+    if imu is not None:  # a unit that looks 3 degrees down: what it adds up to is no length
+        down = Rotation.from_euler("y", 3.0, degrees=True)
+        tilted = down.apply(imu.specific_force_mps2), down.apply(imu.angular_velocity_radps)
+        imu = replace(imu, specific_force_mps2=tilted[0], angular_velocity_radps=tilted[1])
+    found = fuse(replace(measurements, imu=imu))
+    wheels = measurements.wheels
+    own_m = np.sum(np.abs(wheels.velocity_mps[1:, 0]) * np.diff(wheels.stamp_ns) * 1e-9)
+    driven_m = np.sum(np.linalg.norm(np.diff(found.position_enu_m, axis=0), axis=1))
+    assert driven_m == pytest.approx(own_m, rel=0.02)
+    assert found.facts.wheel_scale == pytest.approx(1.0, abs=1e-6)
+    assert found.facts.common_scale_std == found.facts.wheel_scale_std == WHEEL_SCALE_STD
+    moving = np.linalg.norm(found.velocity_enu_mps, axis=1) > 0.5
+    assert (found.forward_velocity_std_mps[moving] > 0.1 * np.linalg.norm(found.velocity_enu_mps, axis=1)[moving]).all()
+    assert np.linalg.norm(found.position_std_m[-1]) > 0.1 * np.linalg.norm(found.position_enu_m[-1])
+
+
+def test_a_speed_without_a_yaw_rate_goes_where_the_fixes_go():
+    measurements = drive.measure(truth(), 1, imu=False, visual=False, gnss_std=0.05)
+    nothing = np.full_like(measurements.wheels.yaw_rate_radps, np.nan)
+    speed_only = replace(measurements.wheels, yaw_rate_radps=nothing, yaw_rate_var=nothing)
+    found = fuse(replace(measurements, wheels=speed_only))
+    figures = drive.errors(truth(), found)
+    assert figures["xy"] < 0.3
+    assert figures["forward"] < 0.1
+    assert figures["nees_position"] < 4.0
+
+
+def test_noisy_fixes_alone_say_that_they_hardly_tell_a_speed():
+    measurements = drive.measure(truth(), 1, imu=False, visual=False, wheels=False, gnss_std=2.3, gnss_hz=1.0)
+    found = fuse(measurements)
+    true = truth().at(truth().velocity, (found.stamp_ns - drive.ZERO_NS) * 1e-9)
+    assert np.linalg.norm(found.velocity_enu_mps, axis=1).max() < 2.5
+    moving = np.linalg.norm(true, axis=1) > 0.5
+    error = np.abs(np.linalg.norm(found.velocity_enu_mps, axis=1) - np.linalg.norm(true, axis=1))[moving]
+    assert np.mean(error < found.displacement_std_m[moving, 1]) > 0.6
+    turned = drive.integral(found.stamp_ns, found.angular_velocity_radps[:, 2])
+    yaw = Rotation.from_quat(found.quat_xyzw).as_euler("ZYX")[:, 0]
+    assert np.abs(np.angle(np.exp(1j * (turned - yaw + yaw[0]))))[20:-20].mean() < 0.3  # what turns says so
 
 
 def test_the_same_input_gives_the_same_bytes():

@@ -74,7 +74,7 @@ def test_filter_and_smoother_are_those_written_out(monkeypatch):
     monkeypatch.setattr(error_state, "_KEPT_BLOCKS", 2)  # some of them filtered twice
     run = error_state._Run(timeline, measurements, 0.999, lags=(3, 10))
     run.gates[:] = np.inf
-    memory = error_state._start(initial)
+    memory = error_state._start(initial, (0.12, 0.05))
     after, smoothed, gains = dense_reference.filter_and_smooth(
         timeline, run._densities, run._levers, memory.x, memory.P
     )

@@ -99,6 +99,23 @@ def test_a_twist_is_turned_into_base_link_with_its_variance():
     assert found.lever_arm_m == ARM
 
 
+def test_an_axis_that_is_not_measured_stays_so_whichever_way_the_sensor_is_turned():
+    columns = odometry_columns(
+        2, velocity_x_mps=[0.5, 0.6], velocity_y_mps=[NAN, NAN], velocity_z_mps=[0.0, 0.0],
+        angular_velocity_x_radps=[NAN, NAN], angular_velocity_y_radps=[NAN, NAN], angular_velocity_z_radps=[0.3, 0.4],
+    )  # fmt: skip
+    about_x = tuple(Rotation.from_euler("x", 90, degrees=True).as_quat())
+    for quat, sideways in (((0.0, 0.0, 0.0, 1.0), 1), (about_x, 2)):
+        found, _ = body_velocities(
+            stamps(2), columns, xyz_m=ARM, quat_xyzw=quat, default_std_mps=0.1, only_forward=False
+        )
+        assert found.velocity_mps[:, 0].tolist() == [0.5, 0.6]
+        assert found.variance_m2ps2[:, sideways].tolist() == [1e6, 1e6]
+        assert found.variance_m2ps2[0, 3 - sideways] == pytest.approx(0.01)
+        assert found.turn_rate_radps is None
+        assert np.isnan(found.yaw_rate_radps).all() == (sideways == 2)
+
+
 def test_wheels_measure_forward_only_and_rows_without_velocity_are_set_aside():
     columns = odometry_columns(
         3, velocity_x_mps=[1.0, NAN, 99.0], velocity_y_mps=[0.3, NAN, 0.0], velocity_z_mps=[0, NAN, 0]

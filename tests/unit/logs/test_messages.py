@@ -209,6 +209,34 @@ def test_odometry_gives_twist_and_pose(role: str) -> None:
     np.testing.assert_array_equal(found.columns["x_m"], np.arange(N) * 0.05)
 
 
+@pytest.mark.parametrize("word", [-1.0, 1e3, 1e6, 1e9])
+def test_what_a_covariance_calls_unmeasured_is_null(word: float) -> None:
+    columns = odometry()
+    columns["twist.covariance"] = covariance(6, 0.01, 0.02, word, word, word, 0.06)
+    columns["twist.covariance"][0, 35] = word
+    columns["twist.twist.angular.x"][:] = 0.2
+    found = read_messages(columns, "visual_odometry", roles.ODOMETRY).columns
+    for name in ("velocity_z_mps", "angular_velocity_x_radps", "angular_velocity_y_radps"):
+        assert np.isnan(found[name]).all()
+    assert np.isnan(found["angular_velocity_z_radps"]).tolist() == [True] + [False] * (N - 1)
+    assert (found["velocity_x_mps"] == 0.5).all()
+    turned = imu()
+    turned["orientation_covariance"][:] = word
+    assert np.isnan(read_messages(turned, "imu", roles.IMU).columns["quat_w"]).all()
+
+
+def test_an_axis_that_is_zero_throughout_while_the_robot_moves_is_not_measured() -> None:
+    few, many = odometry(), {name: np.concatenate([values] * 4) for name, values in odometry().items()}
+    many["twist.twist.angular.z"][:] = 0.0
+    assert (read_messages(few, "wheel_odometry", roles.ODOMETRY).columns["velocity_y_mps"] == 0.0).all()
+    found = read_messages(many, "wheel_odometry", roles.ODOMETRY).columns
+    for name in ("velocity_y_mps", "angular_velocity_x_radps", "angular_velocity_z_radps", "yaw_rate_var"):
+        assert np.isnan(found[name]).all()
+    many["twist.twist.linear.x"][:] = 0.0  # a robot that rests turns at 0
+    many["pose.pose.position.x"][:] = 3.0
+    assert (read_messages(many, "wheel_odometry", roles.ODOMETRY).columns["angular_velocity_z_radps"] == 0.0).all()
+
+
 def test_an_empty_twist_on_a_moving_pose_is_no_standstill() -> None:
     found = read_messages(odometry(speed_mps=0.0), "visual_odometry", roles.ODOMETRY)
     assert np.isnan(found.columns["velocity_x_mps"]).all()
