@@ -388,9 +388,7 @@ def _links(lags: Sequence[int]) -> tuple[NDArray[Any], ...]:
     return np.eye(n), chains, np.zeros((size, n, 2)), np.zeros((size, 6)), recipe, np.array(list(nodes)), wanted
 
 
-def _start(
-    initial: InitialState, scale_stds: tuple[float, float], turn_scale_std: float = 0.0
-) -> _Memory:
+def _start(initial: InitialState, scale_stds: tuple[float, float], turn_scale_std: float = 0.0) -> _Memory:
     """Return the state at the start; with a scale error of the turn rate to be found in the place of the gyroscope's bias, or without."""
     x = np.zeros(kernel.NX)
     rotation = matrix_from_quat(initial.quat_xyzw)

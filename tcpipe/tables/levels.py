@@ -112,9 +112,21 @@ def _odometry(name: str, doc: str) -> TableSchema:
             _STAMP,
             _LOG_TIME,
             _EPOCH,
-            *_xyz("velocity", "mps", "m/s", "body velocity; null where the source does not measure it", "child", nullable=True),
             *_xyz(
-                "angular_velocity", "radps", "rad/s", "body angular velocity; null where not measured", "child", nullable=True
+                "velocity",
+                "mps",
+                "m/s",
+                "body velocity; null where the source does not measure it",
+                "child",
+                nullable=True,
+            ),
+            *_xyz(
+                "angular_velocity",
+                "radps",
+                "rad/s",
+                "body angular velocity; null where not measured",
+                "child",
+                nullable=True,
             ),
             *_xyz(
                 "velocity_var",
