@@ -61,3 +61,12 @@ def test_logs_without_gnss_give_a_local_track(name):
     assert track.table.num_rows > 1000
     assert np.isfinite(floats(track.table, "x_m")).all()
     assert any("local frame" in warning for warning in track.info.findings.warnings)
+
+
+def test_a_metre_of_the_wheels_stays_one_where_nothing_else_tells_it():
+    streams, track = fused("robot_localization/test2.bag")
+    wheels = streams.tables["wheel_odometry"]
+    own_m = np.sum(np.abs(floats(wheels, "velocity_x_mps")[1:]) * np.diff(integers(wheels, "stamp_ns")) * 1e-9)
+    assert path_m(track.table) == pytest.approx(own_m, rel=0.02)  # an accelerometer had made half of it
+    assert np.isnan(floats(wheels, "velocity_y_mps")).all()
+    assert any("how long a metre" in warning for warning in track.info.findings.warnings)
