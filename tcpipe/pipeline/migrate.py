@@ -26,7 +26,12 @@ def _to_1_1(document: Document) -> Document:
     return {**document, "data_model_version": "1.1"}
 
 
-_STEPS: Mapping[str, Callable[[Document], Document]] = {"1.0": _to_1_1}
+def _to_1_2(document: Document) -> Document:
+    """Return a document of 1.1 as one of 1.2: a quality bit and what the audit found are added, and say nothing where they are absent."""
+    return {**document, "data_model_version": "1.2"}
+
+
+_STEPS: Mapping[str, Callable[[Document], Document]] = {"1.0": _to_1_1, "1.1": _to_1_2}
 """By version that is left."""
 
 

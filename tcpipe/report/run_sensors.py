@@ -12,10 +12,10 @@ from tcpipe.tables.findings import ClockOffset, RunFacts
 
 
 def sensor_sections(known: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
-    """Return the sections on topics, on trust and on clocks; ``known`` is None where the run's ``run.json`` is lost."""
+    """Return the sections on topics, on trust, on disagreement and on clocks; ``known`` is None where the run's ``run.json`` is lost."""
     facts = manifest.info.findings.facts
     topics = [] if known is None else [_topics(known, manifest.counts)]
-    return [*topics, *_trust(facts, rejections), *_clocks(facts)]
+    return [*topics, *_trust(facts, rejections), *_disagreements(facts), *_clocks(facts)]
 
 
 def _name(role: str) -> str:
@@ -63,6 +63,28 @@ def _trust(facts: RunFacts, rejections: pa.Table) -> list[Section]:
     )
     header = ("sensor", "measurements", "refused", "NIS", "not fused, since")
     return [Section("How far each sensor was believed", text, header=header, rows=rows)]
+
+
+def _disagreements(facts: RunFacts) -> list[Section]:
+    """Return when sensors and track disagree, by what and how much; where they never do, nothing."""
+    found = facts.audit.disagreements if facts.audit else ()
+    if not found:
+        return []
+    start_ns = min((stretch.start_ns for stretch in facts.fuse.stretches), default=0) if facts.fuse else 0
+    rows = [
+        (
+            _name(each.sensor),
+            each.what,
+            f"{(each.start_ns - start_ns) * 1e-9:.0f} to {(each.end_ns - start_ns) * 1e-9:.0f} s",
+            f"{each.size:.2g} {each.unit}",
+            f"{each.expected_std:.2g} {each.unit}",
+            "it is alone, the track is believed" if each.alone else "deviations are raised, segments flagged",
+        )
+        for each in found
+    ]
+    text = "The track held against each sensor that fed it, in windows of five seconds: where they differ beyond what both claim."
+    header = ("sensor", "what", "in the run", "off by", "expected (1σ)", "so")
+    return [Section("Where sensors disagree with the track", text, header=header, rows=rows)]
 
 
 def _clocks(facts: RunFacts) -> list[Section]:

@@ -9,9 +9,10 @@ import numpy as np
 from tcpipe.errors import FusionError
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_doctor import clock_findings
+from tcpipe.stages.fuse_audit import audit_findings
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, rejections_table
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
-from tcpipe.stages.fuse_sanity import sane_inputs, without_lost_gnss
+from tcpipe.stages.fuse_sanity import sane_inputs, without_lone_sensors
 from tcpipe.stages.fuse_stretches import fuse_stretches
 from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
@@ -38,19 +39,26 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     inputs, sanity = sane_inputs(prepare_inputs(streams, config), streams)
     # 2. Each stretch for itself: where it starts, filter and smoother.
     fused = fuse_stretches(inputs, streams, config)
-    # 3. Fixes that all other sensors refuse are of another path: then without them.
-    if (again := without_lost_gnss(inputs, sanity, fused.facts, streams)) is not None:
+    # 3. A sensor that is alone against the others in most of the way is of another drive: then without it.
+    if (again := without_lone_sensors(inputs, sanity, fused.tallies, streams)) is not None:
         inputs, sanity = again
         fused = fuse_stretches(inputs, streams, config)
     if not fused.found:
         raise FusionError(_nothing(streams, inputs), *sanity.warnings)
     table = TRACK.table(**{name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]})
     datum = None if inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
-    # 4. What was left out, and whether the sensors' clocks agree.
+    # 4. What was left out, where sensors disagree with the track, and whether their clocks agree.
     summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     clocks = clock_findings(streams, inputs)
-    warnings = (*fuse_warnings(inputs, summary), *sanity.warnings, *clocks.warnings)
-    facts = replace(streams.findings.facts, fuse=summary, sensor_checks=sanity.facts, clock_offsets=clocks.facts)
+    audit = audit_findings(fused)
+    warnings = (*fuse_warnings(inputs, summary), *sanity.warnings, *audit.warnings, *clocks.warnings)
+    facts = replace(
+        streams.findings.facts,
+        fuse=summary,
+        sensor_checks=sanity.facts,
+        audit=audit.facts,
+        clock_offsets=clocks.facts,
+    )
     findings = Findings(streams.findings.warnings + warnings, facts)
     info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, findings)
     return Track(table, rejections_table(inputs, fused.found), info)

@@ -7,16 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
+from tcpipe.fusion.checks.audit import Tally, alone_in_most
 from tcpipe.fusion.checks.sensors import CommandedSpeed, Refusal, check_sensors
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import Findings, SensorChecks, StretchFacts
+from tcpipe.tables.findings import Findings, SensorChecks
 from tcpipe.tables.levels import Sensor, Streams
-
-_MOST_REFUSED = 0.5
 
 _STATED = ("recipe", "tf_static", "same frame")
 
@@ -33,20 +32,15 @@ def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, F
     return _left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
 
 
-def without_lost_gnss(
-    inputs: FusionInputs, sanity: Findings[SensorChecks], stretches: Sequence[StretchFacts], streams: Streams
+def without_lone_sensors(
+    inputs: FusionInputs, sanity: Findings[SensorChecks], tallies: Sequence[Tally], streams: Streams
 ) -> tuple[FusionInputs, Findings[SensorChecks]] | None:
-    """Return the inputs without GNSS, and why, where the estimate refused most of its fixes; None where it did not.
-
-    A filter that refuses a sensor throughout is led by it all the same, each time that its gate reopens.
-    """
-    total = sum(stretch.measurements.get(GNSS, 0) for stretch in stretches)
-    refused = sum(stretch.rejected.get(GNSS, 0) for stretch in stretches)
-    others = any(m.odometries() for m in inputs.measurements.values())
-    if not others or refused <= _MOST_REFUSED * total:
+    """Return the inputs without the sensors that two others contradict in most of the way, and why; None where there are none."""
+    lone = alone_in_most(tallies)
+    if not lone:
         return None
-    why = f"{refused} of its {total} fixes contradict all other sensors (another clock, drive or receiver?)"
-    return _left_out(inputs, sanity, [Refusal(GNSS, why)], streams)
+    why = "in most of the way the others contradict it, and not each other (another clock, drive or unit?)"
+    return _left_out(inputs, sanity, [Refusal(role, why) for role in lone], streams)
 
 
 def _left_out(

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.fusion.checks.audit import Tally, audited
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import InitialState
@@ -19,17 +20,19 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_columns import command_columns, pose_columns, power_columns, wheel_column
 from tcpipe.stages.fuse_findings import stretch_facts
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.tables.findings import StretchFacts
+from tcpipe.tables.findings import Disagreement, StretchFacts
 from tcpipe.tables.levels import Streams
 
 
 @dataclass(slots=True)
 class Fused:
-    """Every stretch's trajectory, facts and columns; how long no track could be placed [s]."""
+    """Every stretch's trajectory, facts and columns, and how it was audited; how long no track could be placed [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
     columns: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
+    disagreements: list[Disagreement] = field(default_factory=list)
+    tallies: list[Tally] = field(default_factory=list)
     skipped_s: float = 0.0
 
 
@@ -46,9 +49,13 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
         initial = _initial(stretch, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
         trajectory = _estimate(stretch, initial, output_ns, config)
+        # 3. What came out is held against what went in.
+        trajectory, audit = audited(trajectory, stretch.measurements)
+        fused.disagreements += (replace(each, epoch=stretch.epoch) for each in audit.disagreements)
+        fused.tallies += audit.tallies
         fused.found.append(trajectory)
         fused.facts.append(stretch_facts(stretch, initial, trajectory))
-        # 3. What else is known at the track's stamps.
+        # 4. What else is known at the track's stamps.
         fused.columns.append(_columns(stretch, trajectory, inputs, streams, config))
     return fused
 

@@ -1,4 +1,4 @@
-"""Where a track bears no segment: without power, where the next metre would not be known well enough, and where it jumps."""
+"""Where a track bears no segment: without power, where the next metre is not known well enough or jumps, and between contradictions."""
 
 from __future__ import annotations
 
@@ -25,20 +25,26 @@ class Gaps:
     without_power: Mask
     uncertain: Mask
     jumps: Mask
+    contradicted: Mask
     warnings: tuple[str, ...]
 
     @property
     def rows(self) -> Mask:
         """All of them."""
-        return self.without_power | self.uncertain | self.jumps
+        return self.without_power | self.uncertain | self.jumps | self.contradicted
 
     def counts(self) -> dict[str, int]:
         """Return the number of rows by cause; a row may have several."""
-        return {name: int(getattr(self, name).sum()) for name in ("without_power", "uncertain", "jumps")}
+        return {
+            name: int(getattr(self, name).sum()) for name in ("without_power", "uncertain", "jumps", "contradicted")
+        }
 
 
 def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig) -> Gaps:
-    """Return the rows without power in a run that has power, moving rows whose next chord is uncertain, and rows beside a jump."""
+    """Return the rows that bear no segment, by cause: no power in a run that has power, a moving row whose next chord is uncertain, a jump.
+
+    Where its sensors contradict each other in most of the way undecided, they are all rows of the run.
+    """
     power = floats(track.table, "power_watt")
     without_power = np.isnan(power) & bool(np.isfinite(power).any())
     moving = np.abs(rows.velocity_mps) >= config.turning_velocity_mps
@@ -61,7 +67,9 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
             f"the position jumps {far} times, the furthest by {off_m.max():.1f} m at {at_ns} ns, which no speed explains (a GNSS that "
             "changed its base, datum or receiver?): nothing is cut across, and the jump is not counted as driven"
         )
-    return Gaps(without_power, uncertain, jumps, tuple(warnings))
+    audit = track.info.findings.facts.audit
+    contradicted = np.full(len(moving), bool(audit and audit.undecided))
+    return Gaps(without_power, uncertain, jumps, contradicted, tuple(warnings))
 
 
 def _chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:

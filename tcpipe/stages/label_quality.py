@@ -57,7 +57,19 @@ def motion_flags(
         Quality.CURVED: floats(cut, "arc_length_m") > arc_to_chord * chord_m,
         Quality.NO_COMMAND: np.isnan(commanded_mps),
         Quality.NOT_AT_LIMIT: np.abs(commanded_mps) < (full_speed_mps or 0.0),
+        Quality.SENSORS_DISAGREE: _disputed(cut, info),
     }
+
+
+def _disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
+    """Return the segments of one epoch that touch a time in which a sensor disagrees with the track, undecided."""
+    start_ns, end_ns, epoch = integers(cut, "start_ns"), integers(cut, "end_ns"), integers(cut, "epoch")
+    disputed = np.zeros(cut.num_rows, dtype=np.bool_)
+    audit = info.findings.facts.audit
+    for each in audit.disagreements if audit else ():
+        if not each.alone:
+            disputed |= (epoch == each.epoch) & (start_ns <= each.end_ns) & (end_ns >= each.start_ns)
+    return disputed
 
 
 def _gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:

@@ -57,6 +57,8 @@ class Quality(IntFlag):
     """The power is more than four robust standard deviations from what rolling resistance and grade, fitted on the run, predict."""
     NOT_AT_LIMIT = 1 << 10
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the speed is not the terrain's limit."""
+    SENSORS_DISAGREE = 1 << 11
+    """A sensor says another position, way or turn there than the track, beyond what both claim, and nothing tells which is right."""
 
 
 class Loss(IntFlag):

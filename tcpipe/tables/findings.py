@@ -170,6 +170,34 @@ class SensorChecks:
 
 
 @dataclass(frozen=True, slots=True)
+class Disagreement:
+    """A time in which a sensor says other than the track, beyond what both claim (`tcpipe.fusion.checks.audit`).
+
+    ``what`` is position, displacement or turn; ``size`` the largest difference over a window in ``unit`` (m or rad), and
+    ``expected_std`` what it was expected to be there. ``alone``: two other sensors contradict this one, so the track is believed; otherwise
+    its deviations are raised, and segments there carry the bit sensors_disagree.
+    """
+
+    start_ns: int
+    end_ns: int
+    sensor: str
+    what: str
+    size: float
+    unit: str
+    expected_std: float
+    alone: bool
+    epoch: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class AuditFacts:
+    """The estimate held against what fed it: where they disagree, and which sensors contradict each other in most of the way undecided."""
+
+    disagreements: tuple[Disagreement, ...] = ()
+    undecided: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
 class ClockPair:
     """Two sensors' clocks compared (`tcpipe.fusion.checks.clock_offsets.Pair`), and whether that tells their offset."""
 
@@ -315,6 +343,7 @@ class RunFacts:
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
+    audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
     clock_offsets: ClockFacts | None = field(default=None, metadata=LEFT_OUT)
     gate: GateFacts | None = field(default=None, metadata=LEFT_OUT)
     segment: SegmentFacts | None = field(default=None, metadata=LEFT_OUT)

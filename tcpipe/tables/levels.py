@@ -30,13 +30,13 @@ from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
 
-DATA_MODEL_VERSION = "1.1"
+DATA_MODEL_VERSION = "1.2"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
 
-READ_VERSIONS = ("1.0", DATA_MODEL_VERSION)
+READ_VERSIONS = ("1.0", "1.1", DATA_MODEL_VERSION)
 """Versions that are read as they are; `tcpipe migrate` brings the older ones to the last."""
 
-TABLES_VERSION = "1.0"
+TABLES_VERSION = "1.2"
 """Version in which a table last changed."""
 
 _METADATA_KEY = b"tcpipe"

@@ -205,7 +205,7 @@ def astray(columns: Columns) -> Columns:
 
 
 UNLIKE = {
-    "fixes that go astray": ("gnss", astray, "contradict all other sensors"),
+    "fixes that go astray": ("gnss", astray, "the others contradict it"),
     "fixes that never change": ("gnss", constant(("latitude", "longitude", "altitude")), "same place"),
     "places in radians": ("gnss", lambda c: {n: np.radians(c[n]) for n in ("latitude", "longitude")}, "radians?"),
     "exchanged axes": ("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]}, "exchanged?"),

@@ -16,6 +16,7 @@ from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.migrate import migrate
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
+from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 KEPT = Path(__file__).parents[1] / "data" / "store-1.0.tar.xz"
 
@@ -71,7 +72,7 @@ def test_one_document_is_migrated_once_and_nothing_else_changes(kept, name, docu
     assert after.keys() == before.keys()
     old, new = (json.loads(files[changed]) for files in (before, after))
     assert {key for key in new if new[key] != old[key]} == {"data_model_version", "document_sha256"}
-    assert (old["data_model_version"], new["data_model_version"]) == ("1.0", "1.1")
+    assert (old["data_model_version"], new["data_model_version"]) == ("1.0", DATA_MODEL_VERSION)
     assert verify(kept / name).problems == ()
     again = migrate(kept / name)
     assert (again.migrated, again.exit_code) == ((), 0)
@@ -93,7 +94,7 @@ def test_a_migration_that_was_killed_goes_on(kept):
     for path in manifest.parent.iterdir():
         (other / path.name).write_bytes(path.read_bytes())
     found = json.loads(manifest.read_text())
-    write_sealed(other / "manifest.json", {**found, "recipe_id": "00000000", "data_model_version": "1.1"})
+    write_sealed(other / "manifest.json", {**found, "recipe_id": "00000000", "data_model_version": DATA_MODEL_VERSION})
     half = migrate(kept / "store")
     assert half.migrated == (manifest,)
     assert half.current == 2  # the other manifest, and the map
@@ -108,7 +109,7 @@ def test_what_is_damaged_or_not_known_is_left_and_named(kept):
     assert "not as it was written" in damaged.problems[0]
     write_sealed(manifest, {**json.loads(text), "data_model_version": "3.0"})
     newer = contents(kept / "store")
-    assert "of data model 3.0, this version knows 1.0, 1.1" in migrate(kept / "store").problems[0]
+    assert "of data model 3.0, this version knows 1.0, 1.1, 1.2" in migrate(kept / "store").problems[0]
     assert contents(kept / "store") == newer
     with pytest.raises(UsageError, match="is no store, map"):
         migrate(kept / "site")

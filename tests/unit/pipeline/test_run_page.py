@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -9,8 +10,10 @@ from tcpipe.formats.logs.log_file import open_log
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.maps import add_map
 from tcpipe.report.run_report import run_report
+from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.simulation import Faults, simulate, tiny
 from tcpipe.store import Store
+from tcpipe.tables.findings import AuditFacts, Disagreement, Findings
 
 
 @pytest.fixture(scope="module")
@@ -59,6 +62,19 @@ def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     assert all(f"<td>{role.replace('_', ' ')}</td>" in clocks for role in facts.clock_offsets.offsets)
     assert f"Noise floor of E {100 * facts.label.energy_budget.total:.1f} %" in html
     assert "Kept and dropped add up to the odometer" in html
+
+
+def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
+    run, html = page(store)
+    assert "Where sensors disagree" not in html
+    info, start_ns = run.manifest.info, run.manifest.info.findings.facts.fuse.stretches[0].start_ns
+    each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", "position", 0.49, "m", 0.016, alone=False)
+    facts = replace(info.findings.facts, audit=AuditFacts((each,)))
+    told = replace(run.manifest, info=replace(info, findings=Findings((), facts)))
+    (section,) = [s for s in sensor_sections(None, told, run.rejections()) if "disagree" in s.title]
+    assert section.rows == [
+        ("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "deviations are raised, segments flagged")
+    ]
 
 
 def test_every_topic_stands_on_the_page_and_may_break(store):

@@ -1,5 +1,7 @@
 """What the gate drops of drives written down by formula, and what it must keep."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_tracks import make_track, stamps, straight_track
@@ -8,6 +10,7 @@ from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.gate import gate_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
+from tcpipe.tables.findings import AuditFacts, Findings
 
 T = np.arange(0, 60, 0.05)
 
@@ -102,7 +105,12 @@ def test_a_jump_is_a_gap_and_not_driven():
     velocity = np.tile([0.9, 0.0, 0.0], (len(T), 1))
     gated = gate(make_track(position, velocity))
     assert np.flatnonzero(rows_of(gated, DropReason.GAP)).tolist() == [599, 600]
-    assert gated.info.findings.facts.gate.gap_rows == {"without_power": 0, "uncertain": 0, "jumps": 2}
+    assert gated.info.findings.facts.gate.gap_rows == {
+        "without_power": 0,
+        "uncertain": 0,
+        "jumps": 2,
+        "contradicted": 0,
+    }
     assert "jumps 1 times, the furthest by 1000000.0 m" in gated.info.findings.warnings[0]
     segments = segment_track(gated, SegmentConfig())
     assert sum(segments.ledger_m.values()) == pytest.approx(0.9 * T[-1], rel=1e-6)
@@ -116,6 +124,14 @@ def test_relative_not_absolute_position_error_makes_a_gap():
     unsure = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.12))
     assert rows_of(unsure, DropReason.GAP).all()
     assert "is not known to 0.1 m (gate.max_relative_position_std_m)" in unsure.info.findings.warnings[0]
+
+
+def test_a_run_whose_sensors_contradict_each_other_undecided_is_all_gap():
+    track = straight_track(np.full(200, 0.9))
+    facts = replace(track.info.findings.facts, audit=AuditFacts((), ("gnss",)))
+    gated = gate(replace(track, info=replace(track.info, findings=Findings((), facts))))
+    assert rows_of(gated, DropReason.GAP).all()
+    assert gated.info.findings.facts.gate.gap_rows["contradicted"] == 200
 
 
 def test_rows_and_reasons_are_counted():

@@ -13,7 +13,7 @@ from tcpipe.stages.label import label_segments
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import Findings, RunFacts
+from tcpipe.tables.findings import AuditFacts, Disagreement, Findings, RunFacts
 from tcpipe.tables.levels import Sensor, Streams
 
 T = np.arange(0, 60, 0.05)
@@ -184,6 +184,23 @@ def test_slip_weak_position_curve_and_command():
     velocity = 0.8 * np.column_stack((-np.sin(angle), np.cos(angle), 0 * angle))
     curved = label(make_track(circle, velocity), power_streams({"drive": record()}))
     assert flagged(curved, Quality.CURVED).all()
+
+
+def test_segments_that_touch_a_time_in_which_sensors_disagree_undecided_are_flagged():
+    def between(begin_s, end_s, *, alone=False, epoch=0):
+        span = (int(ZERO + begin_s * 1e9), int(ZERO + end_s * 1e9))
+        return Disagreement(*span, "gnss", "position", 0.5, "m", 0.02, alone=alone, epoch=epoch)
+
+    track = straight_track(SPEED)
+    audit = AuditFacts((between(20, 30), between(40, 50, alone=True), between(5, 10, epoch=1)))
+    facts = replace(track.info.findings.facts, audit=audit)
+    told = replace(track, info=replace(track.info, findings=Findings((), facts)))
+    labelled = label(told, power_streams({"drive": record()}))
+    touched = (integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
+        integers(labelled.table, "end_ns") >= ZERO + 20e9
+    )
+    assert flagged(labelled, Quality.SENSORS_DISAGREE).tolist() == touched.tolist()
+    assert 8 <= touched.sum() <= 10
 
 
 def test_not_at_the_limit_where_slower_than_full_speed_was_kept():

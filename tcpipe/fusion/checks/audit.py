@@ -1,0 +1,391 @@
+"""The audit: in windows, the estimate is held against each sensor that fed it, before anyone believes its deviations.
+
+Every comparison has one form: what a sensor says that the robot did in a window, less what the track says, beside what both claim of it.
+
+============ ============================================ =====================================================
+what         the sensor's                                 the track's
+============ ============================================ =====================================================
+position     median place of the fixes, east and north    antenna at their stamps
+displacement median of its later fixes less the earlier   the same of the antenna
+displacement integral of an odometry's velocity           way along its own axes (wheels: forward only)
+turn         integral of a rate about the vertical axis   change of attitude about it
+============ ============================================ =====================================================
+
+A claim counts as an error that lasts through the window: the deviation of a fix is not divided by the root of their number, an odometry
+may be off by its scale and by a little velocity all the while, a gyroscope by how far its bias wanders. What is constant over the whole
+run, and told by others, is no disagreement: the scale of an odometry where fixes show it, the bias of a rate. A window disagrees where
+the squared difference over both variances passes the chi-square bound at which one window in a hundred runs would by chance, as many
+as there are. Where two other sensors of the same thing hold with each other, and both exclude what the one says, that one is alone:
+a track that does not follow it is believed. So are fixes that lie further off than an antenna could, where two others hold with the
+track. Otherwise the track's deviations are raised, there, by the size of the disagreement.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.gates import chi_square_gate
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
+from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
+from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
+from tcpipe.tables.findings import Disagreement
+
+Floats = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+What = Literal["position", "displacement", "turn"]
+
+UNITS: Mapping[str, str] = {"position": "m", "displacement": "m", "turn": "rad"}
+
+_WINDOW_S = 5.0
+_CHANCE = 0.01
+_FEWEST_FIXES = 5
+_MAX_GAP_NS = 500_000_000
+_MOVES_M = 0.5
+_MOSTLY = 0.5
+_NO_ARM_M = 1.0
+_FEWEST_WINDOWS = 4
+_SCALES = (0.5, 2.0)
+_LASTING_MPS = 0.02
+_SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
+_TURN_SCALE_STD = {WHEELS: 0.3, VISUAL: 0.03, IMU: 0.01}
+_LASTING_RADPS = {WHEELS: 0.02, VISUAL: 0.01, IMU: 0.003}
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """One sensor against the track, in W windows.
+
+    Attributes
+    ----------
+    sensor, what : its role, and what is compared.
+    difference : [m] or [rad], shape (W, k), the sensor's less the track's; NaN where the sensor does not tell. Displacements are along and
+        aside of the body in the middle of the window, positions east and north.
+    std : shape (W,), what the sensor claims, of each component.
+    track_std : shape (W,), what the track claims.
+    """
+
+    sensor: str
+    what: What
+    difference: Floats
+    std: Floats
+    track_std: Floats
+
+    @property
+    def told(self) -> Mask:
+        """Where the sensor tells, shape (W,)."""
+        return np.asarray(np.isfinite(self.difference).all(1))
+
+    @property
+    def size(self) -> Floats:
+        """Length of the difference, shape (W,); 0 where it is not told."""
+        return np.where(self.told, np.linalg.norm(self.difference, axis=1), 0.0)
+
+    @property
+    def disagrees(self) -> Mask:
+        """Where the difference is beyond what both claim, shape (W,)."""
+        return np.asarray(self.size > self._bound * np.hypot(self.std, self.track_std))
+
+    def excludes(self, other: Comparison) -> Mask:
+        """Where both cannot be right, by what they have in common, shape (W,)."""
+        common = min(self.difference.shape[1], other.difference.shape[1])
+        apart = np.linalg.norm(self.difference[:, :common] - other.difference[:, :common], axis=1)
+        return np.asarray(self.told & other.told & (apart > self._bound * np.hypot(self.std, other.std)))
+
+    @property
+    def _bound(self) -> float:
+        windows = max(1, int(self.told.sum()))
+        return float(np.sqrt(chi_square_gate(self.difference.shape[1], 1.0 - _CHANCE / windows)))
+
+
+@dataclass(frozen=True, slots=True)
+class Tally:
+    """In how many windows in which the robot moves a sensor tells a thing, disagrees with the track undecided, and is alone."""
+
+    sensor: str
+    what: What
+    moving: int
+    undecided: int
+    alone: int
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """What the audit of one stretch found: disagreements in order of time, and how much of the way each sensor disagrees."""
+
+    disagreements: tuple[Disagreement, ...]
+    tallies: tuple[Tally, ...]
+
+
+def audited(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
+    """Return the trajectory with deviations raised where sensors disagree with it, and what was found.
+
+    Parameters
+    ----------
+    found : of one stretch.
+    measurements : what fed it.
+    """
+    windows = _windows(found.stamp_ns)
+    if not windows.size:
+        return found, Audit((), ())
+    compared = list(_comparisons(found, measurements, windows))
+    alone = {id(one): _alone(one, compared) for one in compared}
+    moving = _moving(found, windows)
+    tallies = tuple(
+        Tally(
+            one.sensor,
+            one.what,
+            int((one.told & moving).sum()),
+            int((one.disagrees & ~alone[id(one)] & moving).sum()),
+            int((alone[id(one)] & moving).sum()),
+        )
+        for one in compared
+    )
+    told = [each for one in compared for each in _told(one, alone[id(one)], found.stamp_ns, windows)]
+    for what in UNITS:
+        same = [(one, one.disagrees & ~alone[id(one)]) for one in compared if one.what == what]
+        found = _raised(found, what, _largest(same, windows, found.stamp_ns.size))
+    return found, Audit(tuple(sorted(told, key=lambda each: each.start_ns)), tallies)
+
+
+def alone_in_most(tallies: Iterable[Tally]) -> tuple[str, ...]:
+    """Return the sensors that two others contradict in most of the way."""
+    return tuple(dict.fromkeys(t.sensor for t in _summed(tallies) if _most(t.alone, t.moving)))
+
+
+def undecided_in_most(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
+    """Return what sensors contradict in most of the way, where no third tells who is right.
+
+    A position that is off while ways and turns agree is known to be off by how much, and stands in the deviations.
+    """
+    return tuple((t.sensor, t.what) for t in _summed(tallies) if t.what != "position" and _most(t.undecided, t.moving))
+
+
+def _most(windows: int, moving: int) -> bool:
+    return moving >= _FEWEST_WINDOWS and windows > _MOSTLY * moving
+
+
+def _summed(tallies: Iterable[Tally]) -> list[Tally]:
+    """Return the tallies of all stretches, one by sensor and thing."""
+    total: dict[tuple[str, What], Tally] = {}
+    for each in tallies:
+        had = total.get((each.sensor, each.what), Tally(each.sensor, each.what, 0, 0, 0))
+        total[each.sensor, each.what] = replace(
+            had, moving=had.moving + each.moving, undecided=had.undecided + each.undecided, alone=had.alone + each.alone
+        )
+    return list(total.values())
+
+
+def _windows(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return first and last row of each window, shape (W, 2): each begins in the middle of the one before; none bridges a hole."""
+    if stamp_ns.size < 2:
+        return np.empty((0, 2), np.int64)
+    rows = max(2, round(_WINDOW_S * 1e9 / median_period_ns(stamp_ns)))
+    first = np.arange(0, stamp_ns.size - rows, max(1, rows // 2), dtype=np.int64)
+    length_s = (stamp_ns[first + rows] - stamp_ns[first]) * 1e-9
+    first = first[length_s < 1.1 * _WINDOW_S]
+    return np.column_stack((first, first + rows))
+
+
+def _moving(found: Trajectory, windows: NDArray[np.int64]) -> Mask:
+    way_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(found.position_enu_m[:, :2], axis=0).T))))
+    moving: Mask = way_m[windows[:, 1]] - way_m[windows[:, 0]] > _MOVES_M
+    return moving
+
+
+def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64]) -> Iterable[Comparison]:
+    """Yield every comparison that the sensors allow."""
+    zero = int(found.stamp_ns[0])
+    at_s = seconds(found.stamp_ns, zero)
+    step_s = np.diff(at_s)[:, None]
+    rotation = matrix_from_quat(found.quat_xyzw)
+    turned = rotation_vector_from_quat(quat_from_matrix(np.einsum("kji,kjl->kil", rotation[:-1], rotation[1:])))
+    way = np.einsum("kji,kj->ki", rotation[:-1] + rotation[1:], np.diff(found.position_enu_m, axis=0)) / 2.0
+    turn_std, way_std = found.yaw_std_rad[windows[:, 0]], _way_std_m(found)[windows[:, 0]]
+
+    def means(stamp_ns: NDArray[np.int64], values: Floats) -> Floats:
+        told = interval_means(seconds(stamp_ns, zero), values, at_s[:-1], at_s[1:])
+        longest_ns = max(_MAX_GAP_NS, 3 * median_period_ns(stamp_ns))
+        told[in_gap(stamp_ns, found.stamp_ns[:-1], found.stamp_ns[1:], longest_ns=longest_ns)] = np.nan
+        return told
+
+    if m.gnss is not None:
+        yield from _fixes(found, rotation, m.gnss, windows, way_std)
+    if m.imu is not None:
+        rate = means(m.imu.stamp_ns, m.imu.angular_velocity_radps[:, 2:]) * step_s
+        noise = m.imu.gyro_std_radps * np.sqrt(median_period_ns(m.imu.stamp_ns) * 1e-9)
+        yield _turn(IMU, _sums(rate, windows), _sums(turned[:, 2:], windows), noise, turn_std)
+    for role, source in m.odometries().items():
+        axes = slice(0, 1 if role == WHEELS else 2)
+        point = way + np.cross(turned, source.lever_arm_m)
+        yield _way(
+            role,
+            _sums(means(source.stamp_ns, source.velocity_mps[:, axes]) * step_s, windows),
+            _sums(point[:, axes], windows),
+            _noise(source.variance_m2ps2[:, 0], source),
+            way_std,
+            scale_seen=m.gnss is not None,
+        )
+        known = np.asarray(np.isfinite(source.yaw_rate_radps))
+        if known.sum() > 1:
+            rate = means(source.stamp_ns[known], source.yaw_rate_radps[known, None]) * step_s
+            noise = _noise(source.yaw_rate_var[known], source)
+            yield _turn(role, _sums(rate, windows), _sums(turned[:, 2:], windows), noise, turn_std)
+
+
+def _noise(variance: Floats, source: BodyVelocities) -> float:
+    """Return the root of the density of a velocity's white noise."""
+    return float(np.sqrt(np.median(variance) * median_period_ns(source.stamp_ns) * 1e-9))
+
+
+def _sums(values: Floats, windows: NDArray[np.int64]) -> Floats:
+    """Return the sum of (N - 1, k) increments over each window, shape (W, k); NaN where one is unknown."""
+    known = np.asarray(np.isfinite(values).all(1))
+    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(np.where(known[:, None], values, 0.0), axis=0)))
+    lost = np.concatenate(([0], np.cumsum(~known)))
+    first, last = windows.T
+    whole = lost[last] == lost[first]
+    return np.where(whole[:, None], total[last] - total[first], np.nan)
+
+
+def _way_std_m(found: Trajectory) -> Floats:
+    """Return what the track claims of its displacement over a window [m], shape (N,): the longest told one, lengthened."""
+    last_s = DISPLACEMENT_LAGS_S[-1]
+    told = found.displacement_std_m[:, -1] * _WINDOW_S / last_s
+    return np.where(np.isfinite(told), told, found.forward_velocity_std_mps * _WINDOW_S)
+
+
+def _way(role: str, said: Floats, track: Floats, noise: float, track_std: Floats, *, scale_seen: bool) -> Comparison:
+    """Return what an odometry says of the way in each window; its scale is taken out where fixes tell it."""
+    if scale_seen:
+        said = said / _scale(said[:, 0], track[:, 0])
+    length_m = np.linalg.norm(track, axis=1)
+    lasting = np.hypot(_SCALE_STD[role] * length_m, _LASTING_MPS * _WINDOW_S)
+    return Comparison(role, "displacement", said - track, np.hypot(lasting, noise * np.sqrt(_WINDOW_S)), track_std)
+
+
+def _scale(said: Floats, track: Floats) -> float:
+    """Return how many times as far as the track an odometry goes, over all; 1 where it hardly goes."""
+    far = np.isfinite(said) & (np.abs(track) > _MOVES_M)
+    return float(np.clip(np.median(said[far] / track[far]), *_SCALES)) if far.sum() >= _FEWEST_WINDOWS else 1.0
+
+
+def _turn(role: str, said: Floats, track: Floats, noise: float, track_std: Floats) -> Comparison:
+    """Return what a rate says of the turn in each window; its bias, constant over the run, is taken out."""
+    difference = said - track
+    known = np.isfinite(difference[:, 0])
+    bias = np.median(difference[known]) if known.sum() >= _FEWEST_WINDOWS else 0.0
+    lasting = np.hypot(_TURN_SCALE_STD[role] * np.abs(track[:, 0]), _LASTING_RADPS[role] * _WINDOW_S)
+    return Comparison(role, "turn", difference - bias, np.hypot(lasting, noise * np.sqrt(_WINDOW_S)), track_std)
+
+
+def _fixes(
+    found: Trajectory, rotation: Floats, gnss: Positions, windows: NDArray[np.int64], way_std: Floats
+) -> Iterable[Comparison]:
+    """Yield where the fixes are, and how those that the gate took move along and aside, against the antenna on the track."""
+    inside = (gnss.stamp_ns >= found.stamp_ns[0]) & (gnss.stamp_ns <= found.stamp_ns[-1])
+    stamp_ns, zero = gnss.stamp_ns[inside], int(found.stamp_ns[0])
+    antenna = (found.position_enu_m + rotation @ np.asarray(gnss.lever_arm_m))[:, :2]
+    fix_s, at_s = seconds(stamp_ns, zero), seconds(found.stamp_ns, zero)
+    off = gnss.position_enu_m[inside, :2] - np.column_stack([np.interp(fix_s, at_s, axis) for axis in antenna.T])
+    claim = np.sqrt(gnss.variance_m2[inside, :2].mean(1))
+    begin, end = at_s[windows].T
+    middle = (begin + end) / 2.0
+    more_s = max(0.0, _FEWEST_FIXES * 1e-9 * median_period_ns(stamp_ns) - _WINDOW_S) / 2.0
+    place, std = _medians(fix_s, off, claim, begin - more_s, end + more_s)
+    place_std = found.position_std_m[windows[:, 0], :2].max(1)
+    yield Comparison(GNSS, "position", place, std, place_std)
+    refused = found.rejections.stamp_ns[found.rejections.role == GNSS]
+    fed = ~np.isin(stamp_ns, refused)
+    (first, first_std), (last, last_std) = (
+        _medians(fix_s[fed], off[fed], claim[fed], *half) for half in ((begin, middle), (middle, end))
+    )
+    moved = 2.0 * (last - first)
+    ahead = rotation[windows.sum(1) // 2, :2, 0]
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    along = np.sum(moved * ahead, axis=1)
+    aside = moved[:, 1] * ahead[:, 0] - moved[:, 0] * ahead[:, 1]
+    claimed = 2.0 * np.hypot(first_std, last_std)
+    yield Comparison(GNSS, "displacement", np.column_stack((along, aside)), claimed, way_std)
+
+
+def _medians(at_s: Floats, values: Floats, claim: Floats, begin_s: Floats, end_s: Floats) -> tuple[Floats, Floats]:
+    """Return the medians of values (N, 2) and of claims between times, shapes (W, 2) and (W,); NaN and 0 where there are none."""
+    found = np.full((begin_s.size, 3), np.nan)
+    both = np.column_stack((values, claim))
+    bounds = zip(np.searchsorted(at_s, begin_s, "left"), np.searchsorted(at_s, end_s, "right"), strict=True)
+    for window, (first, last) in enumerate(bounds):
+        if last > first:
+            found[window] = np.median(both[first:last], axis=0)
+    return found[:, :2], np.nan_to_num(found[:, 2])
+
+
+def _alone(one: Comparison, compared: Sequence[Comparison]) -> Mask:
+    """Return where two others contradict one, and not each other, shape (W,)."""
+    if one.what == "position":
+        return one.disagrees & (one.size > _NO_ARM_M) & (_holding(compared) >= 2)
+    against = [(each, one.excludes(each)) for each in compared if each.what == one.what and each is not one]
+    alone = np.zeros(one.told.size, np.bool_)
+    for (a, by_a), (b, by_b) in combinations(against, 2):
+        alone |= by_a & by_b & ~a.excludes(b)
+    return alone
+
+
+def _holding(compared: Sequence[Comparison]) -> NDArray[np.int64]:
+    """Return how many sensors besides the fixes hold with the track in all that they tell, shape (W,)."""
+    others = {each.sensor: [c for c in compared if c.sensor == each.sensor] for each in compared if each.sensor != GNSS}
+    holds = [np.all([c.told & ~c.disagrees for c in told], axis=0) for told in others.values()]
+    return np.sum(holds, axis=0) if holds else np.zeros(1, np.int64)
+
+
+def _told(
+    one: Comparison, alone: Mask, stamp_ns: NDArray[np.int64], windows: NDArray[np.int64]
+) -> Iterable[Disagreement]:
+    """Yield a disagreement for every row of windows that overlap."""
+    for kind in (False, True):
+        rows = np.flatnonzero(one.disagrees & (alone == kind))
+        breaks = np.flatnonzero(windows[rows[1:], 0] > windows[rows[:-1], 1]) + 1
+        for run in np.split(rows, breaks) if rows.size else ():
+            worst = int(run[np.argmax(one.size[run])])
+            yield Disagreement(
+                start_ns=int(stamp_ns[windows[run[0], 0]]),
+                end_ns=int(stamp_ns[windows[run[-1], 1]]),
+                sensor=one.sensor,
+                what=one.what,
+                size=float(one.size[worst]),
+                unit=UNITS[one.what],
+                expected_std=float(np.hypot(one.std[worst], one.track_std[worst])),
+                alone=kind,
+            )
+
+
+def _largest(disputed: Iterable[tuple[Comparison, Mask]], windows: NDArray[np.int64], rows: int) -> Floats:
+    """Return the largest difference by any sensor at each of the track's rows, in the windows that are disputed; 0 elsewhere."""
+    size = np.zeros(rows)
+    for one, where in disputed:
+        for (first, last), of_window in zip(windows[where].tolist(), one.size[where].tolist(), strict=True):
+            np.maximum(size[first : last + 1], of_window, out=size[first : last + 1])
+    return size
+
+
+def _raised(found: Trajectory, what: str, size: Floats) -> Trajectory:
+    """Return the trajectory with its deviations raised by the size of what is disputed at each row, shape (N,)."""
+    if not size.any():
+        return found
+    if what == "turn":
+        return replace(found, yaw_std_rad=np.hypot(found.yaw_std_rad, size))
+    if what == "position":
+        return replace(found, position_std_m=np.hypot(found.position_std_m, size[:, None] * [1.0, 1.0, 0.0]))
+    rate = size / _WINDOW_S
+    return replace(
+        found,
+        forward_velocity_std_mps=np.hypot(found.forward_velocity_std_mps, rate),
+        displacement_std_m=np.hypot(found.displacement_std_m, rate[:, None] * DISPLACEMENT_LAGS_S),
+    )

@@ -1,0 +1,40 @@
+"""What the audit found of a whole run: facts for the manifest, and a line for each sensor that disagrees with the track."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tcpipe.fusion.checks.audit import undecided_in_most
+from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.tables.findings import AuditFacts, Disagreement, Findings
+
+
+def audit_findings(fused: Fused) -> Findings[AuditFacts]:
+    """Return every disagreement, the sensors that contradict each other in most of the way, and the warnings of both."""
+    undecided = undecided_in_most(fused.tallies)
+    found = fused.disagreements
+    first_ns = min((stretch.start_ns for stretch in fused.facts), default=0)
+    kinds = dict.fromkeys((each.sensor, each.what, each.alone) for each in found)
+    lines = [_line([e for e in found if (e.sensor, e.what, e.alone) == kind], first_ns) for kind in kinds]
+    if undecided:
+        who = " and ".join(f"{what} by {sensor}" for sensor, what in undecided)
+        lines.append(
+            f"{who}: in most of the way the track is not what this sensor says, and no third tells which is right: no segments; leave out "
+            "the sensor that is wrong ([read] ignore_topics), or mend its scale, mounting or clock"
+        )
+    return Findings(tuple(lines), AuditFacts(tuple(found), tuple(sorted({sensor for sensor, _ in undecided}))))
+
+
+def _line(found: Sequence[Disagreement], first_ns: int) -> str:
+    """Return the line of all disagreements of one kind: how often, the largest, and when that is."""
+    worst = max(found, key=lambda each: each.size / each.expected_std)
+    total_s = sum(each.end_ns - each.start_ns for each in found) * 1e-9
+    begin_s, end_s = ((at_ns - first_ns) * 1e-9 for at_ns in (worst.start_ns, worst.end_ns))
+    times = "" if len(found) == 1 else f"{len(found)} times, {total_s:.0f} s in all; most "
+    what = (
+        f"{worst.sensor}: its {worst.what} is off the track {times}from {begin_s:.0f} to {end_s:.0f} s of the run by {worst.size:.2g} "
+        f"{worst.unit}, expected {worst.expected_std:.2g} {worst.unit} (1 sigma)"
+    )
+    if worst.alone:
+        return f"{what}; two other sensors contradict it, so the track is believed"
+    return f"{what}; deviations are raised there, and segments carry sensors_disagree"
