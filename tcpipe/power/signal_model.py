@@ -39,6 +39,9 @@ _CALM_S, _CALM_SAMPLES = 1.5, 8  # shorter than a halt, longer than what vibrati
 _FEWEST_STILL = 8
 _MOST_OF_CALMEST = 2.0
 """What scatters by more than this, against the calmest stretches, while a robot stands is more than the error of samples."""
+_NOT_NOISE = 16.0
+"""A square beyond so many variances is no noise: of a normal variate one in 16,000."""
+_SIEVES = 5
 _MEDIAN_OF_SQUARE = 0.4549
 """Of a normal variate of unit variance."""
 _NODES = 24  # of the overlap of two periods
@@ -152,11 +155,16 @@ def _fitted(made: Floats, seen: Floats, weight: Floats) -> list[float]:
 def _error_while_still(signal: Samples, still: NDArray[np.bool_]) -> float | None:
     """Return the variance of a sample while the robot stands, in the signal's unit squared; None where it hardly does.
 
-    From the median of the squared differences of following samples, which a motor that starts or stops among them does not move.
+    From the squared differences of following samples, without those that a motor makes which starts or stops among them: what lies
+    beyond four deviations is left out, again and again. A median, from which this begins, is a multiple of the record's resolution.
     """
     if still.sum() <= _FEWEST_STILL:
         return None
-    return float(np.median(np.diff(signal.value[still]) ** 2)) / (2.0 * _MEDIAN_OF_SQUARE)
+    square = np.diff(signal.value[still]) ** 2
+    variance = float(np.median(square)) / _MEDIAN_OF_SQUARE
+    for _ in range(_SIEVES):
+        variance = float(np.mean(square[square <= _NOT_NOISE * variance]))
+    return variance / 2.0
 
 
 def calmest_variance(signal: Samples, period_s: float) -> float:

@@ -133,6 +133,18 @@ def test_what_scatters_while_standing_is_noise(averaged):
     assert np.sqrt((got.std_joule() ** 2).mean()) == pytest.approx(error.std(), rel=0.12)
 
 
+def test_noise_of_a_coarse_record_is_its_own_and_that_of_rounding():
+    """A median of rounded differences is a multiple of the step; motors that start among the samples are no noise."""
+    rng = np.random.default_rng(9)
+    t = np.arange(0, 600, 0.05)
+    step, std_amp = 0.05, 0.113
+    amp = np.where(np.arange(len(t)) % 600 < 300, 0.5, 6.0) + rng.normal(0, std_amp, len(t))
+    still = np.arange(len(t)) % 600 < 305  # five samples of driving are taken as standing
+    signal = samples(ZERO + np.round(t * 1e9).astype(np.int64), np.round(amp / step) * step)
+    found = signal_model(signal, ~still, still, averaged=True)
+    assert found.error_variance == pytest.approx(std_amp**2 + step**2 / 12.0, rel=0.05)
+
+
 def test_what_a_faster_source_would_leave():
     rng = np.random.default_rng(8)
     fine, decay = 0.005, np.exp(-0.005 / 0.5)
