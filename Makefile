@@ -11,7 +11,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 help:
 	@sed -n 's/^#   //p' Makefile
 
-# Where the environment forbids to keep bytecode, each of the hundreds of processes of the tests would compile the package anew.
+# Where the environment forbids to keep bytecode, each process of the tests would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
 .venv/bin/python:
@@ -54,10 +54,12 @@ test: .venv/installed-dev
 check-and-train: check
 	$(if $(TORCH),$(MAKE) .venv/installed-train)
 
-# Compiled while one core checks and installs: each worker of the tests would compile them for itself.
+# Compiled while one core checks and installs, those of both estimators: each worker of the tests would compile them for itself.
 kernels: .venv/installed-dev
 	@rm -rf .venv/tiny
 	$(BIN)/python tests/tiny_pipeline.py .venv/tiny
+	@printf '[fuse]\nestimator = "ukf"\n' > .venv/tiny/ukf.toml
+	$(BIN)/tcpipe ingest .venv/tiny/site/logs --recipe .venv/tiny/ukf.toml --store .venv/tiny/ukf --quiet
 	@rm -rf .venv/tiny
 
 # Changes of the rooms of numbers, one at a time: does a test notice? docs/explanation/mutants.md; an hour and more on one core.

@@ -17,7 +17,7 @@ ENV = {"OMP_NUM_THREADS": "1", "KERAS_BACKEND": os.environ["KERAS_BACKEND"]}
 @pytest.fixture(scope="module")
 def reproduced(tmp_path_factory):
     here = tmp_path_factory.mktemp("reproduced")
-    done = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)  # one and a half minutes on an idle machine
+    done = tcpipe("reproduce", "here", "--quick", cwd=here, env=ENV)
     assert done.returncode == 0, done.stderr
     return here, done
 

@@ -17,7 +17,7 @@ TARGETS = fuzz_log_reading.TARGETS
 
 CHANGES = 8
 """Changed copies of each input of a corpus."""
-RUNS = {"containers": 150, "plans": 400, "definitions": 1000}
+RUNS = {"containers": 75, "plans": 200, "definitions": 500}
 """Inputs of a run with atheris: each takes some seconds."""
 
 
