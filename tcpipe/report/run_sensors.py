@@ -100,7 +100,7 @@ def _clocks(facts: RunFacts) -> list[Section]:
             f"{1e3 * (each.offset_s or 0.0):+.0f} ms",
             f"{2e3 * (each.std_s or 0.0):.0f} ms",
             _drift(each),
-            each.recipe.replace("\n", " ") if each.noted or each.drifts else "",
+            _mended(each),
         )
         for role, each in sorted(offsets.items())
     ]
@@ -111,6 +111,12 @@ def _clocks(facts: RunFacts) -> list[Section]:
         text += f" The clock steps: {'; '.join(steps)}."
     header = ("sensor", "late by", "± (2σ)", "drift", "recipe line that would correct it")
     return [Section("Clocks", text.strip(), header=header, rows=rows)]
+
+
+def _mended(offset: ClockOffset) -> str:
+    if not (offset.noted or offset.drifts):
+        return ""
+    return offset.recipe.replace("\n", " ") if offset.blamed else "none: which of the two is off is not known"
 
 
 def _drift(offset: ClockOffset) -> str:

@@ -7,12 +7,15 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Pair, PowerSignal, RoleOffset, find_clock_offsets
+from tcpipe.fusion.measurements import GNSS
 from tcpipe.power.rails import power_at
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_sanity import longest_epoch
 from tcpipe.stages.power_rails import rails_of
+from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import ClockFacts, ClockOffset, ClockPair, Findings
 from tcpipe.tables.levels import Streams
 
@@ -32,17 +35,44 @@ def clock_findings(streams: Streams, inputs: FusionInputs) -> Findings[ClockFact
     for role, offset in found.offsets.items():
         entry = f"{role} = {given_s.get(role, 0.0) - offset.offset_s:.{3 if offset.std_s < _FINE_S else 2}f}"
         recipe = f'[read.time]\n{role} = "log"' if offset.drifts else f"[read.time_offset_s]\n{entry}"
-        offsets[role] = ClockOffset(**_told(offset), recipe=recipe)
-        if offset.drifts:
-            warnings.append(_drift(found, role, offset))
-        elif offset.noted:
-            warnings.append(
-                f"{role}: its stamps seem {abs(offset.offset_s):.2f} s {'late' if offset.offset_s > 0 else 'early'} against "
-                f"{found.reference} (± {2 * offset.std_s:.2f} s, by {_means(found, role)}); nothing is corrected; "
-                f"to correct it, write in the recipe under [read.time_offset_s]: {entry}"
-            )
+        offsets[role] = ClockOffset(**_told(offset), recipe="" if _is_open(offset) else recipe)
+        if offset.drifts or offset.noted:
+            warnings.append(_said(found, role, offset, entry))
     pairs = tuple(ClockPair(**_told(pair), determined=pair.determined) for pair in found.pairs)
-    return Findings(tuple(warnings), ClockFacts(epoch, found.reference, pairs, offsets))
+    facts = ClockFacts(epoch, found.reference, pairs, offsets, position_offset_s=found.position_offset_s or None)
+    return Findings(tuple(warnings), facts)
+
+
+def _is_open(offset: RoleOffset) -> bool:
+    """Whether two clocks differ and nothing tells whose is off."""
+    return (offset.noted or offset.drifts) and not offset.blamed
+
+
+def _said(found: ClockOffsets, role: str, offset: RoleOffset, entry: str) -> str:
+    """Return what a person should know of a clock; a line for the recipe only where two others agree against it."""
+    change_s, change_std_s = (each * found.span_s / 3600 for each in (offset.drift_s_per_h, offset.drift_std_s_per_h))
+    drift = f"over the run (± {2 * change_std_s:.2f} s, by {_means(found, role)})"
+    constant = f"(± {2 * offset.std_s:.2f} s, by {_means(found, role)})"
+    if _is_open(offset):
+        by = (
+            f"drift apart by {abs(change_s):.2f} s {drift}"
+            if offset.drifts
+            else f"differ by {abs(offset.offset_s):.2f} s {constant}"
+        )
+        cost = "; every position's deviation counts that much driving in" if GNSS in {role, found.reference} else ""
+        return (
+            f"{role} and {found.reference}: their stamps {by}, and no two other sensors agree on which of them is off: "
+            f"nothing is corrected or advised{cost}"
+        )
+    if offset.drifts:
+        return (
+            f"{role}: its stamps drift against {found.reference} by {change_s:+.2f} s {drift}: no constant offset corrects that; "
+            f'where the recorder\'s clock is the better one, write in the recipe under [read.time]: {role} = "log"'
+        )
+    return (
+        f"{role}: its stamps seem {abs(offset.offset_s):.2f} s {'late' if offset.offset_s > 0 else 'early'} against {found.reference} "
+        f"{constant}; nothing is corrected; to correct it, write in the recipe under [read.time_offset_s]: {entry}"
+    )
 
 
 def _told(each: RoleOffset | Pair) -> dict[str, Any]:
@@ -50,18 +80,21 @@ def _told(each: RoleOffset | Pair) -> dict[str, Any]:
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in asdict(each).items()}
 
 
-def _drift(found: ClockOffsets, role: str, offset: RoleOffset) -> str:
-    change_s = offset.drift_s_per_h * found.span_s / 3600
-    return (
-        f"{role}: its stamps drift against {found.reference} by {change_s:+.2f} s over the run "
-        f"(± {2 * offset.drift_std_s_per_h * found.span_s / 3600:.2f} s, by {_means(found, role)}): no constant offset corrects that; "
-        f'where the recorder\'s clock is the better one, write in the recipe under [read.time]: {role} = "log"'
-    )
-
-
 def _means(found: ClockOffsets, role: str) -> str:
     """Return by what the role was compared."""
     return " and ".join(dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against}))
+
+
+def with_offset_cost(track: pa.Table, clocks: ClockFacts) -> pa.Table:
+    """Return the track with what an unresolved offset of the fixes' clock costs: the way driven in it, in the positions' deviations."""
+    offset_s = clocks.position_offset_s
+    if not offset_s:
+        return track
+    for axis, name in zip("xyz", ("east", "north", "up"), strict=True):
+        column = f"{axis}_std_m"
+        raised = np.hypot(floats(track, column), offset_s * floats(track, f"{name}_velocity_mps"))
+        track = track.set_column(track.column_names.index(column), track.schema.field(column), pa.array(raised))
+    return track
 
 
 def _power(streams: Streams, epoch: int) -> PowerSignal | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.recipe import FuseConfig
-from tcpipe.stages.clock_doctor import clock_findings
+from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
 from tcpipe.stages.fuse_audit import audit_findings
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, rejections_table
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
@@ -50,6 +50,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     # 4. What was left out, where sensors disagree with the track, and whether their clocks agree.
     summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     clocks = clock_findings(streams, inputs)
+    table = with_offset_cost(table, clocks.facts)
     audit = audit_findings(fused)
     warnings = (*fuse_warnings(inputs, summary), *sanity.warnings, *audit.warnings, *clocks.warnings)
     facts = replace(

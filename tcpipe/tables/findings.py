@@ -215,7 +215,10 @@ class ClockPair:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.Offset`), and the recipe lines that would correct it."""
+    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.RoleOffset`), and the recipe lines that would correct it.
+
+    Where it is not ``blamed``, only that it and the reference differ is known, and there are no lines.
+    """
 
     offset_s: float | None
     std_s: float | None
@@ -224,16 +227,21 @@ class ClockOffset:
     drift_std_s_per_h: float | None
     drifts: bool
     recipe: str
+    blamed: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class ClockFacts:
-    """The sensors' clocks in one epoch: all pairs compared, and by role each one's offset from the reference."""
+    """The sensors' clocks in one epoch: all pairs compared, and by role each one's offset from the reference.
+
+    ``position_offset_s`` times the velocity is in the track's position deviations: by so much the fixes' clock may be off [s].
+    """
 
     epoch: int
     reference: str
     pairs: tuple[ClockPair, ...]
     offsets: Mapping[str, ClockOffset]
+    position_offset_s: float | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,17 +1,19 @@
 """The clock doctor: offsets between the stamps of a run's sensors, and their drift, from what they say of the same motion.
 
-Speed of the wheels against that of the fixes, yaw rate against the gyroscope, power against what speed and acceleration cost. Each pair
-that can be compared gives a lag with its standard deviation (`lags`), over the whole run and in windows of ten minutes, through which a
-line tells the drift; the pairs together give each sensor's offset from the clock that most of them share. Nothing is corrected here: a
-person decides. The course of the fixes is not held against the gyroscope: an antenna that sits ahead of the turning point by l leads the
-body's course by l / v, 0.1 s for 10 cm.
+Speed of the wheels against that of the fixes, yaw rate against the gyroscope, changes of speed against the accelerometer, power against
+what speed and acceleration cost. A pair is compared only where the robot turns or changes its speed: on a straight there is nothing to
+compare but what the controller corrects, and that leads the body. Each gives a lag with its standard deviation (`lags`), over the whole run
+and in windows of ten minutes, through which a line tells the drift; the pairs together give each sensor's offset from the clock that most
+of them share. A sensor is blamed only where two others agree against it and no pair contradicts; else two differ, and nobody knows which
+is off. Nothing is corrected here: a person decides. The course of the fixes is not held against the gyroscope: an antenna that sits
+ahead of the turning point by l leads the body's course by l / v, 0.1 s for 10 cm.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.checks.gridded_motion import FIXES_S, fix_velocity, on_grid, twist_on_grid
 from tcpipe.fusion.checks.lags import GRID_S, Floats, averaged, lag_of, lag_products
 from tcpipe.fusion.checks.windows import span_ns, windows_ns
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements, part
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions, part
 from tcpipe.fusion.signals import median_period_ns
 
 POWER = "power"
@@ -32,7 +34,12 @@ _SURE = 4.0  # standard deviations
 _MAX_STD_S = {POWER: 0.04}
 _MAX_MOTION_STD_S = 0.02
 _MIN_EXPLAINED = 0.25
+_TURNS_RADPS = 0.1
+_CHANGES_MPS = 0.1
+_LIVELY_S = 2.0
+"""Rows this near to a turn or a change of speed are compared [s]."""
 _ODOMETRY_S = 0.1
+_ACCELERATION_S = 0.3
 _POWER_S = 0.2
 _SLOW_S = 4.0
 _STOPPED_MPS = 0.1
@@ -41,6 +48,10 @@ _WINDOW_NS = 600_000_000_000
 _MARGIN_NS = 5_000_000_000
 _FEWEST_WINDOWS = 3
 _LEAST_STD_S = 1e-3
+_LEAST_BY_FORCE_S = 0.02
+"""Slopes are felt as accelerations: what the accelerometer tells of a clock is a check more than a measure [s]."""
+
+YAW_RATE, SPEED, ACCELERATION = "yaw rate", "speed", "acceleration"
 
 Signals = tuple[str, str, str, Floats, Floats]
 
@@ -68,12 +79,18 @@ class Pair:
         """Whether the offset is known well enough to be spoken of: to a small error, or as surely not zero."""
         return _determined(self.late, self.offset_s, self.std_s, self.explained)
 
+    @property
+    def weight_std_s(self) -> float:
+        """Its standard deviation beside other pairs' [s]."""
+        return max(self.std_s, _LEAST_BY_FORCE_S if self.by == ACCELERATION else _LEAST_STD_S)
+
 
 @dataclass(frozen=True, slots=True)
 class RoleOffset:
     """How late a sensor's stamps are against the reference's [s], their drift [s/h, NaN where unknown], with standard deviations.
 
-    ``noted`` and ``drifts``: whether a person should act on either.
+    ``noted`` and ``drifts``: whether a person should act on either. ``blamed``: whether two others agree against it and nothing
+    contradicts; otherwise it and the reference differ, and which of them is off is not known.
     """
 
     offset_s: float
@@ -82,6 +99,7 @@ class RoleOffset:
     drift_s_per_h: float = math.nan
     drift_std_s_per_h: float = math.nan
     drifts: bool = False
+    blamed: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +122,15 @@ class ClockOffsets:
     reference: str
     offsets: Mapping[str, RoleOffset]
     span_s: float = 0.0
+
+    @property
+    def position_offset_s(self) -> float:
+        """By how much the fixes' clock may be off [s]: the robot's speed times this is an error of every position."""
+        gnss = self.offsets.get(GNSS)
+        if gnss is None or not (gnss.noted or gnss.drifts):
+            return 0.0
+        drifted_s = abs(gnss.drift_s_per_h) * self.span_s / 7200.0 if gnss.drifts else 0.0
+        return abs(gnss.offset_s) + drifted_s
 
 
 def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) -> ClockOffsets:
@@ -135,23 +162,61 @@ def find_clock_offsets(measurements: Measurements, power: PowerSignal | None) ->
 def _signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64]) -> Iterable[Signals]:
     """Yield what can be compared in a window: whose stamps against whose, by what, target and regressors on the grid."""
     twists = {role: twist_on_grid(source, at_ns) for role, source in m.odometries().items()}
-    gyro = (
-        None if m.imu is None else averaged(on_grid(m.imu.stamp_ns, m.imu.angular_velocity_radps, at_ns), _ODOMETRY_S)
-    )
-    if gyro is not None:
-        for role in twists:
-            yield role, IMU, "yaw rate", averaged(twists[role], _ODOMETRY_S)[:, 1], gyro
+    if m.imu is not None:
+        yield from _against_imu(m.imu, twists, m.gnss, at_ns)
+    speeds = {role: averaged(np.abs(of[:, :1]), _ODOMETRY_S) for role, of in twists.items()}
     if len(twists) == 2:
-        speeds = {role: _quick(averaged(np.abs(of[:, :1]), _ODOMETRY_S)) for role, of in twists.items()}
-        yield VISUAL, WHEELS, "speed", speeds[VISUAL][:, 0], speeds[WHEELS]
-    if m.gnss is not None and twists:
-        role = next(iter(twists))
-        seen = averaged(averaged(_antenna_speed(twists[role], m.gnss.lever_arm_m), FIXES_S), FIXES_S)
-        fixes = np.abs(fix_velocity(m.gnss, at_ns))
-        yield GNSS, role, "speed", _quick(fixes[:, None])[:, 0], _quick(seen)
+        yield VISUAL, WHEELS, SPEED, *_where_it_changes(speeds[VISUAL], speeds[WHEELS])
+    for role, twist in twists.items():
+        if m.gnss is not None:
+            seen = averaged(averaged(_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S)
+            yield GNSS, role, SPEED, *_where_it_changes(np.abs(fix_velocity(m.gnss, at_ns))[:, None], seen)
     if power is not None and twists:
         role = next(iter(twists))
         yield POWER, role, "power of speed, acceleration and turning", *_power(power, twists[role], at_ns)
+
+
+def _against_imu(
+    imu: InertialMeasurements, twists: Mapping[str, Floats], gnss: Positions | None, at_ns: NDArray[np.int64]
+) -> Iterable[Signals]:
+    """Yield what the gyroscope and the accelerometer tell of turns and changes of speed."""
+    gyro = averaged(on_grid(imu.stamp_ns, imu.angular_velocity_radps, at_ns), _ODOMETRY_S)
+    for role, twist in twists.items():
+        turning = averaged(twist, _ODOMETRY_S)[:, 1]
+        yield role, IMU, YAW_RATE, np.where(_beside(np.abs(turning) > _TURNS_RADPS), turning, np.nan), gyro
+    if not imu.accelerometer_usable:
+        return
+    force = on_grid(imu.stamp_ns, imu.specific_force_mps2, at_ns)
+    for role, twist in twists.items():
+        yield (
+            role,
+            IMU,
+            ACCELERATION,
+            *_changes(averaged(twist[:, :1], _ACCELERATION_S), averaged(force, _ACCELERATION_S)),
+        )
+    if gnss is not None:
+        ahead = np.sign(next(iter(twists.values()))[:, 0]) if twists else 1.0
+        speed = averaged((ahead * np.abs(fix_velocity(gnss, at_ns)))[:, None], FIXES_S)
+        yield GNSS, IMU, ACCELERATION, *_changes(speed, averaged(averaged(averaged(force, FIXES_S), FIXES_S), FIXES_S))
+
+
+def _changes(speed: Floats, force: Floats) -> tuple[Floats, Floats]:
+    """Return how fast a speed (M, 1) changes [m/s²] and the force (M, 3) that would do it, where the speed changes."""
+    lively = _beside(np.abs(_quick(speed)[:, 0]) > _CHANGES_MPS)
+    rate = _quick(np.gradient(speed, GRID_S, axis=0))[:, 0]
+    return np.where(lively, rate, np.nan), _quick(force)
+
+
+def _where_it_changes(target: Floats, seen: Floats) -> tuple[Floats, Floats]:
+    """Return two speeds (M, 1) without their slow parts, the first only near changes of the second."""
+    quick = _quick(seen)
+    return np.where(_beside(np.abs(quick[:, 0]) > _CHANGES_MPS), _quick(target)[:, 0], np.nan), quick
+
+
+def _beside(lively: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return what lies near something lively, shape (M,)."""
+    beside: NDArray[np.bool_] = averaged(lively.astype(np.float64)[:, None], 2 * _LIVELY_S)[:, 0] > 0
+    return beside
 
 
 def _within(power: PowerSignal | None, first_ns: int, last_ns: int) -> PowerSignal | None:
@@ -236,22 +301,48 @@ def _settled(pairs: tuple[Pair, ...], span_s: float = 0.0) -> ClockOffsets:
     reference = ""
     for role in linked:
         offsets = _against(role, linked, known, span_s)
-        if not best or _agreeing(offsets) > _agreeing(best):
+        if not best or len(_agreeing(offsets)) > len(_agreeing(best)):
             best, reference = offsets, role
-    return ClockOffsets(pairs, reference, {role: offset for role, offset in best.items() if role != reference}, span_s)
+    agreeing = _agreeing(best)
+    told = {
+        role: replace(offset, blamed=role not in agreeing and _is_blamed(role, agreeing, best, known))
+        for role, offset in best.items()
+        if role != reference
+    }
+    return ClockOffsets(pairs, reference, told, span_s)
 
 
-def _agreeing(offsets: Mapping[str, RoleOffset]) -> int:
-    """Count the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
-    return sum(
-        abs(offset.offset_s) <= _NOTED_S.get(role, _NOTED_MOTION_S) and not offset.drifts
+def _agreeing(offsets: Mapping[str, RoleOffset]) -> frozenset[str]:
+    """Return the sensors that are near the reference; how surely does not matter: against a doubtful clock nobody is surely off."""
+    return frozenset(
+        role
         for role, offset in offsets.items()
+        if abs(offset.offset_s) <= _NOTED_S.get(role, _NOTED_MOTION_S) and not offset.drifts
     )
+
+
+def _is_blamed(role: str, agreeing: frozenset[str], offsets: Mapping[str, RoleOffset], pairs: Sequence[Pair]) -> bool:
+    """Whether two sensors that agree speak against a role by the same kind of motion, and no pair contradicts any of them.
+
+    A yaw rate says nothing of the clock of a speed: a filter may pass the gyroscope's on at once and smooth the wheels'.
+    """
+    among = [pair for pair in pairs if {pair.late, pair.against} <= agreeing | {role}]
+    apart = (abs(p.offset_s - offsets[p.late].offset_s + offsets[p.against].offset_s) for p in among)
+    if any(gap_s > max(_SURE * p.weight_std_s, _NOTED_MOTION_S) for gap_s, p in zip(apart, among, strict=True)):
+        return False
+    for turning in (True, False):
+        links = [{p.late, p.against} for p in among if (p.by == YAW_RATE) == turning]
+        heard = {role}
+        for _ in links:
+            heard |= {each for link in links if link & heard for each in link}
+        if len(heard) > 2:
+            return True
+    return False
 
 
 def _against(reference: str, roles: list[str], pairs: list[Pair], span_s: float) -> dict[str, RoleOffset]:
     """Return the offsets of the sensors that pairs connect to the reference, its own (zero) included."""
-    offsets = _solved(reference, roles, [(p.late, p.against, p.offset_s, max(p.std_s, _LEAST_STD_S)) for p in pairs])
+    offsets = _solved(reference, roles, [(p.late, p.against, p.offset_s, p.weight_std_s) for p in pairs])
     least = 3600.0 * _LEAST_STD_S / max(span_s, 1.0)
     told = [p for p in pairs if math.isfinite(p.drift_s_per_h)]
     drifts = _solved(

@@ -2,8 +2,10 @@
 
 Both sides stand on one grid, smoothed alike, so that smoothing moves neither. For every lag the target is fitted by the regressors
 (linear, with a constant); the best lag is where that explains most of the target's variance, refined by a parabola. With one regressor
-this is the peak of the normalised cross-correlation. The standard deviation is the delete-a-group jackknife's over contiguous groups of
-time (Miller 1974, Biometrika 61): it needs no model of the residuals, and a lag that hangs on one event has a large one.
+this is the peak of the normalised cross-correlation. Its standard deviation is the larger of two. That of least squares: the noise that is
+left over the curvature of the peak, so that a flat peak tells little. And the delete-a-group jackknife's over contiguous groups of time
+(Miller 1974, Biometrika 61), which needs no model of the residuals. Where fewer than four groups hold anything, or another peak is
+nearly as high, nothing is said.
 """
 
 from __future__ import annotations
@@ -25,7 +27,12 @@ MAX_LAG_S = 1.2
 _TARGET_ROWS = 5  # the target is taken at every fifth row: nothing smoothed over 0.1 s is lost
 _GROUPS = 20
 _FEWEST_GROUPS = 8
+_FEWEST_EVENTS = 4
 _MIN_GROUP_S = 2.0
+_ALIKE_ROWS = 2
+"""What is left is alike over this many rows: signals are smoothed over 0.1 to 0.2 s."""
+_CLEARLY = 10.83
+"""99.9 % of chi-squared with one degree of freedom: a rival peak must fit worse by this."""
 _TINY = 1e-12
 
 Floats = NDArray[np.float64]
@@ -80,7 +87,8 @@ def find_lag(target: Floats, regressors: Floats) -> Lag | None:
 
     Returns
     -------
-    None where too little is known, where the best lag lies at the end of the search, or where a constant explains the target.
+    None where too little is known, where the best lag lies at the end of the search or another is as good, or where a constant explains
+    the target.
     """
     products = lag_products(target, regressors)
     return None if products is None else lag_of([products])
@@ -89,15 +97,38 @@ def find_lag(target: Floats, regressors: Floats) -> Lag | None:
 def lag_of(windows: Sequence[Floats]) -> Lag | None:
     """Return the lag of several windows of time together; ``windows`` are of `lag_products`, of the same signals."""
     products = _merged(np.concatenate(windows, axis=1))
+    products = products[:, (products[:, :, -2, -2] > 0).all(axis=0)]
+    groups = products.shape[1]
+    if groups < _FEWEST_EVENTS:
+        return None
     whole = products.sum(1)
     explained = _explained(whole)
     offset_s = _peak(explained)
-    left_out = [_peak(_explained(whole - products[:, g])) for g in range(products.shape[1])]
+    left_out = [_peak(_explained(whole - products[:, g])) for g in range(groups)]
     if not np.isfinite([offset_s, *left_out]).all():
         return None
-    groups = len(left_out)
-    std_s = float(np.sqrt((groups - 1) / groups * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
-    return Lag(offset_s, std_s, float(explained.max()))
+    best = int(np.argmax(explained))
+    independent = float(whole[best, -2, -2]) / _ALIKE_ROWS
+    if _has_rival(explained, best, independent):
+        return None
+    jackknife_s = float(np.sqrt((groups - 1) / groups * np.sum((np.array(left_out) - np.mean(left_out)) ** 2)))
+    return Lag(offset_s, max(jackknife_s, _flatness_s(explained, best, independent)), float(explained[best]))
+
+
+def _flatness_s(explained: Floats, best: int, independent: float) -> float:
+    """Return the standard deviation of a peak [s] by least squares: the noise that is left over the peak's curvature."""
+    before, at, after = explained[best - 1 : best + 2]
+    curvature = (2 * at - before - after) / GRID_S**2
+    return float(np.sqrt(2 * max(1.0 - at, 0.0) / (independent * curvature))) if curvature > 0 else np.inf
+
+
+def _has_rival(explained: Floats, best: int, independent: float) -> bool:
+    """Whether another peak is about as high: of a motion that repeats itself no lag can be told."""
+    inner = explained[1:-1]
+    peaks = 1 + np.flatnonzero((inner >= explained[:-2]) & (inner >= explained[2:]))
+    others = explained[peaks[np.abs(peaks - best) > 1]]
+    worse = independent * np.log(np.maximum(1.0 - others, _TINY) / max(1.0 - explained[best], _TINY))
+    return bool((worse < _CLEARLY).any())
 
 
 def _merged(products: Floats) -> Floats:

@@ -3,13 +3,15 @@
 import tomllib
 from dataclasses import replace
 
+import pyarrow as pa
 import pytest
 from simulated_streams import log_of, streams_of
 
 from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import scenario
-from tcpipe.stages.clock_doctor import clock_findings
+from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
 from tcpipe.stages.fuse_inputs import prepare_inputs
+from tcpipe.tables.findings import ClockFacts
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
 WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020, "power": 0.050}
@@ -71,3 +73,16 @@ def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
     assert "gnss" not in found.facts.offsets
     assert found.warnings == ()
     assert not any(pair.determined for pair in found.facts.pairs if pair.late == "gnss")
+
+
+def test_what_an_offset_costs_is_the_way_driven_in_it():
+    """0.2 s at 0.6 m/s east and 0.8 m/s north: 0.12 and 0.16 m, beside 0.05 m that were claimed."""
+    velocity, std = {"east": 0.6, "north": 0.8, "up": 0.0}, dict.fromkeys("xyz", 0.05)
+    columns = {f"{axis}_velocity_mps": [value, -value] for axis, value in velocity.items()}
+    track = pa.table(columns | {f"{axis}_std_m": [value] * 2 for axis, value in std.items()})
+    facts = ClockFacts(0, "imu", (), {}, position_offset_s=0.2)
+    found = with_offset_cost(track, facts)
+    assert found.column("x_std_m").to_pylist() == pytest.approx([0.13, 0.13])
+    assert found.column("y_std_m").to_pylist() == pytest.approx([(0.16**2 + 0.05**2) ** 0.5] * 2)
+    assert found.column("z_std_m").to_pylist() == [0.05, 0.05]
+    assert with_offset_cost(track, replace(facts, position_offset_s=None)) is track

@@ -1,5 +1,7 @@
 """From pairs to one clock: who is late is settled by least squares and by the majority; worked out by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,8 +9,8 @@ from tcpipe.fusion.checks.clock_offsets import Pair, _settled, find_clock_offset
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 
 
-def pair(late, against, offset_s, std_s=0.002, explained=0.9):
-    return Pair(late, against, "speed", offset_s, std_s, explained)
+def pair(late, against, offset_s, std_s=0.002, explained=0.9, *, by="speed"):
+    return Pair(late, against, by, offset_s, std_s, explained)
 
 
 def test_the_one_that_differs_is_the_one_that_is_late():
@@ -73,6 +75,37 @@ def test_small_offsets_are_not_noted_and_power_may_be_off_by_more():
     assert all(_settled(pairs).offsets[role].noted for role in ("gnss", "power"))
 
 
+def blamed(*pairs):
+    return {role for role, offset in _settled(pairs).offsets.items() if offset.blamed}
+
+
+def test_a_sensor_is_blamed_only_where_two_others_agree_against_it():
+    late = pair("gnss", "wheel_odometry", 0.2)
+    assert blamed(late) == set()
+    assert blamed(late, pair("wheel_odometry", "imu", 0.001, by="acceleration")) == {"gnss"}
+    assert blamed(late, pair("gnss", "visual_odometry", 0.2)) == {"gnss"}
+    assert blamed(late, pair("visual_odometry", "wheel_odometry", 0.0)) == {"gnss"}
+
+
+def test_a_yaw_rate_does_not_speak_for_a_speed():
+    """A filter that smooths the speed and passes the gyroscope's rate on: the fixes seem early, and are not."""
+    smoothed = pair("gnss", "wheel_odometry", -0.15), pair("wheel_odometry", "imu", 0.0, by="yaw rate")
+    found = _settled(smoothed)
+    assert found.offsets["gnss"].noted
+    assert blamed(*smoothed) == set()
+    assert (
+        blamed(*smoothed, pair("wheel_odometry", "imu", 0.15, by="acceleration")) == set()
+    )  # it contradicts its own yaw rate
+
+
+def test_what_the_clock_of_the_fixes_may_be_off_by_is_a_cost_of_positions():
+    drifting = Pair("gnss", "wheel_odometry", "speed", 0.1, 0.002, 0.9, 0.36, 0.01)
+    assert _settled((drifting,), 3600.0).position_offset_s == pytest.approx(0.1 + 0.18)
+    assert _settled((pair("gnss", "wheel_odometry", -0.1),)).position_offset_s == pytest.approx(0.1)
+    assert _settled((pair("gnss", "wheel_odometry", 0.01),)).position_offset_s == 0.0
+    assert _settled((pair("imu", "wheel_odometry", 0.1),)).position_offset_s == 0.0
+
+
 HALF_HOUR = np.arange(0.0, 1900.0, 0.04)
 
 
@@ -132,3 +165,22 @@ def test_the_drift_of_the_reference_is_its_own():
     assert found.reference == "wheel_odometry"
     assert {role for role, offset in found.offsets.items() if offset.drifts} == {"imu"}
     assert found.offsets["imu"].drift_s_per_h == pytest.approx(0.72, rel=0.05)
+
+
+def test_a_straight_tells_nothing_of_clocks():
+    """On 1.8 km without a turn the controller weaves: the wheels steer against what the gyroscope felt 0.28 s before."""
+    straight = drive_with_clocks()
+    weave = 0.03 * np.sin(0.7 * HALF_HOUR + np.sin(0.05 * HALF_HOUR))
+    speed = np.clip(np.minimum(HALF_HOUR - 2.0, 1890.0 - HALF_HOUR), 0.0, 1.0)
+    noise = np.random.default_rng(3).normal(0, 0.01, (3, HALF_HOUR.size))
+    wheels = replace(
+        straight.wheels,
+        velocity_mps=np.column_stack((speed + noise[0], *straight.wheels.velocity_mps[:, 1:].T)),
+        yaw_rate_radps=np.roll(weave, 7) + noise[1],
+    )
+    gyro = straight.imu.angular_velocity_radps.copy()
+    gyro[:, 2] = weave + noise[2]
+    imu = replace(straight.imu, angular_velocity_radps=gyro)
+    found = find_clock_offsets(Measurements(imu=imu, wheels=wheels), None)
+    assert found.offsets == {}
+    assert not any(each.determined for each in found.pairs)

@@ -68,3 +68,20 @@ def test_a_running_mean_knows_nothing_beside_a_hole():
     mean = averaged(values, 4 * GRID_S)[:, 0]
     np.testing.assert_array_equal(np.flatnonzero(np.isfinite(mean)), [2, 3, 4, 5, 6, 7, 13, 14, 15, 16, 17])
     np.testing.assert_allclose(mean[[2, 7, 17]], [2.0, 7.0, 17.0])
+
+
+def test_a_motion_that_repeats_itself_and_one_event_give_no_lag():
+    slalom = averaged(np.sin(2 * np.pi * SECONDS / 0.8)[:, None], 0.1)  # three periods lie in the search
+    assert find_lag(slalom[:, 0], slalom) is None
+    once = averaged(np.clip(SECONDS - 60.0, 0.0, 1.0)[:, None], 0.2)
+    masked = np.where(np.abs(SECONDS - 60.5) < 3.0, once[:, 0], np.nan)
+    assert find_lag(masked, once) is None
+
+
+def test_a_flat_peak_tells_little_however_alike_its_parts_are():
+    rng = np.random.default_rng(2)
+    slow = averaged(np.sin(2 * np.pi * SECONDS / 10.0)[:, None], 0.2)
+    noisy = slow[:, 0] + averaged(rng.normal(0.0, 2.0, (AT.size, 1)), 0.2)[:, 0]
+    found, clear = find_lag(noisy, slow), find_lag(slow[:, 0] + 1e-3 * noisy, slow)
+    assert found is None or found.std_s > 0.05
+    assert clear.std_s < 1e-2
