@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
-from tcpipe.logs.coverage import coverage, covering_little
+from tcpipe.logs.coverage import LITTLE_SPAN, LITTLE_SPAN_OF_POWER, coverage, covering_little
 from tcpipe.logs.robots import find_robot
 from tcpipe.logs.several_robots import namespaces_of_robots
 from tcpipe.logs.topics import Topic
@@ -372,7 +372,7 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     names = tuple(topic.name for topic in topics)
     taken = set(names)
     others = [topic for _, _, topic in candidates if topic.name not in taken]
-    thin = covering_little(others, topics)
+    thin = _thin(role, others, topics)
     if len(first) == 1:
         better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
         better = f"{better} than {_names(others)}" if others else f"the only {topics[0].type_name}"
@@ -397,10 +397,14 @@ def _best(role: str, candidates: Ranked) -> list[tuple[str, Topic]]:
     Of power all of a rank are taken, since sides are summed: one that fell silent is still a side.
     """
     topics = [topic for _, _, topic in candidates]
-    thin = covering_little(topics, topics)
+    thin = _thin(role, topics, topics)
     ample = [entry for entry in candidates if entry[2].name not in thin] or candidates
     best = min(rank for rank, _, _ in ample)
     return [(why, topic) for rank, why, topic in (candidates if role == "power" else ample) if rank == best]
+
+
+def _thin(role: str, topics: Sequence[Topic], rivals: Sequence[Topic]) -> frozenset[str]:
+    return covering_little(topics, rivals, little_span=LITTLE_SPAN_OF_POWER if role == "power" else LITTLE_SPAN)
 
 
 def _rails(topics: Iterable[Topic]) -> tuple[str, ...]:

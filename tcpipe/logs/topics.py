@@ -25,6 +25,8 @@ class Topic:
     encoding: str
     definition: str
     problem: str | None = None
+    silent_ns: int = 0
+    """How long between the first and the last message there was none, as far as the index tells [ns]."""
 
     def joined(self, other: Topic) -> Topic:
         """Return this topic with the messages of ``other``, the same topic in another file."""
@@ -38,6 +40,7 @@ class Topic:
             end_ns=max(ends, default=None),
             definition=self.definition or other.definition,
             problem=self.problem or other.problem,
+            silent_ns=self.silent_ns + other.silent_ns,
         )
 
 

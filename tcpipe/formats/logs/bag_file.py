@@ -45,6 +45,7 @@ from tcpipe.formats.logs.log_part import (
     decompressed_prefix,
     listed,
 )
+from tcpipe.logs.coverage import silence_ns
 from tcpipe.logs.topics import Damage, normalized_type_name
 
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
@@ -465,4 +466,5 @@ def _channel(connection: _Connection) -> Channel:
         connection.count,
         min(connection.starts, default=None),
         max(connection.ends, default=None),
+        silence_ns(list(zip(connection.starts, connection.ends, strict=True)), connection.count),
     )

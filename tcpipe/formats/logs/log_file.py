@@ -446,6 +446,7 @@ def _topic(channel: Channel, types: TypeLibrary) -> Topic:
         channel.encoding,
         channel.definition,
         problem,
+        channel.silent_ns,
     )
 
 

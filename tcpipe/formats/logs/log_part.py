@@ -70,6 +70,7 @@ class Channel:
     message_count: int | None = None
     start_ns: int | None = None
     end_ns: int | None = None
+    silent_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

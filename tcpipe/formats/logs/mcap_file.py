@@ -65,6 +65,7 @@ from tcpipe.formats.logs.mcap_records import (
     record_offsets,
 )
 from tcpipe.formats.logs.mcap_summary import Contents, read_summary
+from tcpipe.logs.coverage import silence_ns
 from tcpipe.logs.topics import Damage, normalized_type_name
 
 _LOOSE_BYTES = 1 << 22
@@ -490,11 +491,16 @@ class McapPart:
             count,
             start_ns,
             end_ns,
+            silence_ns([(chunk.start_ns, chunk.end_ns) for chunk in self._holding(number)], count),
         )
+
+    def _holding(self, channel: int) -> list[Chunk]:
+        """Return the chunks that hold messages of a channel, by the index."""
+        return [chunk for chunk in self._contents.chunks if chunk.index and channel in chunk.index]
 
     def _times(self, channel: int) -> tuple[int | None, int | None]:
         """Return the channel's first and last log time, from the message indexes of the chunks at both ends."""
-        holding = [chunk for chunk in self._contents.chunks if chunk.index and channel in chunk.index]
+        holding = self._holding(channel)
         if not holding:
             return None, None
         first, last = min(holding, key=lambda c: c.start_ns), max(holding, key=lambda c: c.end_ns)
