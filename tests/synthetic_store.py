@@ -82,7 +82,7 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
     return LABELLED_SEGMENTS.table(**given, **rest)
 
 
-def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None, track=None):
+def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None, track=None, warnings=()):
     """Put a run with these segments, and this gated track, into the store, as ingestion would."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
@@ -104,7 +104,7 @@ def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, se
         tags={},
         counts=Counts(table.num_rows),
         ledger_m=ledger_m,
-        warnings=(),
+        warnings=warnings,
         damage=(),
         info=info,
     )

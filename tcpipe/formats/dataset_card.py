@@ -84,8 +84,26 @@ class RunSource:
 
 
 @dataclass(frozen=True, slots=True)
+class RunFinding:
+    """One cause that ingest warned of: the first run's line, the runs whose lines differ by figures and topics alone, their samples."""
+
+    example: str
+    runs: tuple[str, ...]
+    samples: int
+
+
+@dataclass(frozen=True, slots=True)
+class Doubtful:
+    """Samples that carry any quality flag: how many, their share of all (0 to 1), and by flag."""
+
+    samples: int
+    share: float
+    by_bit: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
 class MapRegistration:
-    """How a map lies against a run's track (`tcpipe.terrain.registration`); no shift where the ground cannot tell one."""
+    """How a map lies against a run's track (`tcpipe.terrain.registration`); no shift or scale where the ground cannot tell one."""
 
     run_id: str
     points: int
@@ -95,6 +113,11 @@ class MapRegistration:
     height_offset_m: float
     misfit_m: float
     shifted_misfit_m: float | None
+    height_scale: float | None = None
+    """Metres that the track rises where the map rises by one."""
+    height_scale_std: float | None = None
+    expected_misfit_m: float | None = None
+    """What the track's own height errors and the map's resolution leave [m]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,6 +247,10 @@ class DatasetCard:
     problems: tuple[str, ...] = ()
     """What is wrong with the choice of runs."""
     warnings: tuple[str, ...]
+    doubtful: Doubtful | None = None
+    """How many samples carry a quality flag; None in cards of before data model 1.2."""
+    findings: tuple[RunFinding, ...] = ()
+    """What ingest found of the runs, by cause."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""

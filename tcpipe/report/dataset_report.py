@@ -58,6 +58,7 @@ def dataset_report(directory: Path) -> str:
             *(Number(f"{count}", split) for split, count in splits.items()),
             Number(f"{len(card.runs)}", "runs"),
             Number(f"{driven:.0f} m", "driven"),
+            *([] if card.doubtful is None else [Number(f"{100 * card.doubtful.share:.1f} %", "doubtful samples")]),
         ],
         warnings=[*card.problems, *card.warnings],
         sections=[
@@ -65,6 +66,7 @@ def dataset_report(directory: Path) -> str:
             _gallery_section(directory, card, samples),
             *_label_sections(card, samples),
             *quality_sections(_quality_counts(samples), "samples"),
+            *_finding_sections(card),
             *budget_sections(card.energy_budget),
             Section(
                 "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card.ledger_m)
@@ -204,6 +206,15 @@ def _audit_section(card: DatasetCard) -> Section:
         "median",
     )
     return Section("Leakage audit", "How much of what tests has been seen in training.", header=header, rows=rows)
+
+
+def _finding_sections(card: DatasetCard) -> list[Section]:
+    """Return what ingest found of the runs, by cause; nothing where it found nothing."""
+    rows = [(found.example, ", ".join(found.runs), found.samples) for found in card.findings]
+    text = "One line a cause, with the figures of the first of its runs; each run's own page has them all."
+    return (
+        [Section("What ingest found of the runs", text, header=("found", "runs", "samples"), rows=rows)] if rows else []
+    )
 
 
 def _removal_sections(card: DatasetCard) -> list[Section]:

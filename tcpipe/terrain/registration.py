@@ -3,7 +3,7 @@
 A track's heights and the map's differ by a constant (ellipsoid against geoid, the robot's own height) that says nothing. What is left is
 the shape of the ground; the horizontal shift at which the two shapes agree best is searched over a small window, as in terrain-aided
 navigation (Hollowell 1990; Nuth & Kääb 2011 for elevation models). Along directions in which the ground does not vary no shift can be
-told, and none is.
+told, and none is. The track's heights are also regressed on the map's: a map in feet rises 3.28 where the track rises one.
 """
 
 from __future__ import annotations
@@ -41,6 +41,37 @@ _RIVAL_SIGMAS = 3.0
 _APART_M = 0.75
 """Ground that fits nearly as well somewhere else, this far away, does not tell where the track is [m]."""
 _RIDGE = 1e-12
+FOOT_M = 0.3048
+_ABOUT = 0.02
+_OFF = 0.1
+_KNOWN_SCALE = 0.03
+_EXPLAINED = 0.9
+"""A scale is believed where it is known to 3 % and explains nine tenths of the track's heights."""
+
+
+@dataclass(frozen=True, slots=True)
+class HeightScale:
+    """Metres that a track rises where the map rises by one, its standard deviation, and the share of the track's variance so explained.
+
+    Where the ground is even the deviation is huge; where the map holds what the track does not (trees), little is explained.
+    """
+
+    value: float
+    std: float
+    explained: float
+
+    @property
+    def is_known(self) -> bool:
+        """Whether it says something of the map's unit."""
+        return self.std < _KNOWN_SCALE and self.explained > _EXPLAINED
+
+    def is_feet(self) -> bool:
+        """Whether the map's heights are in feet."""
+        return self.is_known and abs(self.value - FOOT_M) < max(3.0 * self.std, _ABOUT)
+
+    def is_off(self) -> bool:
+        """Whether map and track surely do not rise alike."""
+        return self.is_known and abs(self.value - 1.0) > max(_SIGMAS * self.std, _OFF)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +81,7 @@ class Registration:
     ``shift_xy_m`` is what to add to the track's positions to find their ground on the map [m, the map's axes], along determined
     directions only; ``shift_std_m`` its largest standard deviation along them, NaN where none is determined. ``height_offset_m`` is track
     minus map; ``misfit_m`` and ``shifted_misfit_m`` are standard deviations of what is left without and with the shift. ``significant``:
-    the shift is not chance. ``at_reach``: the best shift lies at the window's edge, the true one may be larger.
+    the shift is not chance. ``at_reach``: the best shift lies at the window's edge, the true one may be larger. ``scale`` is of heights.
     """
 
     points: int
@@ -61,6 +92,7 @@ class Registration:
     shifted_misfit_m: float
     significant: bool
     at_reach: bool
+    scale: HeightScale
 
     @property
     def shift_m(self) -> float:
@@ -99,7 +131,8 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
     left = np.abs(excess_m[:, *best] - np.median(excess_m[:, *best]))
     good = left <= _OUTLIER * 1.4826 * np.median(left) + 1e-6  # what is not the ground: bridges, trees
     best = _least(excess_m[good].var(axis=0))
-    return _refined(excess_m[good], best, shift_m)
+    scale = _height_scale(ground_m[whole][good], height_m[at][whole][good])
+    return _refined(excess_m[good], best, shift_m, scale)
 
 
 def _thinned(xy_m: FloatArray) -> NDArray[np.int64]:
@@ -141,7 +174,20 @@ def _least(spread: FloatArray) -> tuple[int, int]:
     return int(i), int(j)
 
 
-def _refined(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray) -> Registration:
+def _height_scale(ground_m: FloatArray, height_m: FloatArray) -> HeightScale:
+    """Regress the track's heights (N,) on the map's (N, K, K) where both are most alike; how sure, by leaving stretches out."""
+    ground, height = ground_m - ground_m.mean(axis=0), height_m - height_m.mean()
+    squares, products = np.einsum("nij,nij->ij", ground, ground), np.einsum("nij,n->ij", ground, height)
+    explained = products**2 / (squares * (height @ height) + _RIDGE)
+    i, j = np.unravel_index(int(explained.argmax()), explained.shape)
+    along = ground[:, i, j]
+    parts = [(along[block] @ along[block], along[block] @ height[block]) for block in _stretches(len(height))]
+    without = [(products[i, j] - product) / (squares[i, j] - square + _RIDGE) for square, product in parts]
+    std = float(np.sqrt(_jackknife_covariance(np.array(without)[:, None])[0, 0]))
+    return HeightScale(float(products[i, j] / (squares[i, j] + _RIDGE)), std, float(explained[i, j]))
+
+
+def _refined(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray, scale: HeightScale) -> Registration:
     """Refine the best shift of the lattice by one Gauss-Newton step, and tell how sure it is by leaving stretches out."""
     last, middle = shift_m.size - 1, shift_m.size // 2
     i, j = (min(max(index, 1), last - 1) for index in best)
@@ -168,6 +214,7 @@ def _refined(excess_m: FloatArray, best: tuple[int, int], shift_m: FloatArray) -
         shifted_misfit_m=float(shifted.std()),
         significant=weight > _CHI2_999 and gain > _LEAST_GAIN and sigmas > _SIGMAS,
         at_reach=bool(known.size) and (i, j) != best,
+        scale=scale,
     )
 
 

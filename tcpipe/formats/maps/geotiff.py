@@ -452,15 +452,22 @@ def _scaling(
     unit = (dataset.units[bands[0] - 1] or "").strip()
     if unit.lower() not in _METRES:
         raise MapError(f"{path}: height is in {unit!r}, wanted metres (or cm, mm, ft)")
-    metres = _METRES[unit.lower()] if unit else _vertical_unit_m(dataset)
+    metres = _METRES[unit.lower()] if unit else _vertical_unit_m(dataset, path)
     return (scale * metres, offset * metres), []
 
 
-def _vertical_unit_m(dataset: Any) -> float:
-    """Return the unit of a compound CRS's heights [m]; a metre where the CRS says nothing of heights."""
+def _vertical_unit_m(dataset: Any, path: Path) -> float:
+    """Return the unit of a compound CRS's heights [m]; a metre where the CRS says nothing of heights and is metric itself."""
     crs = CRS.from_wkt(dataset.crs.to_wkt()) if dataset.crs else None
     vertical = [part for part in crs.sub_crs_list if part.is_vertical] if crs else []
-    return float(vertical[0].axis_info[0].unit_conversion_factor) if vertical else 1.0
+    if vertical:
+        return float(vertical[0].axis_info[0].unit_conversion_factor)
+    if crs is not None and crs.is_projected and "foot" in (lain := crs.axis_info[0].unit_name).lower():
+        raise MapError(
+            f"{path}: its CRS is in {lain}, and nothing says in which unit its heights are; say it in the file: "
+            "gdal_edit -units ft FILE (or us-ft, or m)"
+        )
+    return 1.0
 
 
 def _described(dataset: Any) -> str:

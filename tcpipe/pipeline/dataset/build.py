@@ -14,7 +14,7 @@ from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
-from tcpipe.formats.dataset_card import DatasetCard, Shard
+from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding, Shard
 from tcpipe.formats.dataset_files import (
     CARD,
     CROISSANT,
@@ -45,6 +45,7 @@ from tcpipe.pipeline.dataset.card import (
     is_whole,
 )
 from tcpipe.pipeline.dataset.content import Content, gather_content
+from tcpipe.pipeline.dataset.findings import doubt_in_words, findings_in_words
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.runs import gone_runs
 from tcpipe.pipeline.dataset.segments import KEPT
@@ -83,9 +84,13 @@ class BuildResult:
     """3 if the dataset is not what it should be."""
     recipe: str = ""
     """Which recipe ruled, as a command found it."""
+    doubtful: Doubtful | None = None
+    """How many samples carry a quality flag."""
+    findings: tuple[RunFinding, ...] = ()
+    """What ingest found of the runs, by cause."""
 
     def __str__(self) -> str:
-        """Return counts, the audit, where the metres went and how wrong a label may be, as plain lines."""
+        """Return counts, the share of doubtful samples, the audit, where the metres went and how wrong a label may be, as plain lines."""
         counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {self.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -95,8 +100,10 @@ class BuildResult:
         ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
         floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
-        said = (f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s"))
-        return plain_lines((head, *audit_lines(self.audit), ledger, *floor, *said))
+        doubt = [] if self.doubtful is None else [doubt_in_words(self.doubtful, self.samples)]
+        said = [f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s")]
+        said += findings_in_words(self.findings)
+        return plain_lines((head, *doubt, *audit_lines(self.audit), ledger, *floor, *said))
 
 
 def build_dataset(
@@ -207,6 +214,8 @@ def _result(place: Path, status: str, card: DatasetCard, problems: Sequence[str]
         problems=said,
         energy_budget=card.energy_budget,
         exit_code=3 if said else 0,
+        doubtful=card.doubtful,
+        findings=card.findings,
     )
 
 

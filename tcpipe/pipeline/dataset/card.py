@@ -16,6 +16,7 @@ from tcpipe.cost.budget import pooled
 from tcpipe.formats.dataset_card import (
     Balance,
     DatasetCard,
+    Doubtful,
     LabelColumns,
     LabelStatistics,
     MapRegistration,
@@ -28,6 +29,7 @@ from tcpipe.formats.layer_descriptions import described
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import Checksum
 from tcpipe.pipeline.dataset.content import Content
+from tcpipe.pipeline.dataset.findings import doubtful, findings_of_runs
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.splitting import Drawn, regions_to_json
 from tcpipe.recipe import Recipe
@@ -41,7 +43,7 @@ VELOCITY_COLUMN = {"ground": "velocity_mps", "fused": "fused_velocity_mps"}
 
 _DESCRIBED = ("power_watt", "velocity_mps", "fused_velocity_mps", "duration_s", "energy_joule")
 
-CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", *_DESCRIBED)
+CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *_DESCRIBED)
 """Columns of samples.parquet that the card is made from."""
 
 
@@ -54,6 +56,7 @@ class Measured(TypedDict):
     folds_of_train: tuple[int, ...]
     terrain: dict[str, dict[str, int]]
     label_statistics_of_train: dict[str, LabelStatistics]
+    doubtful: Doubtful
 
 
 def dataset_card(
@@ -71,6 +74,7 @@ def dataset_card(
     """Return the card; ``samples`` has the `CARD_COLUMNS` of every sample."""
     about, drawn, classes = recipe.dataset, content.drawn, content.sources[0].classes
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
+    runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
     return DatasetCard(
         data_model_version=DATA_MODEL_VERSION,
         tcpipe_version=__version__,
@@ -99,10 +103,11 @@ def dataset_card(
         ledger_m=content.ledger_m,
         removal=content.removal,
         balance=balance,
-        runs=tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources),
+        runs=runs,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
         problems=inputs.problems,
         warnings=content.warnings,
+        findings=findings_of_runs(runs),
         shards=tuple(shards),
         checksums=checksums,
     )
@@ -135,6 +140,7 @@ def measured(samples: pa.Table, *, has_terrain: bool) -> Measured:
         "folds_of_train": _fold_counts(samples),
         "terrain": _terrain_counts(samples) if has_terrain else {},
         "label_statistics_of_train": _statistics(samples),
+        "doubtful": doubtful(samples.column("quality")),
     }
 
 

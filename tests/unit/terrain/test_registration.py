@@ -121,3 +121,31 @@ def test_holes_edges_and_short_or_missing_tracks():
     assert register_track(source, xy + 500.0, height) is None
     assert register_track(source, xy[:0], height[:0]) is None
     assert register_track(source, np.full_like(xy, np.nan), height) is None
+
+
+def test_heights_in_feet_are_told_from_heights_in_metres():
+    """The site in feet rises 1 / 0.3048 times as fast; the shift does not matter."""
+    source, xy = site(), drive()
+    height = 600.0 + rolling(*np.add(xy, (0.6, -0.4)).T) + drift(len(xy), 0.03, 100, 2)
+    metres = register_track(source, xy, height).scale
+    assert metres.value == pytest.approx(1.0, abs=0.02)
+    assert metres.is_known
+    assert not metres.is_feet()
+    assert not metres.is_off()
+    feet = register_track(source, xy, 0.3048 * height).scale
+    assert feet.value == pytest.approx(0.3048, abs=0.006)
+    assert feet.is_feet()
+    stretched = register_track(source, xy, 1.25 * height).scale
+    assert stretched.is_off()
+    assert not stretched.is_feet()
+
+
+def test_trees_and_even_ground_say_nothing_of_the_unit():
+    """A surface model with a metre of canopy on rolling ground explains little; even ground tells nothing at all."""
+    xy = drive()
+    height = 600.0 + rolling(*xy.T) + drift(len(xy), 0.03, 100, 2)
+    trees = register_track(site(noise_m=1.0), xy, height).scale
+    assert trees.value < 0.8
+    assert not trees.is_known
+    even = register_track(site(ground=lambda x, y: 0.0 * (x + y)), xy, height).scale
+    assert not even.is_known

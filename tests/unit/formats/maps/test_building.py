@@ -103,8 +103,11 @@ def test_a_raster_in_another_crs_lands_on_the_same_ground(tmp_path, crs):
     def there(u, v):
         return plane(*to_crs.transform(u, v, direction="INVERSE"))
 
-    write_tif(tmp_path / "h.tif", raster_of(there, affine), crs, affine)
-    summary, source = built(tmp_path, height=tmp_path / "h.tif", crs=WORLD.crs)
+    path = write_tif(tmp_path / "h.tif", raster_of(there, affine), crs, affine)
+    if crs == "EPSG:2263":  # in feet: which unit its heights are in has to be said
+        with rasterio.open(path, "r+") as dataset:
+            dataset.units = ("m",)
+    summary, source = built(tmp_path, height=path, crs=WORLD.crs)
     assert source.grid.crs == WORLD.crs
     check_plane(source, 1e-3)
     assert any("datum" in note for note in summary.warnings) == (crs in {"EPSG:31256", "EPSG:2263"})
@@ -218,6 +221,19 @@ def test_feet_of_a_vertical_crs_become_metres(tmp_path):
     _, source = built(tmp_path, height=path)
     assert source.grid.crs == WORLD.crs
     check_plane(source, 2e-4)
+
+
+def test_heights_beside_a_crs_in_feet_must_say_their_unit(tmp_path):
+    """US survey feet east and north (New York), nothing about up: metres or feet would be 20° of slope apart."""
+    affine = (3.0, 0.0, 980_000.0, 0.0, -3.0, 200_000.0)
+    path = write_tif(tmp_path / "h.tif", np.full((1, 40, 40), 30.0, np.float32), "EPSG:2263", affine)
+    with pytest.raises(MapError, match=r"CRS is in US survey foot.*gdal_edit -units ft"):
+        built(tmp_path, height=path)
+    with rasterio.open(path, "r+") as dataset:
+        dataset.units = ("us-ft",)
+    _, source = built(tmp_path, height=path)
+    assert source.grid.crs == "EPSG:26918"
+    assert np.nanmax(heights(source)) == pytest.approx(30.0 * 1200.0 / 3937.0, abs=1e-3)
 
 
 def test_every_way_of_saying_nodata_is_heard(tmp_path):

@@ -5,6 +5,7 @@ import pyarrow as pa
 import pytest
 from synthetic_store import WORLD, add_run, add_world, lanes, lonlat, segments
 
+from tcpipe.errors import MapError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
@@ -14,11 +15,11 @@ from tcpipe.tables.levels import GATED_TRACK
 GEOID_M = 46.3
 
 
-def track_at(xy_m, ground_xy_m, *, std_m=0.02):
+def track_at(xy_m, ground_xy_m, *, std_m=0.02, scale=1.0):
     """Return a track at ``xy_m`` whose heights are those of the world's ground at ``ground_xy_m`` [m from its middle]."""
     count = len(xy_m)
     position = lonlat(xy_m)
-    height = WORLD.height(WORLD.x_m + ground_xy_m[:, 0], WORLD.y_m + ground_xy_m[:, 1]) + GEOID_M
+    height = scale * WORLD.height(WORLD.x_m + ground_xy_m[:, 0], WORLD.y_m + ground_xy_m[:, 1]) + GEOID_M
     noise = np.random.default_rng(3).normal(0.0, 0.01, count)
     given = {"lon_deg": position[:, 0], "lat_deg": position[:, 1], "alt_m": height + noise}
     given |= {"x_std_m": np.full(count, std_m), "y_std_m": np.full(count, std_m)}
@@ -70,3 +71,46 @@ def test_the_card_keeps_every_runs_registration(built):
     assert found["off"].shift_xy_m == pytest.approx([-1.5, 0.8], abs=0.03)
     assert found["off"].height_offset_m == pytest.approx(GEOID_M, abs=0.02)
     assert found["off"].misfit_m > 3.0 * found["off"].shifted_misfit_m
+
+
+def test_how_the_heights_rise_and_what_they_miss_is_on_the_card(built):
+    result, card = built
+    found = {entry.run_id: entry for entry in card.maps[0].registration}
+    assert found["fits"].height_scale == pytest.approx(1.0, abs=0.01)
+    assert found["fits"].expected_misfit_m == pytest.approx(0.1)  # the tracks claim no error of height
+    assert not any("heights" in line for line in result.warnings if line.startswith("run fits"))
+
+
+@pytest.mark.parametrize(("scale", "wrong"), [(0.3048, "in feet"), (1.4, "rise by 0.71 m")])
+def test_a_map_that_rises_otherwise_than_the_track_is_refused_or_named(tmp_path, scale, wrong):
+    store = Store(tmp_path / "store")
+    store.root.mkdir()
+    add_world(store, tmp_path)
+    xy = winding()
+    start, end = lanes([0.0], -10.0, 10.0)
+    add_run(store, "a", segments("a", start, end), track=track_at(xy, xy, scale=scale))
+    if scale < 1.0:
+        with pytest.raises(MapError, match=wrong) as caught:
+            build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+        assert "gdal_edit -units ft" in caught.value.problems[0]
+        assert not (tmp_path / "out").exists()
+    else:
+        found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+        assert any(wrong in line for line in found.warnings)
+
+
+def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):
+    """Heights of 1.5 m of brushwood that the map has not."""
+    store = Store(tmp_path / "store")
+    store.root.mkdir()
+    add_world(store, tmp_path)
+    xy = winding()
+    track = track_at(xy, xy)
+    bumps = 1.5 * np.sin(np.arange(len(xy)) / 15.0)
+    place = track.column_names.index("alt_m")
+    track = track.set_column(place, track.schema.field("alt_m"), pa.array(track.column("alt_m").to_numpy() + bumps))
+    start, end = lanes([0.0], -10.0, 10.0)
+    add_run(store, "a", segments("a", start, end), track=track)
+    found = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    (line,) = [line for line in found.warnings if "m apart" in line]
+    assert "wanted 0.10 m" in line
