@@ -124,7 +124,8 @@ def simulated(route: str, seed: int, length_m: float) -> Drive:
         plan = (Pause(60.0),)
     else:
         plan = Wander(length_m, start_m, climbing=0.4)
-    spec = DriveSpec("drive", plan, start_m, sensors=Sensors(None, None, None, None, None, None))
+    weave_m = 0.0 if route == "straight" else 0.04
+    spec = DriveSpec("drive", plan, start_m, sensors=Sensors(*[None] * 6), weave_m=weave_m)
     scenario = Scenario("campaign", world, (spec,), ((1.0, 1.0), (80.0, 1.0), (80.0, 79.0)), RasterSpec(2.0, 2.0, 2.0))
     truth, _ = simulated_drive(scenario, seed=seed)
     return Drive(truth, site, Noise(seed, 0))
