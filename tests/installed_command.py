@@ -76,12 +76,12 @@ def _exit_code(command: list[str]) -> int:
 
 def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.CompletedProcess[str]:
     """Return what is given; assert that what a command printed with ``--json`` is all of its contract, and no more."""
-    cls = (
-        answers().get(f"{done.args[1]}.answer") if "--json" in done.args[1:] and done.returncode in {0, 1, 3} else None
-    )
-    if cls is not None and '"problems"' not in done.stdout[:40]:
-        said = json.loads(done.stdout)
-        assert plain(typed(said, cls, Path(done.args[1]))) == said
+    command, known = done.args[1], answers()
+    if "--json" in done.args[1:] and done.returncode in {0, 1, 3} and '"problems"' not in done.stdout[:40]:
+        for text in done.stdout.splitlines() if command == "ingest" else [done.stdout]:
+            said = json.loads(text)
+            cls = known.get(f"{command}-{said.get('kind')}.answer") or known.get(f"{command}.answer")
+            assert cls is None or plain(typed(said, cls, Path(command))) == said
     return done
 
 

@@ -12,23 +12,54 @@ def every_contract() -> dict[str, str]:
 
 
 def answers() -> dict[str, type]:
-    """Return the dataclass of every such answer and document, by the name of its contract."""
+    """Return the dataclass of every such answer and document, by the name of its contract; of several kinds one each."""
+    from tcpipe.learning.evaluation_facts import Evaluation
     from tcpipe.learning.model_card import ModelCard
+    from tcpipe.learning.reproduction import Reproduction, ReproductionSummary
     from tcpipe.learning.training import TrainResult
     from tcpipe.pipeline.dataset.build import BuildResult
     from tcpipe.pipeline.diff import Difference
+    from tcpipe.pipeline.explain import Explained
     from tcpipe.pipeline.export import Exported
+    from tcpipe.pipeline.ingest import SummaryLine
+    from tcpipe.pipeline.ingest_task import LogLine
+    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
+    from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
+    from tcpipe.pipeline.known_trouble import Accepted
+    from tcpipe.pipeline.log_inspection import InspectedLog
+    from tcpipe.pipeline.maps import AddedMap
     from tcpipe.pipeline.verify import Verified
     from tcpipe.planning.cost_map import CostMapCard, CostMapResult
+    from tcpipe.planning.path_files import PathResult, TableTotals
+    from tcpipe.planning.plan_files import PlanFile, PlanResult
     from tcpipe.simulation import SimulatedSite
 
     return {
         "model": ModelCard,
         "cost-map": CostMapCard,
+        "evaluation": Evaluation,
+        "path-totals": TableTotals,
+        "plan": PlanFile,
+        "reproduction": ReproductionSummary,
+        "accept.answer": Accepted,
+        "add-map.answer": AddedMap,
         "build-dataset.answer": BuildResult,
         "cost-map.answer": CostMapResult,
         "diff.answer": Difference,
+        "evaluate.answer": Evaluation,
+        "explain.answer": Explained,
         "export.answer": Exported,
+        "ingest-log.answer": LogLine,
+        "ingest-summary.answer": SummaryLine,
+        "inspect-dataset.answer": InspectedDataset,
+        "inspect-log.answer": InspectedLog,
+        "inspect-logs.answer": InspectedLogs,
+        "inspect-map.answer": InspectedMap,
+        "inspect-run.answer": InspectedRun,
+        "inspect-store.answer": InspectedStore,
+        "plan-path.answer": PlanResult,
+        "predict-path.answer": PathResult,
+        "reproduce.answer": Reproduction,
         "simulate.answer": SimulatedSite,
         "train.answer": TrainResult,
         "verify.answer": Verified,

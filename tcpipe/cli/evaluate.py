@@ -45,7 +45,7 @@ def evaluate(
     kept in OUT and used again.
     """
     from tcpipe.cli.output import print_json, progress, say_lines
-    from tcpipe.learning.evaluation import EvaluateConfig
+    from tcpipe.learning.evaluation_facts import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
 
     config = EvaluateConfig(draws=draws, baselines=baselines, retrain=retrain, seed=seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -86,7 +85,10 @@ def ingest(
     accept).
     """
     from tcpipe.cli.output import print_json_line, progress, ruling_recipe
+    from tcpipe.formats.json_files import recast
+    from tcpipe.pipeline.ingest import SummaryLine
     from tcpipe.pipeline.ingest import ingest as run
+    from tcpipe.pipeline.ingest_task import LogLine
 
     ruling, source = ruling_recipe(recipe)
     if not as_json:
@@ -96,7 +98,7 @@ def ingest(
         def on_result(result: IngestResult) -> None:
             shown.step()
             if as_json:
-                print_json_line({**asdict(result), "kind": "log", "is_news": result.is_news})
+                print_json_line(recast(result, LogLine))
             else:
                 _print_one(result)
             for problem in result.problems if result.is_news else ():
@@ -121,9 +123,8 @@ def ingest(
             on_result=on_result,
         )
     if as_json:
-        made = str(summary.store) if summary.store.is_dir() else None
-        of_all = {"recipe": source, "store": made, "exit_code": summary.exit_code, "results": summary.results}
-        print_json_line({**of_all, "kind": "summary"})
+        made = summary.store if summary.store.is_dir() else None
+        print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
     else:
         _print_sum(summary)
     return summary.exit_code

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import click
 
 from tcpipe.cli.options import LOG, json_option, msgdef_option, recipe_option
 from tcpipe.cli.output import say
+
+if TYPE_CHECKING:
+    from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
+    from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
+    from tcpipe.pipeline.log_inspection import InspectedLog, InspectedTopic
 
 
 @click.command(short_help="What is in a log, map, dataset or store")
@@ -30,167 +35,167 @@ def inspect(path: str, *, full: bool, robot: str | None, recipe: str | None, msg
     if as_json:
         print_json(found)
     else:
-        _PRINTERS[found["kind"]](found)
-    return _exit_code(found) if found["kind"] in ("log", "logs") else 0
+        _PRINTERS[found.kind](found)
+    return _exit_code((found,)) if found.kind == "log" else _exit_code(found.logs) if found.kind == "logs" else 0
 
 
-def _exit_code(found: Mapping[str, Any]) -> int:
-    logs = found.get("logs", [found])
-    failed = ["topics" not in log for log in logs]
+def _exit_code(logs: Sequence[InspectedLog]) -> int:
+    failed = [log.topics is None for log in logs]
     if all(failed):
         return 1
-    return 3 if any(failed) or any(log["damage"] for log in logs if "topics" in log) else 0
+    return 3 if any(failed) or any(log.damage for log in logs) else 0
 
 
-def _print_logs(found: Mapping[str, Any]) -> None:
-    for log in found["logs"]:
+def _print_logs(found: InspectedLogs) -> None:
+    for log in found.logs:
         _print_log(log)
         say("")
 
 
-def _print_log(log: Mapping[str, Any]) -> None:
-    if "topics" not in log:
-        for problem in log["problems"]:
+def _print_log(log: InspectedLog) -> None:
+    if log.topics is None:
+        for problem in log.problems:
             say(problem)
         return
-    duration = "" if log["duration_s"] is None else f", {log['duration_s']:.1f} s"
-    say(f"{log['path']}: {log['container']}, {log['size_bytes'] / 1e6:.1f} MB{duration}")
-    say(f"robot {log['robot']}: {log['robot_why']}")
+    duration = "" if log.duration_s is None else f", {log.duration_s:.1f} s"
+    say(f"{log.path}: {log.container}, {(log.size_bytes or 0) / 1e6:.1f} MB{duration}")
+    say(f"robot {log.robot}: {log.robot_why}")
     say("")
-    full = any("messages_read" in topic for topic in log["topics"])
+    full = any(topic.messages_read is not None for topic in log.topics)
     header = ["topic", "type", "messages", "Hz", "role", "why", *(_READ_HEADER if full else [])]
     rows = [
         [
-            topic["name"],
-            topic["type"],
-            _text(topic["messages"]),
-            _text(topic["rate_hz"]),
-            topic["role"] or "",
-            topic["why"] or "",
+            topic.name,
+            topic.type,
+            _text(topic.messages),
+            _text(topic.rate_hz),
+            topic.role or "",
+            topic.why or "",
             *(_read_cells(topic) if full else []),
         ]
-        for topic in log["topics"]
+        for topic in log.topics
     ]
     _print_table(header, rows)
     if full:
         _print_clocks(log)
-    if log["problems"]:
+    if log.problems:
         say("to be decided:")
-    for line in log["problems"]:
+    for line in log.problems:
         say(f"  {line}")
-    for kind in ("warnings", "damage", "remarks"):
-        for line in log[kind]:
-            say(f"{kind.rstrip('s')}: {line}")
+    for kind, lines in (("warning", log.warnings), ("damage", log.damage), ("remark", log.remarks)):
+        for line in lines or ():
+            say(f"{kind}: {line}")
 
 
 _READ_HEADER = ["read", "gaps", "longest gap [s]", "time", "offset [s]", "stamps"]
 
 
-def _read_cells(topic: Mapping[str, Any]) -> list[str]:
+def _read_cells(topic: InspectedTopic) -> list[str]:
     """Return what reading everything found of a topic, in the order of the header."""
-    kinds = ("zero_stamps", "backward_stamps", "wrong_stamps", "repeated_stamps", "duplicates")
-    odd = [f"{topic[kind]} {kind.removesuffix('_stamps')}" for kind in kinds if topic.get(kind)]
-    values = [topic.get(name) for name in ("messages_read", "gaps", "longest_gap_s", "time", "header_minus_log_s")]
-    return [*map(_text, values), ", ".join(odd)]
+    odd = {
+        "zero": topic.zero_stamps,
+        "backward": topic.backward_stamps,
+        "wrong": topic.wrong_stamps,
+        "repeated": topic.repeated_stamps,
+        "duplicates": topic.duplicates,
+    }
+    values = [topic.messages_read, topic.gaps, topic.longest_gap_s, topic.time, topic.header_minus_log_s]
+    return [*map(_text, values), ", ".join(f"{count} {kind}" for kind, count in odd.items() if count)]
 
 
-def _print_clocks(log: Mapping[str, Any]) -> None:
-    for step in log["clock_steps"]:
-        say(f"clock step: {step['step_s']:+.3f} s at log time {step['log_time_ns']} ns on {', '.join(step['topics'])}")
-    for topic in log["topics"]:
-        if topic.get("simulated_time"):
-            say(f"simulated time: the headers of {topic['name']} are not the wall clock's")
-        for moved_s in topic.get("moved_s", ()):
-            say(f"another clock: the stamps of {topic['name']} lie {-moved_s:+.3f} s off those of most topics")
-        if topic.get("time") == "log":
-            say(f"log time rules on {topic['name']}: {topic['time_why']}")
+def _print_clocks(log: InspectedLog) -> None:
+    for step in log.clock_steps or ():
+        say(f"clock step: {step.step_s:+.3f} s at log time {step.log_time_ns} ns on {', '.join(step.topics)}")
+    for topic in log.topics or ():
+        if topic.simulated_time:
+            say(f"simulated time: the headers of {topic.name} are not the wall clock's")
+        for moved_s in topic.moved_s or ():
+            say(f"another clock: the stamps of {topic.name} lie {-moved_s:+.3f} s off those of most topics")
+        if topic.time == "log":
+            say(f"log time rules on {topic.name}: {topic.time_why}")
 
 
-def _print_map(found: Mapping[str, Any]) -> None:
-    size = " x ".join(f"{found[side] * found['pitch_m']:.1f} m" for side in ("cols", "rows"))
-    say(f"{found['path']}: {size} at {found['pitch_m']:g} m a pixel in {found['crs']}")
+def _print_map(found: InspectedMap) -> None:
+    size = " x ".join(f"{pixels * found.pitch_m:.1f} m" for pixels in (found.cols, found.rows))
+    say(f"{found.path}: {size} at {found.pitch_m:g} m a pixel in {found.crs}")
     say("")
-    rows = [[layer, found["sources"][layer], f"{found['covered'][layer]:.1%}"] for layer in found["layers"]]
+    rows = [[layer, found.sources[layer], f"{found.covered[layer]:.1%}"] for layer in found.layers]
     _print_table(["layer", "made from", "covered"], rows)
     say("")
-    say(f"height: {found['height_min_m']:.1f} m to {found['height_max_m']:.1f} m")
-    share = found["class_share"]
+    say(f"height: {found.height_min_m:.1f} m to {found.height_max_m:.1f} m")
+    share = found.class_share
     classes = [
-        [str(c["id"]), c["name"], "yes" if c["traversable"] else "no", f"{share.get(c['name'], 0.0):.1%}"]
-        for c in found["class_table"]
+        [str(entry.id), entry.name, "yes" if entry.traversable else "no", f"{share.get(entry.name, 0.0):.1%}"]
+        for entry in found.class_table
     ]
-    if "terrain" in found["layers"]:
+    if "terrain" in found.layers:
         say("")
         _print_table(["id", "class", "traversable", "share"], classes)
-    for line in found["warnings"]:
+    for line in found.warnings:
         say(f"warning: {line}")
 
 
-def _print_dataset(found: Mapping[str, Any]) -> None:
+def _print_dataset(found: InspectedDataset) -> None:
     say(
-        f"{found['path']}: dataset {found['name']}, {found['samples']} samples of {', '.join(found['robots'])}, "
-        f"format {found['format']}, data model {found['data_model_version']}"
+        f"{found.path}: dataset {found.name}, {found.samples} samples of {', '.join(found.robots)}, "
+        f"format {found.format}, data model {found.data_model_version}"
     )
     say("")
-    names = [
-        entry["name"] for entry in found["classes"] if any(entry["name"] in of for of in found["terrain"].values())
-    ]
+    names = [entry.name for entry in found.classes if any(entry.name in of for of in found.terrain.values())]
     rows = [
-        [split, str(found["splits"][split]), *(str(found["terrain"].get(split, {}).get(name, 0)) for name in names)]
+        [split, str(found.splits[split]), *(str(found.terrain.get(split, {}).get(name, 0)) for name in names)]
         for split in ("train", "test", "unseen", "buffer")
     ]
     _print_table(["split", "samples", *names], rows)
     say("")
-    say(f"layers: {', '.join(found['layers'])}; labels: {', '.join(found['label']['columns'])}")
-    say(
-        f"runs: {', '.join(run['run_id'] for run in found['runs'])}; map: {', '.join(m['name'] for m in found['maps'])}"
-    )
-    for line in found["warnings"]:
+    say(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
+    say(f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}")
+    for line in found.warnings:
         say(f"warning: {line}")
 
 
-def _print_store(found: Mapping[str, Any]) -> None:
-    runs = len({run["run_id"] for run in found["runs"]})
-    say(f"{found['path']}: {runs} run{'' if runs == 1 else 's'}, maps: {', '.join(found['maps']) or 'none'}")
+def _print_store(found: InspectedStore) -> None:
+    runs = len({run.run_id for run in found.runs})
+    say(f"{found.path}: {runs} run{'' if runs == 1 else 's'}, maps: {', '.join(found.maps) or 'none'}")
     say("")
     rows = [
         [
-            run["run_id"],
-            run["recipe_id"],
-            run["robot"],
-            str(run["segments"]),
-            f"{run['distance_m']:.1f}",
-            str(run["damage"]),
+            run.run_id,
+            run.recipe_id,
+            run.robot,
+            str(run.segments),
+            f"{run.distance_m:.1f}",
+            str(run.damage),
         ]
-        for run in found["runs"]
+        for run in found.runs
     ]
     _print_table(["run", "recipe", "robot", "segments", "metres", "damage"], rows)
-    for run_id, version in found["outdated"].items():
+    for run_id, version in found.outdated.items():
         say(f"of another data model ({version}): {run_id}; ingest its log again")
-    for line in found["damaged_runs"].values():
+    for line in found.damaged_runs.values():
         say(f"damaged: {line}")
-    for run_id, by in found["superseded"].items():
+    for run_id, by in found.superseded.items():
         say(f"superseded by {by}: {run_id}; its log was completed or repaired")
-    for run_id in found["unfinished"]:
+    for run_id in found.unfinished:
         say(f"not finished: {run_id}; ingest its log again")
 
 
-def _print_run(found: Mapping[str, Any]) -> None:
-    say(f"{found['run_id']}: from {' + '.join(found['source'].get('paths', ['an unknown log']))}")
-    if found["tags"]:
-        say("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found["tags"].items())))
-    for line in found["remarks"]:
+def _print_run(found: InspectedRun) -> None:
+    say(f"{found.run_id}: from {' + '.join(found.source.paths if found.source else ['an unknown log'])}")
+    if found.tags:
+        say("tags: " + ", ".join(f"{key}={value}" for key, value in sorted(found.tags.items())))
+    for line in found.remarks:
         say(f"remark: {line}")
-    for run in found["recipes"]:
-        ledger = run["ledger_m"]
+    for run in found.recipes:
+        ledger = run.ledger_m
         say("")
-        say(f"recipe {run['recipe_id']}: {run['segments']} segments of robot {run['robot']}")
+        say(f"recipe {run.recipe_id}: {run.segments} segments of robot {run.robot}")
         lost = sorted(((metres, name) for name, metres in ledger.items() if metres >= 0.05), reverse=True)
         said = ", ".join(f"{metres:.1f} m {name.replace('_', ' ')}" for metres, name in lost)
-        say(f"{run['distance_m']:.1f} m driven: {said}" if said else "not driven")
-        for kind in ("warnings", "damage"):
-            for line in run[kind]:
-                say(f"{kind.rstrip('s')}: {line}")
+        say(f"{run.distance_m:.1f} m driven: {said}" if said else "not driven")
+        for kind, lines in (("warning", run.warnings), ("damage", run.damage)):
+            for line in lines:
+                say(f"{kind}: {line}")
 
 
 def _text(value: object) -> str:
@@ -203,7 +208,7 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         say("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
-_PRINTERS = {
+_PRINTERS: dict[str, Callable[..., None]] = {
     "log": _print_log,
     "logs": _print_logs,
     "map": _print_map,

@@ -49,7 +49,7 @@ def predict_path(
         source = chosen_map(store, map_name)
         result = run(load_model(model), source, Path(path_file), Path(out) if out else None)
     if as_json:
-        print_json({**result.summary, "path": path_file, "out": out, "status": result.status})
+        print_json(result)
     else:
         say_lines(result)
     return result.exit_code

@@ -24,14 +24,12 @@ def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, as_json: bo
     Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
     paper is the pattern, not the figures. Writes reproduction.html, reproduction.json and everything behind them to DIR.
     """
-    from dataclasses import asdict
-
     from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.reproduction import reproduce as run
 
     with progress("reproduce", 1, quiet=quiet):
         result = run(directory, quick=quick, seeds=seeds, jobs=jobs)
     if as_json:
-        print_json({**asdict(result), "claims": [{**asdict(claim), "held": claim.held} for claim in result.claims]})
+        print_json(result)
     else:
         say_lines(result)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from tcpipe.dataset.pixels import Pixels, View
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
-Batch = tuple[Any, ...]
+Batch = tuple[Floats | tuple[Floats, Floats], ...]
 
 _FLIPPED = ("cross_slope_rad",)
 """Columns whose sign changes when a sample is mirrored across its direction of travel."""
@@ -121,10 +120,9 @@ class Batches:
     def _batch(self, pixels: Pixels, rows: Ints, samples: Ints, mirrors: np.random.Generator) -> Batch:
         content = self._content
         mirrored = mirrors.random(len(rows)) < 0.5 if self._rules.mirror else np.zeros(len(rows), np.bool_)
-        patches: Any = content.view.form.form(pixels, rows, mirrored)
-        if content.features:
-            patches = (patches, _features(content.features, samples, mirrored))
-        batch = (patches, content.labels[samples])
+        patches = content.view.form.form(pixels, rows, mirrored)
+        given = (patches, _features(content.features, samples, mirrored)) if content.features else patches
+        batch = (given, content.labels[samples])
         return batch if content.weights is None else (*batch, content.weights[samples])
 
 

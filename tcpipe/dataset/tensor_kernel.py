@@ -5,8 +5,6 @@ Layers and tensor are walked as flat arrays with unsigned indices, which the com
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,18 +12,20 @@ from tcpipe.compiled import kernel
 from tcpipe.terrain.sampling_kernel import HEIGHT_NODATA
 
 Floats = NDArray[np.float32]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 
 @kernel
 def form_paper_tensor(  # noqa: PLR0917
-    ortho: Any,
-    terrain: Any,
-    height: Any,
-    rows: Any,
-    mirrored: Any,
-    most_grey: Any,
-    most_class: Any,
-    step: Any,
+    ortho: NDArray[np.uint8],
+    terrain: NDArray[np.uint8],
+    height: NDArray[np.uint16],
+    rows: Ints,
+    mirrored: Mask,
+    most_grey: np.float32,
+    most_class: np.float32,
+    step: np.float32,
     out: Floats,
 ) -> None:
     """Form ``rows`` of all three layers into ``out``, (B, px, px, 3).
@@ -53,7 +53,7 @@ def form_paper_tensor(  # noqa: PLR0917
 
 
 @kernel
-def form_bytes(layer: Any, rows: Any, mirrored: Any, value: Floats, channel: int, out: Floats) -> None:  # noqa: PLR0917
+def form_bytes(layer: NDArray[np.uint8], rows: Ints, mirrored: Mask, value: Floats, channel: int, out: Floats) -> None:  # noqa: PLR0917
     """Write ``value`` of each byte of ``rows`` to one channel of ``out``, (B, px, px, C)."""
     px = out.shape[1]
     for b in range(rows.size):
@@ -67,7 +67,14 @@ def form_bytes(layer: Any, rows: Any, mirrored: Any, value: Floats, channel: int
 
 @kernel
 def form_numbers(  # noqa: PLR0917
-    layer: Any, rows: Any, mirrored: Any, nodata: Any, scale: Any, offset: Any, channel: int, out: Floats
+    layer: NDArray[np.uint16 | np.float32],
+    rows: Ints,
+    mirrored: Mask,
+    nodata: np.uint16 | np.float32,
+    scale: np.float32,
+    offset: np.float32,
+    channel: int,
+    out: Floats,
 ) -> None:
     """Write numbers of ``rows``, scaled and clipped to [0, 1], to one channel of ``out``, (B, px, px, C); NaN and ``nodata`` become 0."""
     px, none, whole = out.shape[1], np.float32(0.0), np.float32(1.0)

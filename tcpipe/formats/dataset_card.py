@@ -10,6 +10,7 @@ from tcpipe.balance.correlation import Correlation
 from tcpipe.balance.repeats import Floor
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.formats.layer_descriptions import Description
+from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.seals import Checksum
 from tcpipe.motion.removal import Group
 from tcpipe.recipe import Recipe
@@ -118,16 +119,6 @@ class MapRegistration:
     height_scale_std: float | None = None
     expected_misfit_m: float | None = None
     """What the track's own height errors and the map's resolution leave [m]."""
-
-
-@dataclass(frozen=True, slots=True)
-class MapInputs:
-    """What a map was made from: the sha256 of each file of each role, and the CRS that was asked for."""
-
-    files: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
-    crs: str | None = None
-    categorical: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-    ortho_bands: str | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,19 +2,38 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Generic, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import PathError, RegionError
 from tcpipe.formats.geojson import brief, read_features
-from tcpipe.formats.json_files import Json, write_json
+from tcpipe.formats.json_files import Json
+
+P = TypeVar("P")
 
 _DECIMALS = 9
 """A tenth of a millimetre."""
+
+
+@dataclass(frozen=True, slots=True)
+class LineString:
+    """A line's points, longitude and latitude [deg]."""
+
+    coordinates: tuple[tuple[float, float], ...]
+    type: Literal["LineString"] = "LineString"
+
+
+@dataclass(frozen=True, slots=True)
+class LineFeature(Generic[P]):
+    """A line and what is said of it."""
+
+    properties: P
+    geometry: LineString
+    type: Literal["Feature"] = "Feature"
 
 
 def read_line(path: Path) -> NDArray[np.float64]:
@@ -70,16 +89,7 @@ def check_lonlat(where: str, lonlat_deg: NDArray[np.float64]) -> None:
         )
 
 
-def write_lines(
-    path: Path, lines: Sequence[tuple[NDArray[np.float64], Mapping[str, Any]]], about: Mapping[str, Any]
-) -> None:
-    """Write lines (points, shape (P, 2), and properties) as a FeatureCollection, whole or not at all; ``about`` are foreign members."""
-    features = [
-        {
-            "type": "Feature",
-            "properties": dict(properties),
-            "geometry": {"type": "LineString", "coordinates": np.round(lonlat, _DECIMALS).tolist()},
-        }
-        for lonlat, properties in lines
-    ]
-    write_json(path, {"type": "FeatureCollection", "features": features, **about})
+def line_feature(lonlat_deg: NDArray[np.float64], properties: P) -> LineFeature[P]:
+    """Return a line through points, shape (P, 2), as a feature of GeoJSON."""
+    points = np.round(lonlat_deg, _DECIMALS).tolist()
+    return LineFeature(properties, LineString(tuple((lon, lat) for lon, lat in points)))

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from inspect import cleandoc
@@ -32,8 +32,8 @@ MOST_BYTES = 32 << 20
 def plain(value: Any) -> Any:
     """Return ``value`` as JSON values: dataclasses become objects, numpy values numbers and lists, what is not finite null."""
     if is_dataclass(value) and not isinstance(value, type):
-        told = ((of.name, getattr(value, of.name), "json" in of.metadata) for of in fields(value))
-        value = {name: item for name, item, left_out in told if not (left_out and item in (None, {}, [], ()))}
+        told = ((of.name, getattr(value, of.name), of.metadata.get("json", ())) for of in fields(value))
+        value = {name: item for name, item, left_out in told if not (left_out and item in left_out)}
     elif isinstance(value, Enum):
         value = value.value
     elif hasattr(value, "tolist"):  # numpy scalars and arrays
@@ -45,6 +45,12 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return str(value) if isinstance(value, Path) else value
+
+
+def recast(record: object, cls: Callable[..., T], **more: object) -> T:
+    """Return a record of another dataclass: with the fields that ``record`` has too, and ``more``, which goes before."""
+    known = {of.name: getattr(record, of.name) for of in fields(cls) if hasattr(record, of.name)}  # type: ignore[arg-type]
+    return cls(**(known | more))
 
 
 def to_json(value: Any) -> str:
@@ -67,7 +73,7 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, text)
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def read_json(path: Path) -> dict[str, Json]:
     """Read one JSON object; `StoreError` names a file that cannot be read."""
     return parse_json(read_document(path), path)
 
@@ -86,7 +92,7 @@ def read_document(path: Path) -> bytes:
     return data
 
 
-def parse_json(data: bytes, path: Path) -> dict[str, Any]:
+def parse_json(data: bytes, path: Path) -> dict[str, Json]:
     """Return the object in the bytes of a file; `StoreError` if it holds none."""
     try:
         found = json.loads(data.decode("utf-8"))

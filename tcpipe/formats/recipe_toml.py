@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from tcpipe.errors import RecipeError
-from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.json_files import Json, digest, plain
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.formats.toml_text import parse_toml
 from tcpipe.recipe import IngestSections, Recipe
@@ -57,7 +57,7 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     return from_values(Recipe, values, where=where)
 
 
-def ingest_key(recipe: Recipe | Mapping[str, Any]) -> str:
+def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
     """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
     values = plain(recipe.ingest) if isinstance(recipe, Recipe) else recipe
     names = [section.name for section in fields(IngestSections)]
@@ -70,7 +70,7 @@ def read_key(recipe: Recipe, robot: str | None, *, definitions: str) -> str:
     return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})
 
 
-def recipe_id(recipe: Recipe | Mapping[str, Any], robot: str) -> str:
+def recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:
     """Return the name of a run's recipe directory: first 8 hex of the hash of the ingest sections and the robot."""
     return digest({"ingest": ingest_key(recipe), "robot": robot})[:8]
 

@@ -12,10 +12,10 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import digest, parse_json, plain, read_document, typed, write_json
+from tcpipe.formats.json_files import Json, digest, parse_json, plain, read_document, typed, write_json
 
 T = TypeVar("T")
 
@@ -54,13 +54,13 @@ def write_sealed(path: Path, value: object) -> None:
     write_json(path, sealed(value))
 
 
-def sealed(value: object) -> dict[str, Any]:
+def sealed(value: object) -> dict[str, Json]:
     """Return a dataclass or a mapping as a JSON object with its seal."""
     bare = {key: item for key, item in plain(value).items() if key != SEAL}
     return {**bare, SEAL: digest(bare)}
 
 
-def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Any]], bool] = lambda _: True) -> dict[str, Any]:
+def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True) -> dict[str, Json]:
     """Read a JSON object that `write_sealed` wrote, and prove it.
 
     Parameters

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS, SPLITS
-from tcpipe.learning.metrics import ALL, QUANTITIES
+from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS
+from tcpipe.learning.evaluation_facts import SPLITS, Evaluation
+from tcpipe.learning.metrics import ALL, QUANTITIES, Errors
 
 NOTICEABLE, WIDE, FLOOR_FACTOR = 1.1, 1.5, 1.5
 
@@ -26,13 +26,8 @@ class Claim:
     at_least: bool
     wanted: float
     in_the_paper: float | None
-
-    @property
-    def held(self) -> bool:
-        """Return whether it holds here."""
-        if self.ratio is None:
-            return False
-        return self.ratio >= self.wanted if self.at_least else self.ratio <= self.wanted
+    held: bool
+    """Whether it holds here."""
 
     def __str__(self) -> str:
         """Return the claim, its figure and its verdict as one line."""
@@ -47,21 +42,47 @@ class Claim:
         return "≥" if self.at_least else "≤"
 
 
-def checked_claims(runs: Sequence[Mapping[str, Any]]) -> list[Claim]:
+def checked_claims(runs: Sequence[Evaluation]) -> list[Claim]:
     """Return every claim with its ratio, of errors averaged over the runs (one evaluation a seed)."""
     found = []
-    for split in runs[0]["splits"]:
+    for split in runs[0].splits:
         mean, told = _mean_figures([_figures(run, split) for run in runs]), _paper_figures(split)
         for says, measure, numerator, denominator, wanted in _CLAIMS:
             if split == "unseen" or says != _OF_UNSEEN:
                 ratio, paper_ratio = (_over(said.get(numerator), said.get(denominator)) for said in (mean, told))
-                found.append(Claim(says, split, measure, ratio, True, wanted, paper_ratio))
+                found.append(
+                    _claim(says, split, measure, ratio, at_least=True, wanted=wanted, in_the_paper=paper_ratio)
+                )
         floors = [quantity for quantity in QUANTITIES if f"floor {quantity}" in mean and split == "unseen"]
         measure = "RMSE, one net : simulator known"
         for quantity in floors:
             ratio = _over(mean[quantity], mean[f"floor {quantity}"])
-            found.append(Claim(f"{quantity} is as good as can be", split, measure, ratio, False, FLOOR_FACTOR, None))
+            found.append(
+                _claim(
+                    f"{quantity} is as good as can be",
+                    split,
+                    measure,
+                    ratio,
+                    at_least=False,
+                    wanted=FLOOR_FACTOR,
+                    in_the_paper=None,
+                )
+            )
     return found
+
+
+def _claim(
+    says: str,
+    split: str,
+    measure: str,
+    ratio: float | None,
+    *,
+    at_least: bool,
+    wanted: float,
+    in_the_paper: float | None,
+) -> Claim:
+    held = ratio is not None and (ratio >= wanted if at_least else ratio <= wanted)
+    return Claim(says, split, measure, ratio, at_least, wanted, in_the_paper, held)
 
 
 _OF_UNSEEN = "class matters for unseen areas"
@@ -76,19 +97,24 @@ _CLAIMS = (
 """What is said, of what, numerator and denominator, the least ratio."""
 
 
-def _figures(run: Mapping[str, Any], split: str) -> dict[str, float | None]:
+def _figures(run: Evaluation, split: str) -> dict[str, float | None]:
     """Return what the claims compare, of one evaluation."""
-    left = {"".join(row["layers"]): row[split]["E"]["mape_percent"] for row in run["ablation"] if row["how"] == "noise"}
+    left = {"".join(row.layers): row.on(split)["E"].mape_percent for row in run.ablation if row.how == "noise"}
     figures = _without_layers(left)
     for who in (OURS, GRASS_ONLY, PER_CLASS):
-        figures[who] = run["energy"].get(who, {}).get(split, {}).get("mape_percent")
-    figures["T of one net"] = run["time"][OURS][split]["mape_percent"]
-    figures[EXPECTED] = run["time"].get(EXPECTED, {}).get(split, {}).get("mape_percent")
-    part = run["splits"][split]
-    for quantity, by_class in part.get("simulation_floor", {}).items():
-        figures[quantity] = part["errors"][quantity][ALL]["rmse"]
-        figures[f"floor {quantity}"] = by_class[ALL]["rmse"]
+        figures[who] = _percent(run.energy, who, split)
+    figures["T of one net"] = _percent(run.time, OURS, split)
+    figures[EXPECTED] = _percent(run.time, EXPECTED, split)
+    part = run.splits[split]
+    for quantity, by_class in (part.simulation_floor or {}).items():
+        figures[quantity] = part.errors[quantity][ALL].rmse
+        figures[f"floor {quantity}"] = by_class[ALL].rmse
     return figures
+
+
+def _percent(table: Mapping[str, Mapping[str, Errors]], who: str, split: str) -> float | None:
+    found = table.get(who, {}).get(split)
+    return None if found is None else found.mape_percent
 
 
 def _paper_figures(split: str) -> dict[str, float | None]:

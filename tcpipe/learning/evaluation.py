@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from tcpipe import __version__
+from tcpipe.balance.repeats import Floor
 from tcpipe.dataset import Dataset, Split, open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.json_files import plain
 from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.learning.evaluation_facts import (
+    SPLITS,
+    AblationRow,
+    ErrorsByClass,
+    EvaluateConfig,
+    EvaluatedDataset,
+    EvaluatedModel,
+    Evaluation,
+    Plotted,
+    SplitErrors,
+)
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import (
     ALL,
@@ -36,8 +46,6 @@ from tcpipe.terrain.classes import NODATA_ID
 
 logger = logging.getLogger("tcpipe")
 
-KIND = "tcpipe evaluation"
-SPLITS = ("test", "unseen")
 NETWORKS = "networks"
 """Folder of the networks that an evaluation trains: baselines, and the ablation anew."""
 
@@ -60,33 +68,25 @@ _FEWEST = 20
 """Samples of a class in train that a network of its own needs."""
 
 
-@dataclass(frozen=True, slots=True)
-class EvaluateConfig:
-    """How much is evaluated."""
-
-    draws: int = 5
-    """Draws of noise that each ablated input set is the mean of."""
-    baselines: bool = True
-    """Train the networks of Wei & Isler."""
-    retrain: bool = False
-    """Train a network for each input set of the ablation, too."""
-    seed: int = 0
-    """Of the noise."""
-    plotted: int = 21
-    """Patches a class in the pictures."""
-
-
 PlantCosts = Callable[[Split], dict[str, Array]]
 """Costs of samples by a predictor that knows how they were simulated."""
 
 Sets = dict[str, Measured]
 Trained = Callable[[str, Variant], Model]
+Said = Mapping[str, Mapping[str, Array]]
+"""What a model says of each split: costs by quantity, shape (N,) each."""
 
 
 def evaluate(
-    model: str | Path, dataset: str | Path, out: Path, config: EvaluateConfig, *, plant: PlantCosts | None = None
-) -> dict[str, Any]:
-    """Measure a model on a dataset and return everything that was found, as JSON values.
+    model: str | Path,
+    dataset: str | Path,
+    out: Path,
+    config: EvaluateConfig,
+    *,
+    key: str,
+    plant: PlantCosts | None = None,
+) -> Evaluation:
+    """Measure a model on a dataset and return everything that was found, which ``key`` tells from any other evaluation.
 
     Networks that it needs beside it are trained into ``out`` and kept there. ``plant`` is the best that can be predicted where the
     samples were simulated.
@@ -120,22 +120,20 @@ def evaluate(
 
     ablation = list(_ablation(ours, sets, config, trained))
     energy = _energy(ours, data, sets, said, trained if config.baselines else None)
-    values = {
-        "kind": KIND,
-        "schema_version": 1,
-        "tcpipe_version": __version__,
-        "model": {"name": ours.name, "checksum": ours.checksum, "training": ours.card.training},
-        "dataset": {"name": data.card.name, "sha256": dataset_checksum(data.card), "samples": data.card.splits},
-        "config": asdict(config),
-        "splits": {name: _split_values(found, said[name], plant) for name, found in sets.items()},
-        "ablation": ablation,
-        "energy": energy,
-        "time": _time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
-        "repeatability": _repeatability(data.card),
-        "warnings": [*_warnings(ours, data, sets), *_left_out(data, sets, energy)],
-        "plots": {name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
-    }
-    return dict(plain(values))
+    return Evaluation(
+        tcpipe_version=__version__,
+        key=key,
+        model=EvaluatedModel(ours.name, ours.checksum, ours.card.training),
+        dataset=EvaluatedDataset(data.card.name, dataset_checksum(data.card), data.card.splits),
+        config=config,
+        splits={name: _split_errors(found, said[name], plant) for name, found in sets.items()},
+        ablation=tuple(ablation),
+        energy=energy,
+        time=_time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
+        repeatability=_repeatability(data.card),
+        warnings=(*_warnings(ours, data, sets), *_left_out(data, sets, energy)),
+        plots={name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
+    )
 
 
 def _how_it_was_trained(model: Model) -> tuple[FitConfig, int]:
@@ -143,35 +141,35 @@ def _how_it_was_trained(model: Model) -> tuple[FitConfig, int]:
     return model.card.training.config, model.card.training.samples["fitted"]
 
 
-def _repeatability(card: DatasetCard) -> dict[str, Any]:
+def _repeatability(card: DatasetCard) -> dict[str, Floor | None]:
     """Return how well each label repeats itself where ground was driven twice, as the dataset's card has it; None where it was not."""
     columns = {"w": "power_watt", "v": card.label.columns[1], "T": "duration_s", "E": "energy_joule"}
     found = card.balance.repeatability
     return {quantity: found.get(column) for quantity, column in columns.items()}
 
 
-def _split_values(found: Measured, said: Mapping[str, Any], plant: PlantCosts | None) -> dict[str, Any]:
-    """Return tables I and II of one split, and what its labels' deviations, or the simulator, allow."""
+def _split_errors(found: Measured, said: Mapping[str, Array], plant: PlantCosts | None) -> SplitErrors:
+    def errors_of(costs: Mapping[str, Array]) -> ErrorsByClass:
+        return errors_by_class(costs, found.costs, found.class_ids, found.names)
+
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
-    values = {
-        "samples": len(found.split),
-        "classes": counts,
-        "class_order": list(counts),
-        "errors": errors_by_class(said, found.costs, found.class_ids, found.names),
-        "label_floor": label_floor(found.deviations, found.costs, found.class_ids, found.names),
-    }
-    if plant is not None:
-        values["simulation_floor"] = errors_by_class(plant(found.split), found.costs, found.class_ids, found.names)
-    return values
+    return SplitErrors(
+        samples=len(found.split),
+        classes=counts,
+        class_order=tuple(counts),
+        errors=errors_of(said),
+        label_floor=label_floor(found.deviations, found.costs, found.class_ids, found.names),
+        simulation_floor=None if plant is None else errors_of(plant(found.split)),
+    )
 
 
-def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained) -> Iterator[dict[str, Any]]:
+def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained) -> Iterator[AblationRow]:
     """Yield table III, row by row: the trained network with layers replaced by noise, and networks that never had them."""
     for number, letters in enumerate(_input_sets(ours)):
         left = tuple(LETTERS[letter] for letter in letters)
         noise = [channel for channel in ours.channels if channel not in left]
         logger.info("ablation: {%s}", ",".join(letters))
-        row: dict[str, Any] = {"layers": list(letters), "how": "noise"}
+        by_split = {}
         for at, (name, found) in enumerate(sets.items()):
             draws = [
                 _all_errors(
@@ -179,15 +177,12 @@ def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained)
                 )
                 for draw in range(config.draws if noise else 1)
             ]
-            row[name] = {quantity: mean_of_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
-        yield row
+            by_split[name] = {quantity: mean_of_draws(draw[quantity] for draw in draws) for quantity in draws[0]}
+        yield AblationRow(letters, "noise", **by_split)
         if config.retrain and noise:
             anew = trained("ablation_" + "".join(letters), Variant(channels=left))
-            yield {
-                "layers": list(letters),
-                "how": "retrained",
-                **{name: _all_errors(predicted_costs(anew, found.split), found) for name, found in sets.items()},
-            }
+            by_split = {name: _all_errors(predicted_costs(anew, found.split), found) for name, found in sets.items()}
+            yield AblationRow(letters, "retrained", **by_split)
 
 
 def _input_sets(ours: Model) -> list[tuple[str, ...]]:
@@ -197,16 +192,16 @@ def _input_sets(ours: Model) -> list[tuple[str, ...]]:
     return list(dict.fromkeys(letters for letters in found if letters))
 
 
-def _all_errors(said: Mapping[str, Any], found: Measured) -> dict[str, Errors]:
+def _all_errors(said: Mapping[str, Array], found: Measured) -> dict[str, Errors]:
     by_class = errors_by_class(said, found.costs, found.class_ids, found.names)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
 
 
 def _energy(
-    ours: Model, data: Dataset, sets: Sets, said: Mapping[str, Mapping[str, Any]], trained: Trained | None
-) -> dict[str, Any]:
+    ours: Model, data: Dataset, sets: Sets, said: Said, trained: Trained | None
+) -> dict[str, dict[str, Errors]]:
     """Return table IV: E by this model, by a height-only network of grass, and by one a class."""
-    found: dict[str, Any] = {OURS: {name: _all_errors(said[name], part)["E"] for name, part in sets.items()}}
+    found = {OURS: {name: _all_errors(said[name], part)["E"] for name, part in sets.items()}}
     if trained is None or "height" not in data.card.layers:
         return found
     counts = ours.card.seen.class_counts
@@ -243,11 +238,9 @@ def _fastest_mps(robot: str, data: Dataset) -> float | None:
     return known.get(robot, Robot()).max_velocity_mps
 
 
-def _time(
-    ours: Model, sets: Sets, said: Mapping[str, Mapping[str, Any]], *, max_velocity_mps: float | None
-) -> dict[str, Any]:
+def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's greatest speed."""
-    found: dict[str, Any] = {OURS: {name: _all_errors(said[name], part)["T"] for name, part in sets.items()}}
+    found = {OURS: {name: _all_errors(said[name], part)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:
         expected = {
             name: {"T": np.full(len(part.split), ours.chord_m / max_velocity_mps)} for name, part in sets.items()
@@ -288,13 +281,14 @@ def _left_out(data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Error
             )
 
 
-def _plotted(found: Measured, said: Mapping[str, Any], count: int) -> dict[str, Any]:
-    """Return measured and predicted E and T of the first samples of every class (the rows stand in random order)."""
+def _plotted(found: Measured, said: Mapping[str, Array], count: int) -> Plotted:
+    """Return the first samples of every class (the rows stand in random order)."""
     rows = [np.flatnonzero(found.class_ids == class_id)[:count] for class_id in found.names]
     at = np.concatenate(rows)
-    names = [name for name, here in zip(found.names.values(), rows, strict=True) for _ in here]
     return {
-        "class": names,
-        **{f"{key}_measured": found.costs[key][at] for key in ("E", "T")},
-        **{f"{key}_predicted": said[key][at] for key in ("E", "T")},
+        "class": [name for name, here in zip(found.names.values(), rows, strict=True) for _ in here],
+        "E_measured": found.costs["E"][at].tolist(),
+        "T_measured": found.costs["T"][at].tolist(),
+        "E_predicted": said["E"][at].tolist(),
+        "T_predicted": said["T"][at].tolist(),
     }

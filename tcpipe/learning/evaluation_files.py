@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import read_card
-from tcpipe.formats.json_files import digest, read_json, to_json, write_json
+from tcpipe.formats.json_files import digest, read_as, read_json, write_json
 from tcpipe.formats.seals import sealed
-from tcpipe.learning.evaluation import NETWORKS, EvaluateConfig, PlantCosts, evaluate
+from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
+from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
@@ -31,17 +30,16 @@ class EvaluationResult:
     """What was found and where it lies; ``str`` of it is what the command prints."""
 
     path: Path
-    values: dict[str, Any]
+    values: Evaluation
 
     def __str__(self) -> str:
         """Return the errors of all classes together, as plain lines."""
-        lines = [f"warning: {text}" for text in self.values["warnings"]]
-        for split, part in self.values["splits"].items():
+        lines = [f"warning: {text}" for text in self.values.warnings]
+        for split, part in self.values.splits.items():
             figures = (
-                f"{quantity} {part['errors'][quantity][ALL]['mape_percent'] or float('nan'):.2f} %"
-                for quantity in QUANTITIES
+                f"{quantity} {part.errors[quantity][ALL].mape_percent or float('nan'):.2f} %" for quantity in QUANTITIES
             )
-            lines.append(f"{split}: {part['samples']} samples, MAPE {', '.join(figures)}")
+            lines.append(f"{split}: {part.samples} samples, MAPE {', '.join(figures)}")
         return plain_lines((*lines, f"open {self.path / PAGE}"))
 
 
@@ -74,18 +72,15 @@ def run_evaluation(
         raise UsageError(f"{place}: exists and is no evaluation; it is left alone; give another OUT")
     rules = config or EvaluateConfig()
     key = _key(model, dataset, rules, simulated=plant is not None)
-    if (place / JSON).is_file() and (known := read_json(place / JSON)).get("key") == key:
-        values = known
-    else:
-        found = {**evaluate(model, dataset, place, rules, plant=plant), "key": key}
-        values = json.loads(to_json(found))  # in the order of the file, as the next call will read it
-    name = values["dataset"]["name"]
+    if not (place / JSON).is_file() or read_json(place / JSON).get("key") != key:
+        write_json(place / JSON, evaluate(model, dataset, place, rules, key=key, plant=plant))
+    values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
+    name = values.dataset.name
     lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E, beside the paper's."
     warnings = [SIMULATED] if plant is not None else []
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
     writer.writerows([COLUMNS, *evaluation_rows(values)])
-    write_json(place / JSON, values)
     write_text(place / CSV, table.getvalue())
     write_text(place / PAGE, evaluation_page(values, title=f"Evaluation on {name}", lead=lead, warnings=warnings))
     return EvaluationResult(place, values)

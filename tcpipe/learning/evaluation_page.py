@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from dataclasses import astuple
+from typing import Literal
 
 import numpy as np
 
 from tcpipe.learning import paper_tables as paper
-from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS, SPLITS
-from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
+from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS
+from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation
+from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS, Errors
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.prediction_figures import MOST_PERCENT, predictions_by_patch
 
@@ -22,53 +24,53 @@ _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"
 
 
 def evaluation_page(
-    values: Mapping[str, Any], *, title: str, lead: str, before: Sequence[Section] = (), warnings: Sequence[str] = ()
+    found: Evaluation, *, title: str, lead: str, before: Sequence[Section] = (), warnings: Sequence[str] = ()
 ) -> str:
     """Return the HTML page of what `evaluate` found; ``before`` and ``warnings`` come first."""
-    sections = [*before, *_by_class(values), _ablation(values), _energy(values), _time(values), *_pictures(values)]
+    sections = [*before, *_by_class(found), _ablation(found), _energy(found), _time(found), *_pictures(found)]
     return render_page(
         title=title,
         lead=lead,
         numbers=[
             Number(
-                _figure(values["splits"][name]["errors"][quantity][ALL], "mape_percent", quantity) + " %",
+                _figure(found.splits[name].errors[quantity][ALL], "mape_percent", quantity) + " %",
                 f"MAPE of {quantity}, {name}",
             )
-            for name in _splits(values)
+            for name in found.ordered_splits
             for quantity in ("E", "T")
         ],
-        warnings=[*warnings, *values["warnings"]],
+        warnings=[*warnings, *found.warnings],
         sections=[section for section in sections if section.rows or section.svg or section.text],
     )
 
 
-def evaluation_rows(values: Mapping[str, Any]) -> list[tuple[Any, ...]]:
+def evaluation_rows(found: Evaluation) -> list[tuple[str | int | float | None, ...]]:
     """Return every figure as one row: table, split, what, quantity, unit, class, count, RMSE, MAPE [%], count of the MAPE."""
-    found = [*_rows_by_class(values), *_rows_of_ablation(values), *_rows_compared(values)]
-    return [(*keys[:4], UNITS[keys[3]], keys[4], *(error[name] for name in COLUMNS[6:])) for keys, error in found]
+    rows = (*_rows_by_class(found), *_rows_of_ablation(found), *_rows_compared(found))
+    return [(*keys[:4], UNITS[keys[3]], keys[4], *astuple(error)) for keys, error in rows]
 
 
-_Row = tuple[tuple[str, str, str, str, str], Mapping[str, Any]]
+_Row = tuple[tuple[str, str, str, str, str], Errors]
 
 
-def _rows_by_class(values: Mapping[str, Any]) -> Iterator[_Row]:
-    for split, part in values["splits"].items():
-        for what in ("errors", *(floor for floor in FLOORS if floor in part)):
-            for quantity, by_class in part[what].items():
+def _rows_by_class(found: Evaluation) -> Iterator[_Row]:
+    for split, part in found.splits.items():
+        for what, by_quantity in {"errors": part.errors, **part.floors}.items():
+            for quantity, by_class in by_quantity.items():
                 for name, error in by_class.items():
                     yield ("by class", split, what, quantity, name), error
 
 
-def _rows_of_ablation(values: Mapping[str, Any]) -> Iterator[_Row]:
-    for row in values["ablation"]:
-        for split in values["splits"]:
-            for quantity, error in row[split].items():
-                yield ("ablation", split, f"{'+'.join(row['layers'])} {row['how']}", quantity, ALL), error
+def _rows_of_ablation(found: Evaluation) -> Iterator[_Row]:
+    for row in found.ablation:
+        for split in found.splits:
+            for quantity, error in row.on(split).items():
+                yield ("ablation", split, f"{'+'.join(row.layers)} {row.how}", quantity, ALL), error
 
 
-def _rows_compared(values: Mapping[str, Any]) -> Iterator[_Row]:
-    for table, quantity in (("energy", "E"), ("time", "T")):
-        for what, by_split in values[table].items():
+def _rows_compared(found: Evaluation) -> Iterator[_Row]:
+    for table, quantity, by_predictor in (("energy", "E", found.energy), ("time", "T", found.time)):
+        for what, by_split in by_predictor.items():
             for split, error in by_split.items():
                 yield (table, split, what, quantity, ALL), error
 
@@ -77,8 +79,8 @@ COLUMNS = ("table", "split", "what", "quantity", "unit", "class", "count", "rmse
 """Of `evaluation_rows`."""
 
 
-def _figure(error: Mapping[str, Any] | None, measure: str, quantity: str) -> str:
-    value = None if error is None else error[measure]
+def _figure(error: Errors | None, measure: str, quantity: str) -> str:
+    value = None if error is None else error.mape_percent if measure == "mape_percent" else error.rmse
     return "–" if value is None else f"{value:.{2 if measure == 'mape_percent' else _DIGITS[quantity]}f}"
 
 
@@ -90,33 +92,33 @@ def _unit(measure: str, quantity: str) -> str:
     return "%" if measure == "mape_percent" else UNITS[quantity]
 
 
-def _by_class(values: Mapping[str, Any]) -> list[Section]:
+def _by_class(found: Evaluation) -> list[Section]:
     """Return tables I and II."""
     sections = []
     for number, name in zip(("I", "II"), SPLITS, strict=True):
-        if name not in values["splits"]:
+        if name not in found.splits:
             continue
-        part = values["splits"][name]
-        classes = [*part["class_order"], ALL]
+        part = found.splits[name]
+        classes = [*part.class_order, ALL]
         rows = []
         for quantity in QUANTITIES:
             for measure, called in MEASURES.items():
-                ours = [_figure(part["errors"][quantity].get(entry), measure, quantity) for entry in classes]
+                ours = [_figure(part.errors[quantity].get(entry), measure, quantity) for entry in classes]
                 rows.append((f"{quantity}, {called} [{_unit(measure, quantity)}]", "here", *ours))
                 told = dict(zip(paper.CLASSES, paper.BY_CLASS[name, quantity, measure], strict=True))
                 rows.append(("", "the paper", *(_paper_figure(told.get(entry)) for entry in classes)))
-                for said, floors in _floors(values, name):
+                for said, floors in _floors(found, name):
                     noise = [_figure(floors[quantity].get(entry), measure, quantity) for entry in classes]
                     rows.append(("", said, *noise))
-                repeats = values["repeatability"][quantity]
+                repeats = found.repeatability[quantity]
                 if measure == "rmse" and repeats is not None:
-                    blank = [""] * len(part["classes"])
-                    rows.append(("", "repeats to, driven again", *blank, f"{repeats['std']:.{_DIGITS[quantity]}f}"))
+                    blank = [""] * len(part.classes)
+                    rows.append(("", "repeats to, driven again", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}"))
         header = (
             "",
             "",
-            *(f"{entry} ({part['classes'][entry]})" for entry in part["class_order"]),
-            f"all ({part['samples']})",
+            *(f"{entry} ({part.classes[entry]})" for entry in part.class_order),
+            f"all ({part.samples})",
         )
         sections.append(
             Section(f"Table {number}: {_CALLED[name]}", _TEXT[name], header=header, rows=rows, figures_from=2)
@@ -130,60 +132,61 @@ _TEXT = {
 }
 
 
-def _ablation(values: Mapping[str, Any]) -> Section:
+def _ablation(found: Evaluation) -> Section:
     """Return table III."""
-    splits = _splits(values)
+    splits = found.ordered_splits
     rows = []
-    for row in values["ablation"]:
-        key = tuple(row["layers"])
-        called, how = "{" + ", ".join(key) + "}", "retrained" if row["how"] == "retrained" else "here"
+    for row in found.ablation:
+        key = row.layers
+        called, how = "{" + ", ".join(key) + "}", "retrained" if row.how == "retrained" else "here"
         for split in splits:
-            figures = [_figure(row[split][quantity], measure, quantity) for quantity, measure in paper.ABLATION_COLUMNS]
+            figures = [
+                _figure(row.on(split)[quantity], measure, quantity) for quantity, measure in paper.ABLATION_COLUMNS
+            ]
             rows.append((called, split, how, *figures))
-            if row["how"] == "noise" and key in paper.ABLATION:
+            if row.how == "noise" and key in paper.ABLATION:
                 told = paper.ABLATION[key][SPLITS.index(split)]
                 rows.append(("", "", "the paper", *(_paper_figure(value) for value in told)))
     for split in splits:
-        for said, floors in _floors(values, split):
+        for said, floors in _floors(found, split):
             figures = [
                 _figure(floors[quantity][ALL], measure, quantity) for quantity, measure in paper.ABLATION_COLUMNS
             ]
             rows.append((said, split, "", *figures))
     header = ("layers", "", "", *(f"{q} {MEASURES[m]} [{_unit(m, q)}]" for q, m in paper.ABLATION_COLUMNS))
-    draws = values["config"]["draws"]
+    draws = found.config.draws
     text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them."
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
 
 
-def _splits(values: Mapping[str, Any]) -> list[str]:
-    """Return the splits that were evaluated, in the paper's order."""
-    return [split for split in SPLITS if split in values["splits"]]
-
-
-def _floors(values: Mapping[str, Any], split: str) -> Iterator[tuple[str, Mapping[str, Any]]]:
+def _floors(found: Evaluation, split: str) -> Iterator[tuple[str, ErrorsByClass]]:
     """Yield what errors on a split can hardly be less than: its name, and errors by quantity and class."""
-    part = values["splits"][split]
-    yield from ((said, part[floor]) for floor, said in FLOORS.items() if floor in part)
+    yield from ((FLOORS[floor], errors) for floor, errors in found.splits[split].floors.items())
 
 
-def _compared(title: str, text: str, values: Mapping[str, Any], table: tuple[str, Mapping[str, Any], str]) -> Section:
-    """Return table IV or V: ``table`` is its key among the values, the paper's figures, its quantity."""
-    key, told, quantity = table
-    found = values[key]
-    splits = _splits(values)
+def _compared(
+    title: str,
+    text: str,
+    found: Evaluation,
+    told: Mapping[str, Sequence[tuple[float, float]]],
+    quantity: Literal["E", "T"],
+) -> Section:
+    """Return table IV or V, beside what is told in the paper."""
+    table = found.energy if quantity == "E" else found.time
+    splits = found.ordered_splits
     rows = []
-    for what, by_split in ((what, found[what]) for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED) if what in found):
+    for what, by_split in ((what, table[what]) for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED) if what in table):
         cells = [_figure(by_split[split], measure, quantity) for split in splits for measure in MEASURES]
         rows.append((what, "here", *cells))
         if what in told:
             figures = [value for split in splits for value in told[what][SPLITS.index(split)]]
             rows.append(("", "the paper", *(_paper_figure(value) for value in figures)))
-    for floors in zip(*(_floors(values, split) for split in splits), strict=True):
+    for floors in zip(*(_floors(found, split) for split in splits), strict=True):
         cells = [_figure(floor[quantity][ALL], measure, quantity) for _, floor in floors for measure in MEASURES]
         rows.append((floors[0][0], "", *cells))
-    repeats = values["repeatability"][quantity]
+    repeats = found.repeatability[quantity]
     if repeats is not None:
-        rows.append(("repeats to, driven again", "", *([f"{repeats['std']:.{_DIGITS[quantity]}f}", ""] * len(splits))))
+        rows.append(("repeats to, driven again", "", *([f"{repeats.std:.{_DIGITS[quantity]}f}", ""] * len(splits))))
     header = (
         "",
         "",
@@ -192,25 +195,25 @@ def _compared(title: str, text: str, values: Mapping[str, Any], table: tuple[str
     return Section(title, text, header=header, rows=rows, figures_from=2)
 
 
-def _energy(values: Mapping[str, Any]) -> Section:
+def _energy(found: Evaluation) -> Section:
     text = "Wei and Isler predict E from heights alone: one network of grass, or one for every class."
-    return _compared("Table IV: energy against Wei and Isler", text, values, ("energy", paper.ENERGY, "E"))
+    return _compared("Table IV: energy against Wei and Isler", text, found, paper.ENERGY, "E")
 
 
-def _time(values: Mapping[str, Any]) -> Section:
+def _time(found: Evaluation) -> Section:
     text = "The expected time is d / v at the robot's greatest speed."
-    return _compared("Table V: time against the expected time", text, values, ("time", paper.TIME, "T"))
+    return _compared("Table V: time against the expected time", text, found, paper.TIME, "T")
 
 
-def _pictures(values: Mapping[str, Any]) -> list[Section]:
+def _pictures(found: Evaluation) -> list[Section]:
     """Return the paper's pictures: E of test samples and T of the unseen area, each with its error."""
     sections = []
     for split, quantity, label in (("test", "E", "energy E [J]"), ("unseen", "T", "time T [s]")):
-        if split in values["plots"]:
-            plot = values["plots"][split]
+        if split in found.plots:
+            plot = found.plots[split]
             svg = predictions_by_patch(
-                np.asarray(plot[f"{quantity}_measured"]),
-                np.asarray(plot[f"{quantity}_predicted"]),
+                np.asarray(plot["E_measured" if quantity == "E" else "T_measured"], np.float64),
+                np.asarray(plot["E_predicted" if quantity == "E" else "T_predicted"], np.float64),
                 plot["class"],
                 label=label,
             )

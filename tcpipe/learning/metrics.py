@@ -28,39 +28,44 @@ Costs = Mapping[str, Array]
 
 @dataclass(frozen=True, slots=True)
 class Errors:
-    """Errors of some samples."""
+    """Errors of some samples; None where there is nothing to average."""
 
     count: int
-    rmse: float
-    mape_percent: float
+    rmse: float | None
+    mape_percent: float | None
     mape_count: int
     """Samples whose label is large enough for a percentage."""
 
 
 def errors(predicted: Array, measured: Array, least: float = 0.0) -> Errors:
-    """Return the errors of predictions, both of shape (N,); NaN where there is nothing to average."""
+    """Return the errors of predictions, both of shape (N,)."""
     difference = np.asarray(predicted, np.float64) - measured
     large = measured >= least
-    share = np.abs(difference[large]) / measured[large] if large.any() else np.array([np.nan])
-    rmse = float(np.sqrt(np.mean(difference**2))) if len(difference) else float("nan")
-    return Errors(len(difference), rmse, 100.0 * float(np.mean(share)), int(large.sum()))
+    rmse = float(np.sqrt(np.mean(difference**2))) if len(difference) else None
+    mape = 100.0 * float(np.mean(np.abs(difference[large]) / measured[large])) if large.any() else None
+    return Errors(len(difference), rmse, mape, int(large.sum()))
 
 
 def combined(parts: Iterable[Errors]) -> Errors:
     """Return the errors of all parts together: RMSE in quadrature, MAPE weighted by count."""
     found = [part for part in parts if part.count]
     count, mape_count = sum(part.count for part in found), sum(part.mape_count for part in found)
-    squares = sum(part.count * part.rmse**2 for part in found)
-    shares = sum(part.mape_count * part.mape_percent for part in found if part.mape_count)
-    rmse = float(np.sqrt(squares / count)) if count else float("nan")
-    return Errors(count, rmse, shares / mape_count if mape_count else float("nan"), mape_count)
+    squares = sum(part.count * part.rmse**2 for part in found if part.rmse is not None)
+    shares = sum(part.mape_count * part.mape_percent for part in found if part.mape_percent is not None)
+    rmse = float(np.sqrt(squares / count)) if count else None
+    return Errors(count, rmse, shares / mape_count if mape_count else None, mape_count)
 
 
 def mean_of_draws(draws: Iterable[Errors]) -> Errors:
     """Return the mean errors of the same samples under several draws of noise."""
     found = list(draws)
-    rmse, mape = (float(np.mean([getattr(draw, name) for draw in found])) for name in ("rmse", "mape_percent"))
+    rmse, mape = _mean(draw.rmse for draw in found), _mean(draw.mape_percent for draw in found)
     return Errors(found[0].count, rmse, mape, found[0].mape_count)
+
+
+def _mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def errors_by_class(
@@ -105,8 +110,8 @@ def label_floor(
                 continue
             label, std = measured[quantity][here], sigma[here]
             large = label >= LEAST[quantity]
-            mape = 100.0 * np.sqrt(2.0 / np.pi) * float(np.mean(std[large] / label[large])) if large.any() else np.nan
-            by_class[name] = Errors(int(here.sum()), float(np.sqrt(np.mean(std**2))), float(mape), int(large.sum()))
+            mape = 100.0 * np.sqrt(2.0 / np.pi) * float(np.mean(std[large] / label[large])) if large.any() else None
+            by_class[name] = Errors(int(here.sum()), float(np.sqrt(np.mean(std**2))), mape, int(large.sum()))
         found[quantity] = {**by_class, ALL: combined(by_class.values())}
     return found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from tcpipe.formats.json_files import Json
 from tcpipe.formats.seals import Checksum
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.network import Architecture
@@ -84,6 +85,6 @@ class ModelCard:
     """Of the files beside it, by name."""
 
 
-def is_current(found: Mapping[str, object]) -> bool:
+def is_current(found: Mapping[str, Json]) -> bool:
     """Return whether a document is the card of a model of this schema."""
     return found.get("kind") == KIND and found.get("schema_version") == SCHEMA_VERSION

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.claims import Claim, checked_claims
-from tcpipe.learning.evaluation import EvaluateConfig
+from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.plant_floor import plant_costs
@@ -35,7 +34,7 @@ SIMULATION_SEED = 1
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class Experiment:
     """How large an experiment is."""
 
     scenario: str
@@ -43,16 +42,39 @@ class Plan:
     evaluating: EvaluateConfig
 
 
-FULL = Plan("paper", FitConfig(epochs=60, patience=10), EvaluateConfig(draws=5))
+FULL = Experiment("paper", FitConfig(epochs=60, patience=10), EvaluateConfig(draws=5))
 """The paper's size: fits 90 minutes on two cores."""
 
-QUICK = Plan(
+QUICK = Experiment(
     "paper_quick", FitConfig(epochs=6, patience=6, batch=32, learning_rate=1e-3, width=16), EvaluateConfig(draws=2)
 )
 """Two minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
 
 RECIPE = replace(Recipe(), robot="husky", split=replace(Recipe().split, holdout="sample"))
 """The defaults with the paper's random test samples."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleCounts:
+    """What was driven: samples by split, by class of each split, and all."""
+
+    splits: Mapping[str, int] = field(default_factory=dict)
+    terrain: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+    segments: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReproductionSummary:
+    """All of reproduction.json."""
+
+    kind: str = "tcpipe reproduction"
+    simulated: bool = True
+    scenario: str
+    plan: Experiment
+    counts: SampleCounts
+    claims: tuple[Claim, ...]
+    seeds: tuple[Mapping[str, SplitErrors], ...]
+    """Errors by split, of each training."""
 
 
 @dataclass(slots=True)
@@ -62,8 +84,9 @@ class Reproduction:
     directory: Path
     scenario: str
     claims: list[Claim] = field(default_factory=list)
-    runs: list[dict[str, Any]] = field(default_factory=list)
-    counts: Mapping[str, Any] = field(default_factory=dict)
+    runs: list[Evaluation] = field(default_factory=list)
+    """One a training."""
+    counts: SampleCounts = field(default_factory=SampleCounts)
     seconds: dict[str, float] = field(default_factory=dict)
     """Of the stages, of this call."""
 
@@ -112,7 +135,7 @@ def reproduce(directory: str | Path, *, quick: bool = False, seeds: int = 1, job
     with _timed(result, "ingest and build"):
         _build(place, site, jobs)
     card = open_dataset(place / "dataset").card
-    result.counts = {"splits": card.splits, "terrain": card.terrain, "segments": card.samples}
+    result.counts = SampleCounts(card.splits, card.terrain, card.samples)
     for seed in range(seeds):
         result.runs.append(_train_and_evaluate(place, made, plan, seed, result))
     result.claims = checked_claims(result.runs)
@@ -140,29 +163,33 @@ def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
     logger.info("%s", str(built).splitlines()[0])
 
 
-def _train_and_evaluate(place: Path, made: Scenario, plan: Plan, seed: int, result: Reproduction) -> dict[str, Any]:
+def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int, result: Reproduction) -> Evaluation:
     here, dataset = place / f"seed-{seed}", place / "dataset"
     with _timed(result, "train"):
         train(dataset, here / "model", config=replace(plan.fitting, seed=seed), disposable=True)
     with _timed(result, "evaluate"):
-        known: Callable[[Any], Any] = partial(plant_costs, made.world, made.drives[0].robot)
+        known = partial(plant_costs, made.world, made.drives[0].robot)
         config = replace(plan.evaluating, seed=seed)
         return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
 
 
-def _write(result: Reproduction, plan: Plan) -> None:
+def _write(result: Reproduction, plan: Experiment) -> None:
     """Write the page, and the same as JSON."""
-    claims = [{**asdict(claim), "held": claim.held} for claim in result.claims]
-    values = {
-        "kind": "tcpipe reproduction",
-        "simulated": True,
-        "scenario": result.scenario,
-        "plan": asdict(plan),
-        "counts": result.counts,
-        "claims": claims,
-        "seeds": [run["splits"] for run in result.runs],
-    }
-    write_json(result.directory / JSON, values)
+    summary = ReproductionSummary(
+        scenario=result.scenario,
+        plan=plan,
+        counts=result.counts,
+        claims=tuple(result.claims),
+        seeds=tuple(run.splits for run in result.runs),
+    )
+    write_json(result.directory / JSON, summary)
     write_text(
-        result.directory / PAGE, reproduction_page(result.runs, result.claims, result.counts, quick=plan is QUICK)
+        result.directory / PAGE,
+        reproduction_page(
+            result.runs,
+            result.claims,
+            splits=result.counts.splits,
+            terrain=result.counts.terrain,
+            quick=plan is QUICK,
+        ),
     )

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from tcpipe.learning.claims import Claim
+from tcpipe.learning.evaluation_facts import Evaluation
 from tcpipe.learning.evaluation_files import SIMULATED
 from tcpipe.learning.evaluation_page import evaluation_page
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
@@ -18,15 +18,20 @@ _PAPER_COUNTS = {"train": 5142, "test": 1286, "unseen": 4458}
 
 
 def reproduction_page(
-    runs: Sequence[Mapping[str, Any]], claims: Sequence[Claim], counts: Mapping[str, Any], *, quick: bool
+    runs: Sequence[Evaluation],
+    claims: Sequence[Claim],
+    *,
+    splits: Mapping[str, int],
+    terrain: Mapping[str, Mapping[str, int]],
+    quick: bool,
 ) -> str:
-    """Return the HTML page."""
+    """Return the HTML page; ``splits`` and ``terrain`` count the samples by split, and by split and class."""
     held = sum(claim.held for claim in claims)
     return evaluation_page(
         runs[0],
         title="The paper's experiment on a simulated site",
         lead=f"{held} of {len(claims)} claims held; {len(runs)} training{'s' if len(runs) > 1 else ''}.",
-        before=[_claims(claims), _shares(counts), *_seeds(runs), _sources()],
+        before=[_claims(claims), _shares(splits, terrain), *_seeds(runs), _sources()],
         warnings=[SIMULATED, *([_QUICK] if quick else [])],
     )
 
@@ -45,26 +50,27 @@ def _claims(claims: Sequence[Claim]) -> Section:
     return Section("Does the pattern of the paper hold?", text, header=header, rows=rows, figures_from=4)
 
 
-def _shares(counts: Mapping[str, Any]) -> Section:
-    total = max(counts["segments"], 1)
-    by_class = {name: sum(part.get(name, 0) for part in counts["terrain"].values()) for name in _PAPER_SHARES}
-    rows = [(name, f"{100.0 * by_class[name] / total:.1f} %", f"{share} %") for name, share in _PAPER_SHARES.items()]
-    rows += [(f"samples of {name}", f"{counts['splits'][name]}", f"{told}") for name, told in _PAPER_COUNTS.items()]
-    rows.append(("all samples", f"{counts['segments']}", "10886"))
+def _shares(splits: Mapping[str, int], terrain: Mapping[str, Mapping[str, int]]) -> Section:
+    total = sum(splits.values())
+    by_class = {name: sum(part.get(name, 0) for part in terrain.values()) for name in _PAPER_SHARES}
+    rows = [
+        (name, f"{100.0 * by_class[name] / max(total, 1):.1f} %", f"{share} %") for name, share in _PAPER_SHARES.items()
+    ]
+    rows += [(f"samples of {name}", f"{splits[name]}", f"{told}") for name, told in _PAPER_COUNTS.items()]
+    rows.append(("all samples", f"{total}", "10886"))
     return Section("What was driven", header=("", "here", "the paper"), rows=rows, figures_from=1)
 
 
-def _seeds(runs: Sequence[Mapping[str, Any]]) -> list[Section]:
+def _seeds(runs: Sequence[Evaluation]) -> list[Section]:
     """Return the spread between trainings, where there are several."""
     if len(runs) < 2:
         return []
     rows = []
-    for split in runs[0]["splits"]:
+    for split in runs[0].splits:
         for quantity in QUANTITIES:
-            found = [run["splits"][split]["errors"][quantity][ALL] for run in runs]
+            found = [run.splits[split].errors[quantity][ALL] for run in runs]
             figures = (
-                f"{error['rmse']:.3f} {UNITS[quantity]}, {error['mape_percent'] or float('nan'):.2f} %"
-                for error in found
+                f"{error.rmse:.3f} {UNITS[quantity]}, {error.mape_percent or float('nan'):.2f} %" for error in found
             )
             rows.append((split, quantity, *figures))
     header = ("", "", *(f"seed {number}" for number in range(len(runs))))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -177,7 +177,7 @@ def _causes(a: DatasetCard, b: DatasetCard) -> Iterator[str]:
         was, now = getattr(a, name), getattr(b, name)
         if was != now:
             yield f"code: {name} {was} → {now}"
-    ours, theirs = flat_recipe(asdict(a.recipe)), flat_recipe(asdict(b.recipe))
+    ours, theirs = flat_recipe(a.recipe), flat_recipe(b.recipe)
     for key in sorted({*ours, *theirs}):
         if ours.get(key) != theirs.get(key):
             yield f"recipe: {key} {_shown(ours.get(key))} → {_shown(theirs.get(key))}"

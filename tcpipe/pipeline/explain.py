@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal, TypeAlias
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, TcpipeError, plain_lines
-from tcpipe.formats.dataset_card import DatasetCard, MapInputs
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     SAMPLES,
     open_patches,
@@ -24,39 +24,153 @@ from tcpipe.formats.dataset_files import (
     rows_in_files,
     sample_columns,
 )
-from tcpipe.formats.json_files import plain, typed
+from tcpipe.formats.json_files import plain
+from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.seals import file_checksum
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
-from tcpipe.stages.sample import sample_segments
+from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import RunDirectory, Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, name_of
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import LABELLED_SEGMENTS, Streams
+from tcpipe.terrain.sampling import Patches
 
 _NEARBY_NS = 5_000_000_000
 """Gates and refusals this long before and after a segment are told [ns]."""
 
 
+Value: TypeAlias = str | int | float | bool | None
+"""Of a column in one row."""
+
+Setting: TypeAlias = Value | Sequence[Value | Mapping[str, Value]] | Mapping[str, Value | Sequence[Value]]
+"""Of a key of a recipe."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleLog:
+    """The log that a sample's run was read from; no path and no sha256 where run.json is gone."""
+
+    run_id: str
+    robot: str
+    paths: tuple[str, ...]
+    sha256: str | None
+    damage: tuple[str, ...]
+    tags: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class MessageRange:
+    """Which messages of a role lie in a segment: from ``first`` to ``last`` of so many."""
+
+    topic: str
+    type: str
+    time: str
+    """Which stamps rule: ``header`` or ``log``."""
+    placed_by: str
+    first: int
+    last: int
+    """Less than ``first``: none."""
+    of: int
+    first_ns: int | None
+    last_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class NearbyGate:
+    """A stretch of dropped track near a segment: why, and how far from its start or end."""
+
+    why: tuple[str, ...]
+    where: Literal["before", "after"]
+    apart_s: float
+    rows: int
+
+
+@dataclass(frozen=True, slots=True)
+class NearbyRefusal:
+    """How many measurements of a role near a segment the filter refused, by reason."""
+
+    role: str
+    reason: str
+    count: int
+
+
+@dataclass(frozen=True, slots=True)
+class SampleMap:
+    """The map that a patch is cut from, and the tiles of it that the patch touches."""
+
+    name: str
+    crs: str
+    sources: Mapping[str, str]
+    inputs: MapInputs
+    corners_xy_m: tuple[tuple[float, float], ...]
+    """Of the patch; none where the map gives no patch any more."""
+    tiles_col_row: tuple[tuple[int, int], ...]
+    tile_px: int
+
+
+@dataclass(frozen=True, slots=True)
+class Versions:
+    """By which version of the program dataset and run were made, and which one this is."""
+
+    dataset: str
+    run: str
+    here: str
+    data_model: str
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """A sample's whole history."""
+
+    sample: Mapping[str, Value]
+    """Its row of samples.parquet by column, and which ``row`` it is."""
+    labels: Mapping[str, float]
+    quality: tuple[str, ...]
+    log: SampleLog
+    messages: Mapping[str, MessageRange]
+    """By role."""
+    gates: tuple[NearbyGate, ...]
+    refused: tuple[NearbyRefusal, ...]
+    map: SampleMap
+    recipe_id: str
+    recipe_differs_in: Mapping[str, Setting]
+    """The recipe's keys that are not at their default."""
+    versions: Versions
+    made_from: Literal["segments", "streams"]
+    """What it was made again from."""
+
+
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A sample's whole history as JSON values, and what differs when it is made again; ``str`` of it is what the command prints."""
+    """A sample's whole history, and what differs when it is made again; ``str`` of it is what the command prints."""
 
     sample_id: str
-    facts: Mapping[str, Any]
+    facts: History
     differences: tuple[str, ...]
     """Empty: the sample was made again bit for bit."""
 
     def __str__(self) -> str:
-        """Return the lines as one text."""
-        return plain_lines(self.lines())
-
-    def lines(self) -> list[str]:
         """Return the history as plain lines."""
-        return list(_lines(self.sample_id, self.facts, self.differences))
+        return plain_lines(tuple(_lines(self.sample_id, self.facts, self.differences)))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sample:
+    """A sample's row of samples.parquet, and what of it is asked for."""
+
+    values: Mapping[str, Value]
+    row: int
+    sample_id: str
+    run_id: str
+    map: str
+    start_ns: int
+    end_ns: int
+    quality: int
+    labels: Mapping[str, float]
 
 
 def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Path = "tcpipe-store") -> Explained:
@@ -79,37 +193,36 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     """
     directory, opened = Path(dataset), open_store(store)
     card, sample = read_current_card(directory), _sample(directory, sample_id)
-    recipe = card.recipe
     run = _run(opened, directory, card, sample)
     told = run.manifest
-    read_with = read_key(recipe, told.robot_requested, definitions=told.message_definitions)
+    read_with = read_key(card.recipe, told.robot_requested, definitions=told.message_definitions)
     streams = opened.read_streams(run.run_id, key=f"{read_with}-{told.tcpipe_version}")
-    source = open_map(opened.map_path(sample["map"]))
-    window = sample["start_ns"], sample["end_ns"]
-    made = _made_again(sample, run, streams, source, recipe)
+    source = open_map(opened.map_path(sample.map))
+    made = _made_again(sample, run, streams, source, card.recipe)
     differences = tuple(_differences(directory, card, sample, made))
     if differences:
         differences += tuple(_reasons(card, sample, run, source))
-    facts = {
-        "sample": sample,
-        "labels": {name: sample[name] for name in _LABELS},
-        "quality": [name_of(bit) for bit in Quality if sample["quality"] & bit],
-        "log": _log(opened, run),
-        "messages": {} if streams is None else dict(_messages(streams, *window)),
-        "gates": list(_gates(run, *window)),
-        "refused": list(_refused(run, *window)),
-        "map": _map(source, sample, recipe),
-        "recipe_id": run.recipe_id,
-        "recipe_differs_in": _changed_keys(recipe),
-        "versions": {
-            "dataset": card.tcpipe_version,
-            "run": run.manifest.tcpipe_version,
-            "here": __version__,
-            "data_model": card.data_model_version,
-        },
-        "made_from": "segments" if streams is None else "streams",
-    }
-    return Explained(sample_id, plain(facts), differences)
+    return Explained(sample_id, _history(opened, card, sample, run, streams=streams, source=source), differences)
+
+
+def _history(
+    store: Store, card: DatasetCard, sample: _Sample, run: RunDirectory, *, streams: Streams | None, source: MapFile
+) -> History:
+    window = sample.start_ns, sample.end_ns
+    return History(
+        sample={**sample.values, "row": sample.row},
+        labels=sample.labels,
+        quality=tuple(name_of(bit) for bit in Quality if sample.quality & bit),
+        log=_log(store, run),
+        messages={} if streams is None else dict(_messages(streams, *window)),
+        gates=tuple(_gates(run, *window)),
+        refused=tuple(_refused(run, *window)),
+        map=_map(source, sample, card.recipe),
+        recipe_id=run.recipe_id,
+        recipe_differs_in=_changed_keys(card.recipe),
+        versions=Versions(card.tcpipe_version, run.manifest.tcpipe_version, __version__, card.data_model_version),
+        made_from="segments" if streams is None else "streams",
+    )
 
 
 _LABELS = tuple(
@@ -119,8 +232,7 @@ _LABELS = tuple(
 )
 
 
-def _sample(directory: Path, sample_id: str) -> dict[str, Any]:
-    """Return a sample's row, and under ``row`` where it stands."""
+def _sample(directory: Path, sample_id: str) -> _Sample:
     ids = read_samples(directory, ["sample_id"]).column("sample_id")
     row = pc.index(ids, sample_id).as_py()
     if row < 0:
@@ -133,38 +245,40 @@ def _sample(directory: Path, sample_id: str) -> dict[str, Any]:
         group = read_row_group(directory / SAMPLES, row // ROWS_PER_GROUP, sample_columns(directory))
     except StoreError as error:
         raise DatasetError(*error.problems) from None
-    found: dict[str, Any] = group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0]
-    return {**found, "row": row}
+    found = group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0]
+    asked = ("sample_id", "run_id", "map", "start_ns", "end_ns", "quality")
+    labels = {name: found[name] for name in _LABELS}
+    return _Sample(found, row, **{name: found[name] for name in asked}, labels=labels)
 
 
-def _run(store: Store, directory: Path, card: DatasetCard, sample: Mapping[str, Any]) -> RunDirectory:
-    recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample["run_id"]), None)
+def _run(store: Store, directory: Path, card: DatasetCard, sample: _Sample) -> RunDirectory:
+    recipe_id = next((run.recipe_id for run in card.runs if run.run_id == sample.run_id), None)
     if recipe_id is None:
         raise DatasetError(
-            f"{directory}: its card lists no run {sample['run_id']}; 'tcpipe verify {directory}' tells what else is wrong"
+            f"{directory}: its card lists no run {sample.run_id}; 'tcpipe verify {directory}' tells what else is wrong"
         )
-    for run in store.recipes_of(sample["run_id"]):
+    for run in store.recipes_of(sample.run_id):
         if run.recipe_id == recipe_id:
             return run
     raise DatasetError(
-        f"{store.root}: run {sample['run_id']} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
+        f"{store.root}: run {sample.run_id} under recipe {recipe_id}, of which {directory} is made, is not in this store; "
         "name the store it was built from with --store"
     )
 
 
-def _log(store: Store, run: RunDirectory) -> dict[str, Any]:
+def _log(store: Store, run: RunDirectory) -> SampleLog:
     known = store.run_json(run.run_id)
-    return {
-        "run_id": run.run_id,
-        "robot": run.manifest.robot,
-        "paths": list(known.source.paths) if known else [],
-        "sha256": known.source.sha256 if known else None,
-        "damage": list(known.damage) if known else [],
-        "tags": dict(run.manifest.tags),
-    }
+    return SampleLog(
+        run_id=run.run_id,
+        robot=run.manifest.robot,
+        paths=tuple(known.source.paths) if known else (),
+        sha256=known.source.sha256 if known else None,
+        damage=tuple(known.damage) if known else (),
+        tags=run.manifest.tags,
+    )
 
 
-def _messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, dict[str, Any]]]:
+def _messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[str, MessageRange]]:
     """Yield, for every role, its topic and which of its messages lie in the segment."""
     for role, table in streams.tables.items():
         stamps = integers(table, "stamp_ns")
@@ -173,69 +287,59 @@ def _messages(streams: Streams, start_ns: int, end_ns: int) -> Iterator[tuple[st
         sensor = streams.sensors[role]
         yield (
             role,
-            {
-                "topic": sensor.topic,
-                "type": sensor.type_name,
-                "time": sensor.time_source,
-                "placed_by": sensor.placed_by,
-                "first": int(first),
-                "last": int(last) - 1,
-                "of": len(stamps),
-                "first_ns": int(inside[0]) if len(inside) else None,
-                "last_ns": int(inside[-1]) if len(inside) else None,
-            },
+            MessageRange(
+                topic=sensor.topic,
+                type=sensor.type_name,
+                time=sensor.time_source,
+                placed_by=sensor.placed_by,
+                first=int(first),
+                last=int(last) - 1,
+                of=len(stamps),
+                first_ns=int(inside[0]) if len(inside) else None,
+                last_ns=int(inside[-1]) if len(inside) else None,
+            ),
         )
 
 
-def _gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[dict[str, Any]]:
-    """Yield each stretch of dropped track near the segment: why, and when, from its start and end [s]."""
+def _gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyGate]:
     table = run.track().table
     stamps, bits = integers(table, "stamp_ns"), integers(table, "dropped_by")
     near = slice(*np.searchsorted(stamps, [start_ns - _NEARBY_NS, end_ns + _NEARBY_NS]))
     stamps, bits = stamps[near], bits[near]
     for part in np.split(np.arange(len(bits)), np.flatnonzero(np.diff(bits)) + 1):
         if len(part) and bits[part[0]]:
-            names = [name_of(reason) for reason in DropReason if int(bits[part[0]]) & reason]
+            names = tuple(name_of(reason) for reason in DropReason if int(bits[part[0]]) & reason)
             before = stamps[part[0]] < start_ns
             offset_ns = start_ns - stamps[part[-1]] if before else stamps[part[0]] - end_ns
-            yield {
-                "why": names,
-                "where": "before" if before else "after",
-                "apart_s": float(offset_ns) / 1e9,
-                "rows": len(part),
-            }
+            yield NearbyGate(names, "before" if before else "after", float(offset_ns) / 1e9, len(part))
 
 
-def _refused(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[dict[str, Any]]:
-    """Yield how many measurements near the segment the filter refused, by role and reason."""
+def _refused(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyRefusal]:
     table = run.rejections()
     stamps = integers(table, "stamp_ns")
     near = (stamps >= start_ns - _NEARBY_NS) & (stamps <= end_ns + _NEARBY_NS)
-    pairs: dict[tuple[str, str], int] = {}
-    for row in table.filter(pa.array(near)).select(["role", "reason"]).to_pylist():
-        key = row["role"], row["reason"]
-        pairs[key] = pairs.get(key, 0) + 1
-    yield from ({"role": role, "reason": reason, "count": count} for (role, reason), count in sorted(pairs.items()))
+    rows = table.filter(pa.array(near)).select(["role", "reason"]).to_pylist()
+    for (role, reason), count in sorted(Counter((row["role"], row["reason"]) for row in rows).items()):
+        yield NearbyRefusal(role, reason, count)
 
 
-def _map(source: MapFile, sample: Mapping[str, Any], recipe: Recipe) -> dict[str, Any]:
-    """Return which map, made from what, and the tiles of it that the patch touches; none where the map gives no patch any more."""
-    corners = _sampled(sample, source, recipe).footprint_xy_m.reshape(-1, 2)
+def _map(source: MapFile, sample: _Sample, recipe: Recipe) -> SampleMap:
+    corners = _sampled(sample.values, source, recipe).footprint_xy_m.reshape(-1, 2)
     px = source.grid.px_from_xy(corners)
     ends = (px.min(axis=0), px.max(axis=0)) if len(px) else (np.zeros(2), -np.ones(2))
     low, high = (np.floor(end / source.tile_px).astype(int) for end in ends)
-    return {
-        "name": source.name,
-        "crs": source.grid.crs,
-        "sources": source.facts["sources"],
-        "inputs": source.facts.get("inputs", {}),
-        "corners_xy_m": corners.tolist(),
-        "tiles_col_row": [[col, row] for row in range(low[1], high[1] + 1) for col in range(low[0], high[0] + 1)],
-        "tile_px": source.tile_px,
-    }
+    return SampleMap(
+        name=source.name,
+        crs=source.grid.crs,
+        sources=source.facts.sources,
+        inputs=source.facts.inputs,
+        corners_xy_m=tuple((x, y) for x, y in corners.tolist()),
+        tiles_col_row=tuple((col, row) for row in range(low[1], high[1] + 1) for col in range(low[0], high[0] + 1)),
+        tile_px=source.tile_px,
+    )
 
 
-def _sampled(segment: Mapping[str, Any], source: MapFile, recipe: Recipe) -> Any:
+def _sampled(segment: Mapping[str, Value], source: MapFile, recipe: Recipe) -> Sampled:
     """Sample one segment, given as a row of values."""
     row = {column.name: pa.array([segment[column.name]], column.dtype) for column in LABELLED_SEGMENTS.columns}
     table = pa.Table.from_arrays(list(row.values()), schema=LABELLED_SEGMENTS.arrow())
@@ -243,8 +347,8 @@ def _sampled(segment: Mapping[str, Any], source: MapFile, recipe: Recipe) -> Any
 
 
 def _made_again(
-    sample: Mapping[str, Any], run: RunDirectory, streams: Streams | None, source: MapFile, recipe: Recipe
-) -> Mapping[str, Any] | str:
+    sample: _Sample, run: RunDirectory, streams: Streams | None, source: MapFile, recipe: Recipe
+) -> tuple[Mapping[str, Value], Patches] | str:
     """Return the segment and its patch as they come out now, or why they do not.
 
     From the streams where the store has them: fused, gated, cut and labelled anew; else from the stored segments.
@@ -256,48 +360,48 @@ def _made_again(
             segments = run_stages(streams, recipe.ingest, run_id=run.run_id, name=run.run_id)[2].table
         except TcpipeError as error:
             return "; ".join(error.problems)
-    row = pc.index(segments.column("segment_id"), sample["sample_id"]).as_py()
+    row = pc.index(segments.column("segment_id"), sample.sample_id).as_py()
     if row < 0:
-        away_s = np.abs(integers(segments, "start_ns") - sample["start_ns"]).min(initial=np.iinfo(np.int64).max) / 1e9
+        away_s = np.abs(integers(segments, "start_ns") - sample.start_ns).min(initial=np.iinfo(np.int64).max) / 1e9
         near = f"; the nearest begins {away_s:.3f} s away" if segments.num_rows else "; it has none now"
         return f"no segment of run {run.run_id} begins at this stamp any more{near}"
     segment = segments.slice(row, 1).to_pylist()[0]
     sampled = _sampled(segment, source, recipe)
     if len(sampled.kept) == 0:
         return f"map {source.name} gives no patch for it any more"
-    return {"segment": segment, "patches": sampled.patches}
+    return segment, sampled.patches
 
 
 def _differences(
-    directory: Path, card: DatasetCard, sample: Mapping[str, Any], made: Mapping[str, Any] | str
+    directory: Path, card: DatasetCard, sample: _Sample, made: tuple[Mapping[str, Value], Patches] | str
 ) -> Iterator[str]:
     """Yield a line for each value and each layer that is not, bit for bit, what the dataset holds."""
     if isinstance(made, str):
         yield made
         return
-    for name, value in made["segment"].items():
-        if name in sample and sample[name] != value:
-            yield f"{name}: {value!r} now, {sample[name]!r} in the dataset"
-    patches = made["patches"]
+    segment, patches = made
+    for name, value in segment.items():
+        if name in sample.values and sample.values[name] != value:
+            yield f"{name}: {value!r} now, {sample.values[name]!r} in the dataset"
     for name, values in patches.columns().items():
         now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
-        if now != sample[name]:
-            yield f"{name}: {now!r} now, {sample[name]!r} in the dataset"
-    for layer, stored in _stored(directory, card, sample["row"]).items():
+        if now != sample.values[name]:
+            yield f"{name}: {now!r} now, {sample.values[name]!r} in the dataset"
+    for layer, stored in _stored(directory, card, sample.row).items():
         pixels = patches.pixels.get(layer)
         if pixels is None:
-            yield f"{layer}: map {sample['map']} has no such layer any more"
+            yield f"{layer}: map {sample.map} has no such layer any more"
         elif not np.array_equal(pixels[0], stored, equal_nan=pixels.dtype.kind == "f"):
             yield f"{layer}: {int((pixels[0] != stored).sum())} of {stored.size} pixels differ"
 
 
-def _reasons(card: DatasetCard, sample: Mapping[str, Any], run: RunDirectory, source: MapFile) -> Iterator[str]:
+def _reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, source: MapFile) -> Iterator[str]:
     """Yield what is not as it was when the dataset was built, which may be why."""
     versions = {card.tcpipe_version, run.manifest.tcpipe_version, __version__}
     if len(versions) > 1:
         yield f"made by tcpipe {', '.join(sorted(versions - {__version__}))}, this is {__version__}"
     for entry in card.maps:
-        if entry.name == sample["map"] and entry.inputs != typed(source.facts["inputs"], MapInputs, Path(source.name)):
+        if entry.name == sample.map and entry.inputs != source.facts.inputs:
             yield f"map {source.name} was added anew since, from other files"
     for made_from in card.runs:
         now = file_checksum(run.path / "segments.parquet").sha256
@@ -314,58 +418,54 @@ def _stored(directory: Path, card: DatasetCard, row: int) -> dict[str, NDArray[n
     return {name: pixels[place - files.starts[piece]] for name, pixels in files.read(piece, files.layers).items()}
 
 
-def _changed_keys(recipe: Recipe) -> dict[str, Any]:
+def _changed_keys(recipe: Recipe) -> dict[str, Setting]:
     """Return the recipe's keys that are not at their default."""
-    return {key: value for key, value in flat_recipe(asdict(recipe)).items() if value != _DEFAULTS.get(key)}
+    return {key: value for key, value in flat_recipe(recipe).items() if value != _DEFAULTS.get(key)}
 
 
-def flat_recipe(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def flat_recipe(recipe: Recipe) -> dict[str, Setting]:
     """Return a recipe's values by dotted key; a table whose keys are the user's own is one value."""
-    flat: dict[str, Any] = {}
-    for key, value in values.items():
-        if isinstance(value, Mapping) and not prefix:
-            flat.update(flat_recipe(value, f"{key}."))
-        else:
-            flat[prefix + key] = json.loads(json.dumps(plain(value)))
+    flat: dict[str, Setting] = {}
+    for key, value in plain(asdict(recipe)).items():
+        flat |= {f"{key}.{name}": of for name, of in value.items()} if isinstance(value, Mapping) else {key: value}
     return flat
 
 
-_DEFAULTS = flat_recipe(asdict(Recipe()))
+_DEFAULTS = flat_recipe(Recipe())
 
 
-def _lines(sample_id: str, facts: Mapping[str, Any], differences: Sequence[str]) -> Iterator[str]:
-    sample, labels, log, ground = facts["sample"], facts["labels"], facts["log"], facts["map"]
+def _lines(sample_id: str, facts: History, differences: Sequence[str]) -> Iterator[str]:
+    sample, labels, log, ground = facts.sample, facts.labels, facts.log, facts.map
     fold = "" if sample["fold"] is None else f", fold {sample['fold']}"
     yield f"{sample_id}: row {sample['row']}, split {sample['split']}{fold}"
     yield (
         f"labels   power {labels['power_watt']:.1f} ± {labels['power_std_watt']:.1f} W, "
         f"velocity {labels['velocity_mps']:.3f} ± {labels['velocity_std_mps']:.3f} m/s, "
         f"duration {labels['duration_s']:.3f} s, energy {labels['energy_joule']:.1f} J; "
-        f"quality {', '.join(facts['quality']) or 'clean'}"
+        f"quality {', '.join(facts.quality) or 'clean'}"
     )
-    paths = [path if Path(path).exists() else f"{path} (not there now)" for path in log["paths"]]
-    yield f"log      {', '.join(paths) or 'unknown'} (sha256 {str(log['sha256'])[:12]}…), run {log['run_id']}, robot {log['robot']}"
+    paths = [path if Path(path).exists() else f"{path} (not there now)" for path in log.paths]
+    yield f"log      {', '.join(paths) or 'unknown'} (sha256 {str(log.sha256)[:12]}…), run {log.run_id}, robot {log.robot}"
     yield f"stamps   {sample['start_ns']} to {sample['end_ns']} ns"
-    for role, found in facts["messages"].items():
-        count = found["last"] - found["first"] + 1
-        which = f"{found['first']} to {found['last']} ({count})" if count else "none"
-        yield f"messages {role}: {found['topic']}, {which} of {found['of']} as read, by {found['time']} time"
-    for gate in facts["gates"]:
-        yield f"gate     {gate['apart_s']:.2f} s {gate['where']}: {', '.join(gate['why'])}, {gate['rows']} rows"
-    for refused in facts["refused"]:
-        yield f"refused  {refused['count']} of {refused['role']} ({refused['reason']}) within {_NEARBY_NS / 1e9:g} s"
-    tiles = ", ".join(f"({col}, {row})" for col, row in ground["tiles_col_row"])
-    made_of = ", ".join(f"{layer} {name}" for layer, name in sorted(ground["sources"].items()))
-    yield f"map      {ground['name']} in {ground['crs']} from {made_of}; tiles (column, row) {tiles}"
+    for role, found in facts.messages.items():
+        count = found.last - found.first + 1
+        which = f"{found.first} to {found.last} ({count})" if count else "none"
+        yield f"messages {role}: {found.topic}, {which} of {found.of} as read, by {found.time} time"
+    for gate in facts.gates:
+        yield f"gate     {gate.apart_s:.2f} s {gate.where}: {', '.join(gate.why)}, {gate.rows} rows"
+    for refused in facts.refused:
+        yield f"refused  {refused.count} of {refused.role} ({refused.reason}) within {_NEARBY_NS / 1e9:g} s"
+    tiles = ", ".join(f"({col}, {row})" for col, row in ground.tiles_col_row)
+    made_of = ", ".join(f"{layer} {name}" for layer, name in sorted(ground.sources.items()))
+    yield f"map      {ground.name} in {ground.crs} from {made_of}; tiles (column, row) {tiles}"
     changed = (
-        ", ".join(f"{key} = {value}" for key, value in facts["recipe_differs_in"].items())
-        or "all keys at their defaults"
+        ", ".join(f"{key} = {value}" for key, value in facts.recipe_differs_in.items()) or "all keys at their defaults"
     )
-    yield f"recipe   {facts['recipe_id']}: {changed}"
-    versions = facts["versions"]
-    yield f"versions dataset {versions['dataset']}, run {versions['run']}, here {versions['here']}; data model {versions['data_model']}"
+    yield f"recipe   {facts.recipe_id}: {changed}"
+    versions = facts.versions
+    yield f"versions dataset {versions.dataset}, run {versions.run}, here {versions.here}; data model {versions.data_model}"
     if differences:
-        yield f"made again from the {facts['made_from']}: it differs"
+        yield f"made again from the {facts.made_from}: it differs"
         yield from (f"  {line}" for line in differences)
     else:
-        yield f"made again from the {facts['made_from']}: equal, bit for bit"
+        yield f"made again from the {facts.made_from}: equal, bit for bit"

@@ -8,14 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
-from tcpipe.formats.json_files import read_json, write_json
+from tcpipe.formats.json_files import read_json, typed, write_json
 from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.parquet import parquet_rows, read_schema, storable
 from tcpipe.pipeline.log_sources import definitions_key
@@ -25,8 +25,39 @@ from tcpipe.tables.levels import metadata_of, with_metadata
 
 INDEX = "export.json"
 """What a directory of exported topics holds, and of which log: a second call finds it done."""
-_ENTRY = {"file", "bytes", "type", "rows", "made_from", "damage", "remarks"}
 _LONGEST_STEM = 200
+
+
+@dataclass(frozen=True, slots=True)
+class ExportOrigin:
+    """What an export depends on."""
+
+    log: str
+    """Its path or URL."""
+    size_and_time: tuple[tuple[int, int], ...]
+    """Of each file of it [byte, ns]."""
+    message_definitions: str
+    tcpipe_version: str
+
+
+@dataclass(frozen=True, slots=True)
+class IndexEntry:
+    """What an export's index has of a topic; no file where it cannot be read."""
+
+    file: str | None
+    bytes: int
+    type: str
+    rows: int
+    made_from: ExportOrigin
+    damage: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportIndex:
+    """All of export.json."""
+
+    topics: Mapping[str, IndexEntry]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,18 +125,28 @@ def export(
         paths = _paths(out, sorted(log.topics))
         index = _index(out)
         _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
-        known = {name for name in wanted if _is_there(index["topics"].get(name), made_from, out)}
+        known = {name for name in wanted if _is_there(index.get(name), made_from, out)}
         if wanted and known == set(wanted):
-            return _exported("unchanged", index["topics"], wanted, str(log_path), out)
-        written = _write(log, {name: paths[name] for name in wanted}, threads)
-        if wanted and not any(entry["file"] for entry in written.values()):
+            return _exported("unchanged", index, wanted, str(log_path), out)
+        rows = _write(log, {name: paths[name] for name in wanted}, threads)
+        if wanted and not any(count is not None for count in rows.values()):
             raise LogError(f"{log_path}: nothing to export: no topic can be read", *map(str, log.damage))
-        damage = [str(damage) for damage in log.damage if damage.is_loss]
+        damage, remarks = tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.remarks)
         if not wanted:
-            return Exported(str(log_path), out, "done", (), tuple(damage), tuple(log.remarks), 3 if damage else 0)
-        said = {"made_from": made_from, "damage": damage, "remarks": log.remarks}
-        entries = {name: {**said, **entry} for name, entry in written.items()}
-    write_json(out / INDEX, {**index, "topics": {**index["topics"], **entries}})
+            return Exported(str(log_path), out, "done", (), damage, remarks, 3 if damage else 0)
+        entries = {
+            name: IndexEntry(
+                file=None if count is None else paths[name].name,
+                bytes=0 if count is None else paths[name].stat().st_size,
+                type=log.topics[name].type_name,
+                rows=count or 0,
+                made_from=made_from,
+                damage=damage,
+                remarks=remarks,
+            )
+            for name, count in rows.items()
+        }
+    write_json(out / INDEX, ExportIndex({**index, **entries}))
     return _exported("done", entries, wanted, str(log_path), out)
 
 
@@ -122,22 +163,23 @@ def _wanted(log: Log, log_path: Path | str, topics: Sequence[str]) -> list[str]:
     return split or sorted(log.topics)
 
 
-def _identity(log: Log, log_path: Path | str, message_definitions: Path | None) -> dict[str, Any]:
-    """Return what an export depends on, in JSON values."""
-    return {
-        "log": str(log_path) if "://" in str(log_path) else str(Path(log_path).resolve()),
-        "size_and_time": log.size_and_time,
-        "message_definitions": definitions_key(message_definitions),
-        "tcpipe_version": __version__,
-    }
+def _identity(log: Log, log_path: Path | str, message_definitions: Path | None) -> ExportOrigin:
+    return ExportOrigin(
+        log=str(log_path) if "://" in str(log_path) else str(Path(log_path).resolve()),
+        size_and_time=tuple((size, time_ns) for size, time_ns in log.size_and_time),
+        message_definitions=definitions_key(message_definitions),
+        tcpipe_version=__version__,
+    )
 
 
-def _index(out: Path) -> dict[str, Any]:
-    """Return what ``out`` holds; an entry that is not as this version writes it counts for nothing."""
-    found = read_json(out / INDEX) if (out / INDEX).is_file() else {}
-    entries = found.get("topics")
-    known = entries if isinstance(entries, dict) else {}
-    return {"topics": {name: of for name, of in known.items() if isinstance(of, dict) and of.keys() == _ENTRY}}
+def _index(out: Path) -> dict[str, IndexEntry]:
+    """Return what ``out`` holds by topic; an entry that is not as this version writes it counts for nothing."""
+    entries = read_json(out / INDEX).get("topics") if (out / INDEX).is_file() else None
+    found: dict[str, IndexEntry] = {}
+    for name, entry in entries.items() if isinstance(entries, dict) else ():
+        with suppress(StoreError):
+            found[name] = typed(entry, IndexEntry, out / INDEX)
+    return found
 
 
 def _refuse_what_is_ours(out: Path) -> None:
@@ -151,17 +193,13 @@ def _refuse_what_is_ours(out: Path) -> None:
         raise UsageError(f"{out}: is a {kind}; give another directory for the topics")
 
 
-def _refuse_others_files(index: Mapping[str, Any], made_from: Mapping[str, Any], paths: Mapping[str, Path]) -> None:
-    others = {
-        entry["file"]: entry["made_from"]["log"]
-        for entry in index["topics"].values()
-        if entry["made_from"]["log"] != made_from["log"]
-    }
+def _refuse_others_files(index: Mapping[str, IndexEntry], made_from: ExportOrigin, paths: Mapping[str, Path]) -> None:
+    others = {of.file: of.made_from.log for of in index.values() if of.made_from.log != made_from.log}
     taken = sorted({others[path.name] for path in paths.values() if path.name in others})
     if taken:
         out = next(iter(paths.values())).parent
         raise UsageError(f"{out}: holds the same topics of {', '.join(taken)}; give another directory")
-    known = {entry["file"] for entry in index["topics"].values()}
+    known = {entry.file for entry in index.values()}
     strange = [path for path in paths.values() if path.exists() and path.name not in known and not _is_a_topics(path)]
     if strange:
         raise UsageError(
@@ -176,28 +214,29 @@ def _is_a_topics(path: Path) -> bool:
     return False
 
 
-def _is_there(entry: Mapping[str, Any] | None, made_from: Mapping[str, Any], out: Path) -> bool:
-    if entry is None or entry["made_from"] != made_from:
+def _is_there(entry: IndexEntry | None, made_from: ExportOrigin, out: Path) -> bool:
+    if entry is None or entry.made_from != made_from:
         return False
-    path = None if entry["file"] is None else out / entry["file"]
-    return path is None or (path.is_file() and path.stat().st_size == entry["bytes"])
+    path = None if entry.file is None else out / entry.file
+    return path is None or (path.is_file() and path.stat().st_size == entry.bytes)
 
 
 def _exported(
-    status: Literal["done", "unchanged"], entries: Mapping[str, Any], wanted: Sequence[str], log: str, out: Path
+    status: Literal["done", "unchanged"],
+    entries: Mapping[str, IndexEntry],
+    wanted: Sequence[str],
+    log: str,
+    out: Path,
 ) -> Exported:
-    files = tuple(
-        ExportedTopic(name, entries[name]["type"], out / entries[name]["file"], entries[name]["rows"])
-        for name in wanted
-        if entries[name]["file"] is not None
-    )
-    damage = dict.fromkeys(line for name in wanted for line in entries[name]["damage"])
-    remarks = dict.fromkeys(line for name in wanted for line in entries[name]["remarks"])
+    found = {name: entries[name] for name in wanted}
+    files = tuple(ExportedTopic(name, of.type, out / of.file, of.rows) for name, of in found.items() if of.file)
+    damage = dict.fromkeys(line for of in found.values() for line in of.damage)
+    remarks = dict.fromkeys(line for of in found.values() for line in of.remarks)
     return Exported(log, out, status, files, tuple(damage), tuple(remarks), 3 if damage else 0)
 
 
-def _write(log: Log, paths: Mapping[str, Path], threads: int) -> dict[str, dict[str, Any]]:
-    """Write the topics in one pass; return what stands in the index of each."""
+def _write(log: Log, paths: Mapping[str, Path], threads: int) -> dict[str, int | None]:
+    """Write the topics in one pass; return the rows of each, None of one that cannot be read."""
     rows = dict.fromkeys(paths, 0)
     writers: dict[str, Callable[[pa.Table], None]] = {}
     with ExitStack() as files:
@@ -207,15 +246,7 @@ def _write(log: Log, paths: Mapping[str, Path], threads: int) -> dict[str, dict[
                     writers[name] = files.enter_context(parquet_rows(paths[name], _schema(log, name, table)))
                 writers[name](storable(table))
                 rows[name] += table.num_rows
-    none: dict[str, Any] = {"file": None, "bytes": 0}
-    return {
-        name: {
-            **({"file": path.name, "bytes": path.stat().st_size} if name in writers else none),
-            "type": log.topics[name].type_name,
-            "rows": rows[name],
-        }
-        for name, path in paths.items()
-    }
+    return {name: count if name in writers else None for name, count in rows.items()}
 
 
 def _schema(log: Log, name: str, table: pa.Table) -> pa.Schema:

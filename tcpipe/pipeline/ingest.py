@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
@@ -57,6 +57,19 @@ class IngestSummary:
         if not any(result.is_news for result in self.results):
             return 0
         return 1 if all(result.status == "failed" for result in self.results) else 3
+
+
+@dataclass(frozen=True, slots=True)
+class SummaryLine:
+    """The last line of ``ingest --json``: what became of all logs."""
+
+    recipe: str
+    """The file that rules, or that it is the defaults."""
+    store: Path | None
+    """None where no store was made."""
+    exit_code: int
+    results: tuple[IngestResult, ...]
+    kind: Literal["summary"] = "summary"
 
 
 def ingest(

@@ -84,6 +84,14 @@ class IngestResult:
         return (self.status == "failed" or bool(self.damage)) and not self.known and not self.accepted
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogLine(IngestResult):
+    """What became of one log, as ``ingest --json`` says it when the log ends."""
+
+    kind: Literal["log"] = "log"
+    is_news: bool = False
+
+
 def result_of(
     source: LogSource, status: Status, run: RunDirectory, sha256: str, *, same_as: str | None
 ) -> IngestResult:

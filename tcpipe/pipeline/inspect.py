@@ -2,16 +2,95 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import TcpipeError, UsageError
-from tcpipe.formats.json_files import plain
+from tcpipe.formats.json_files import recast
 from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below, open_log
 from tcpipe.formats.object_storage import copied, is_url
-from tcpipe.pipeline.log_inspection import inspect_log
+from tcpipe.formats.run_documents import Counts, LogOrigin
+from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store, is_store, run_at
+
+if TYPE_CHECKING:
+    from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedLogs:
+    """What every log of a folder holds."""
+
+    kind: Literal["logs"] = "logs"
+    path: str
+    logs: tuple[InspectedLog, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ingestion:
+    """A run under one recipe."""
+
+    run_id: str
+    recipe_id: str
+    robot: str
+    segments: int
+    distance_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedIngestion(Ingestion):
+    """A run under one recipe: what became of it."""
+
+    counts: Counts
+    ledger_m: Mapping[str, float]
+    warnings: tuple[str, ...]
+    damage: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedRun:
+    """What a run is, under every recipe."""
+
+    kind: Literal["run"] = "run"
+    path: str
+    run_id: str
+    source: LogOrigin | None
+    """None where run.json is gone."""
+    tags: Mapping[str, str]
+    remarks: tuple[str, ...]
+    recipes: tuple[InspectedIngestion, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StoredIngestion(Ingestion):
+    """A run under one recipe: how much there is to say of it."""
+
+    warnings: int
+    damage: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedStore:
+    """What a store holds."""
+
+    kind: Literal["store"] = "store"
+    path: str
+    maps: tuple[str, ...]
+    runs: tuple[StoredIngestion, ...]
+    outdated: Mapping[str, str]
+    """Runs of another data model, and which."""
+    damaged_runs: Mapping[str, str]
+    """By path, what is wrong."""
+    superseded: Mapping[str, str]
+    """Runs, and which run supersedes each."""
+    unfinished: tuple[str, ...]
+
+
+Inspected: TypeAlias = "InspectedLog | InspectedLogs | InspectedMap | InspectedDataset | InspectedRun | InspectedStore"
 
 
 def inspect(
@@ -21,8 +100,8 @@ def inspect(
     robot: str | None = None,
     full: bool = False,
     message_definitions: Path | None = None,
-) -> dict[str, Any]:
-    """Return what the path holds as JSON values; ``kind`` is log, logs, map, dataset, run or store.
+) -> Inspected:
+    """Return what the path holds.
 
     Parameters
     ----------
@@ -37,17 +116,18 @@ def inspect(
         When it is none of these, or cannot be read.
 
     """
-    how = {"robot": robot or recipe.robot, "full": full, "message_definitions": message_definitions}
+    ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):
         with copied(str(path), wanted=belongs_to_a_log) as copy:
-            return _named(_logs_at(copy, recipe, **how), str(copy), str(path).rstrip("/"))
+            return _named(_logs_at(copy, ask), str(copy), str(path).rstrip("/"))
     path = Path(path)
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
         from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as below
+        from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
 
-        return {**plain(read_current_card(path)), "kind": "dataset", "path": str(path)}
+        return recast(read_current_card(path), InspectedDataset, kind="dataset", path=str(path))
     if is_store(path):
         return _store(Store(path))
     found = run_at(path)
@@ -55,91 +135,95 @@ def inspect(
         return _run(path, *found)
     if path.suffix == ".zarr":
         from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
+        from tcpipe.pipeline.inspected import InspectedMap  # noqa: PLC0415
 
-        return {"kind": "map", "path": str(path), **plain(open_map(path).summary())}
-    return _logs_at(path, recipe, **how)
+        return recast(open_map(path).summary(), InspectedMap, path=str(path))
+    return _logs_at(path, ask)
 
 
-def _logs_at(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
+def _logs_at(path: Path, ask: Callable[[Path], InspectedLog]) -> InspectedLog | InspectedLogs:
     logs = logs_below(path) if path.is_dir() else [path]
     if not logs:
         raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
     if len(logs) == 1:
-        return _one(logs[0], recipe, **how)
-    return {"kind": "logs", "path": str(path), "logs": [_one_of(entry, recipe, **how) for entry in logs]}
+        return ask(logs[0])
+    return InspectedLogs(path=str(path), logs=tuple(_one_of(entry, ask) for entry in logs))
 
 
-def _named(found: dict[str, Any], copy: str, url: str) -> dict[str, Any]:
+def _named(found: InspectedLog | InspectedLogs, copy: str, url: str) -> InspectedLog | InspectedLogs:
     """Return what was found in a copy with the URL in the place of the copy's path."""
-    texts: dict[str, Any] = {key: value.replace(copy, url) for key, value in found.items() if isinstance(value, str)}
-    if "problems" in found:
-        texts["problems"] = [line.replace(copy, url) for line in found["problems"]]
-    if "logs" in found:
-        texts["logs"] = [_named(log, copy, url) for log in found["logs"]]
-    return {**found, **texts}
+    path = found.path.replace(copy, url)
+    if isinstance(found, InspectedLog):
+        return replace(found, path=path, problems=tuple(line.replace(copy, url) for line in found.problems))
+    logs = (_named(log, copy, url) for log in found.logs)
+    return replace(found, path=path, logs=tuple(log for log in logs if isinstance(log, InspectedLog)))
 
 
 def _one(
-    path: Path, recipe: Recipe, *, robot: str | None, full: bool, message_definitions: Path | None
-) -> dict[str, Any]:
+    path: Path, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
+) -> InspectedLog:
     with open_log(path, message_definitions=message_definitions) as log:
         return inspect_log(log, recipe, robot, full=full)
 
 
-def _one_of(path: Path, recipe: Recipe, **how: Any) -> dict[str, Any]:
+def _one_of(path: Path, ask: Callable[[Path], InspectedLog]) -> InspectedLog:
     try:
-        return _one(path, recipe, **how)
+        return ask(path)
     except TcpipeError as error:
-        return {"kind": "log", "path": str(path), "problems": list(error.problems)}
+        return InspectedLog(path=str(path), problems=error.problems)
 
 
-def _run(path: Path, store: Store, runs: list[RunDirectory]) -> dict[str, Any]:
+def _run(path: Path, store: Store, runs: list[RunDirectory]) -> InspectedRun:
     run_id = runs[0].run_id
     known = store.run_json(run_id)
-    return {
-        "kind": "run",
-        "path": str(path),
-        "run_id": run_id,
-        "source": plain(known.source) if known else {},
-        "tags": dict(known.tags) if known else {},
-        "remarks": list(known.remarks) if known else [],
-        "recipes": [
-            {
-                **_line(run),
-                "counts": plain(run.manifest.counts),
-                "ledger_m": dict(run.manifest.ledger_m),
-                "warnings": list(run.manifest.warnings),
-                "damage": list(run.manifest.damage),
-            }
+    return InspectedRun(
+        path=str(path),
+        run_id=run_id,
+        source=known.source if known else None,
+        tags=known.tags if known else {},
+        remarks=known.remarks if known else (),
+        recipes=tuple(
+            recast(
+                _ingestion(run),
+                InspectedIngestion,
+                counts=run.manifest.counts,
+                ledger_m=run.manifest.ledger_m,
+                warnings=run.manifest.warnings,
+                damage=run.manifest.damage,
+            )
             for run in runs
-        ],
-    }
+        ),
+    )
 
 
-def _store(store: Store) -> dict[str, Any]:
+def _store(store: Store) -> InspectedStore:
     found = store.ingestions()
     runs, outdated = found.finished, {run_id: str(head.data_model_version) for run_id, head in found.outdated.items()}
-    damaged = {str(path): line for path, line in found.damaged.items()}
     seen = {*outdated, *found.superseded, *(run.run_id for run in runs), *(path.parent.name for path in found.damaged)}
-    return {
-        "kind": "store",
-        "path": str(store.root),
-        "maps": store.maps(),
-        "runs": [
-            {**_line(run), "warnings": len(run.manifest.warnings), "damage": len(run.manifest.damage)} for run in runs
-        ],
-        "outdated": outdated,
-        "damaged_runs": damaged,
-        "superseded": dict(found.superseded),
-        "unfinished": sorted(set(store.run_ids()) - seen),
-    }
+    return InspectedStore(
+        path=str(store.root),
+        maps=tuple(store.maps()),
+        runs=tuple(
+            recast(
+                _ingestion(run),
+                StoredIngestion,
+                warnings=len(run.manifest.warnings),
+                damage=len(run.manifest.damage),
+            )
+            for run in runs
+        ),
+        outdated=outdated,
+        damaged_runs={str(path): line for path, line in found.damaged.items()},
+        superseded=dict(found.superseded),
+        unfinished=tuple(sorted(set(store.run_ids()) - seen)),
+    )
 
 
-def _line(run: RunDirectory) -> dict[str, Any]:
-    return {
-        "run_id": run.run_id,
-        "recipe_id": run.recipe_id,
-        "robot": run.manifest.robot,
-        "segments": run.manifest.counts.segments,
-        "distance_m": sum(run.manifest.ledger_m.values()),
-    }
+def _ingestion(run: RunDirectory) -> Ingestion:
+    return Ingestion(
+        run_id=run.run_id,
+        recipe_id=run.recipe_id,
+        robot=run.manifest.robot,
+        segments=run.manifest.counts.segments,
+        distance_m=sum(run.manifest.ledger_m.values()),
+    )

@@ -3,20 +3,80 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from dataclasses import dataclass, field, fields, replace
+from operator import attrgetter
+from typing import Literal
 
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.robot_files import profiles_of
-from tcpipe.logs.clocks import settle_clocks
-from tcpipe.logs.roles import assign_roles
+from tcpipe.logs.clocks import Timeline, settle_clocks
+from tcpipe.logs.roles import RoleAssignment, assign_roles
 from tcpipe.logs.simulated_clock import CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic
 from tcpipe.pipeline.log_stamps import TopicStamps
 from tcpipe.recipe import Recipe
+from tcpipe.tables.findings import ABSENT, ClockStep
 
 
-def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> dict[str, Any]:
-    """Return what a log holds as JSON values.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedTopic:
+    """What the index tells of a topic, and with everything read what its messages do.
+
+    What only reading everything tells is None without; of stamps also where the messages have no header.
+    """
+
+    name: str
+    type: str
+    messages: int | None
+    rate_hz: float | None
+    role: str | None
+    why: str | None
+    """Why it plays its role, or plays none."""
+    messages_read: int | None = field(default=None, metadata=ABSENT)
+    longest_gap_s: float | None = None
+    longest_gap_at_ns: int | None = None
+    median_period_s: float | None = None
+    gaps: int | None = field(default=None, metadata=ABSENT)
+    zero_stamps: int | None = field(default=None, metadata=ABSENT)
+    backward_stamps: int | None = field(default=None, metadata=ABSENT)
+    repeated_stamps: int | None = field(default=None, metadata=ABSENT)
+    duplicates: int | None = field(default=None, metadata=ABSENT)
+    wrong_stamps: int | None = field(default=None, metadata=ABSENT)
+    """Stamps beside zero that were replaced."""
+    time: Literal["header", "log"] | None = field(default=None, metadata=ABSENT)
+    """Which stamps rule."""
+    time_why: str | None = field(default=None, metadata=ABSENT)
+    header_minus_log_s: float | None = None
+    moved_s: tuple[float, ...] | None = field(default=None, metadata=ABSENT)
+    """What was added to its stamps to bring them to most topics' clock, by epoch [s]."""
+    simulated_time: bool | None = field(default=None, metadata=ABSENT)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedLog:
+    """What a log holds; of one that cannot be read only its path and the problems are known."""
+
+    kind: Literal["log"] = "log"
+    path: str
+    container: str | None = field(default=None, metadata=ABSENT)
+    size_bytes: int | None = field(default=None, metadata=ABSENT)
+    start_ns: int | None = None
+    duration_s: float | None = None
+    robot: str | None = field(default=None, metadata=ABSENT)
+    robot_why: str | None = field(default=None, metadata=ABSENT)
+    topics: tuple[InspectedTopic, ...] | None = field(default=None, metadata=ABSENT)
+    clock_epochs: int | None = field(default=None, metadata=ABSENT)
+    """With everything read: stretches of the log between clock steps."""
+    clock_steps: tuple[ClockStep, ...] | None = field(default=None, metadata=ABSENT)
+    problems: tuple[str, ...] = ()
+    """What is to be decided before it can be ingested, or why it cannot be read."""
+    warnings: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
+    damage: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
+    remarks: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
+
+
+def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> InspectedLog:
+    """Return what a log holds.
 
     Parameters
     ----------
@@ -32,70 +92,85 @@ def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> d
         known=profiles_of(recipe),
         namespace=config.namespace,
     )
-    playing = {topic: (name, role.why) for name, role in cast.roles.items() for topic in role.topics}
-    playing |= dict.fromkeys(cast.transforms, ("transforms", "places the sensors"))
-    read, clocks = _read(log) if full else ({}, {})
+    topics, steps = tuple(_indexed(topic, cast) for topic in sorted(log.topics.values(), key=attrgetter("name"))), None
+    if full:
+        topics, steps = _read(log, topics)
     starts = [topic.start_ns for topic in log.topics.values() if topic.start_ns is not None]
     ends = [topic.end_ns for topic in log.topics.values() if topic.end_ns is not None]
-    return {
-        "kind": "log",
-        "path": str(log.path),
-        "container": log.container,
-        "size_bytes": log.size_bytes,
-        "start_ns": min(starts, default=None),
-        "duration_s": (max(ends) - min(starts)) / 1e9 if starts and ends else None,
-        "robot": cast.robot,
-        "robot_why": cast.robot_why,
-        "topics": [
-            {
-                "name": topic.name,
-                "type": topic.type_name,
-                "messages": topic.message_count,
-                "rate_hz": _rate_hz(topic),
-                "role": playing.get(topic.name, (None, None))[0],
-                "why": playing.get(topic.name, (None, cast.left_out.get(topic.name) or topic.problem))[1],
-                **read.get(topic.name, {}),
-            }
-            for topic in sorted(log.topics.values(), key=lambda topic: topic.name)
-        ],
-        **clocks,
-        "problems": list(cast.problems),
-        "warnings": [*cast.warnings, *_simulated(log.topics.values())],
-        "damage": [str(damage) for damage in log.damage if damage.is_loss],
-        "remarks": log.remarks,
-    }
+    return InspectedLog(
+        path=str(log.path),
+        container=log.container,
+        size_bytes=log.size_bytes,
+        start_ns=min(starts, default=None),
+        duration_s=(max(ends) - min(starts)) / 1e9 if starts and ends else None,
+        robot=cast.robot,
+        robot_why=cast.robot_why,
+        topics=topics,
+        clock_epochs=None if steps is None else len(steps) + 1,
+        clock_steps=steps,
+        problems=tuple(cast.problems),
+        warnings=(*cast.warnings, *_simulated(log.topics.values())),
+        damage=tuple(str(damage) for damage in log.damage if damage.is_loss),
+        remarks=tuple(log.remarks),
+    )
 
 
-def _read(log: Log) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
-    """Read every message; return facts by topic, and what the clocks did."""
+def _indexed(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
+    """Return what the index tells of a topic."""
+    played = next(((name, role.why) for name, role in cast.roles.items() if topic.name in role.topics), None)
+    if topic.name in cast.transforms:
+        played = "transforms", "places the sensors"
+    role, why = played or (None, cast.left_out.get(topic.name) or topic.problem)
+    return InspectedTopic(
+        name=topic.name,
+        type=topic.type_name,
+        messages=topic.message_count,
+        rate_hz=_rate_hz(topic),
+        role=role,
+        why=why,
+    )
+
+
+def _read(log: Log, topics: tuple[InspectedTopic, ...]) -> tuple[tuple[InspectedTopic, ...], tuple[ClockStep, ...]]:
+    """Read every message; return the topics with what that tells of them, and what the clocks did."""
     found: dict[str, TopicStamps] = {}
     for tables in log.batches(sorted(log.topics)):
         for name, table in tables.items():
             found.setdefault(name, TopicStamps()).add(table)
-    facts = {name: stamps.facts() for name, stamps in found.items()}
     times = {name: stamps.topic_times() for name, stamps in found.items()}
     clocks = {name: of for name, of in times.items() if of.header_ns is not None and len(of.log_time_ns)}
     published = any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values())
     settled = settle_clocks(clocks, clock_published=published)
     clock = settled.simulated
     counting = clock.topics if clock is not None and clock.remark() is not None else frozenset()
-    for name, timeline in settled.timelines.items():
-        wrong = timeline.notes.get("stamps_replaced", 0) * found[name].every - facts[name]["zero_stamps"]
-        facts[name] |= {
-            "time": timeline.source,
-            "time_why": timeline.why,
-            "header_minus_log_s": timeline.offset_s,
-            "moved_s": [moved for moved in timeline.moved_s if moved],
-            "wrong_stamps": max(wrong, 0),
-            "simulated_time": name in counting,
-        }
-    return facts, {
-        "clock_epochs": len(settled.steps) + 1,
-        "clock_steps": [
-            {"log_time_ns": step.log_time_ns, "step_s": step.step_s, "topics": list(step.topics)}
-            for step in settled.steps
-        ],
-    }
+    read = tuple(
+        _with_stamps(topic, found[topic.name], settled.timelines.get(topic.name), simulated=topic.name in counting)
+        if topic.name in found
+        else topic
+        for topic in topics
+    )
+    return read, tuple(settled.steps)
+
+
+def _with_stamps(
+    topic: InspectedTopic, stamps: TopicStamps, timeline: Timeline | None, *, simulated: bool
+) -> InspectedTopic:
+    """Return a topic with what its messages do; without a timeline they have no header."""
+    counts = stamps.counts()
+    counted = {of.name: getattr(counts, of.name) for of in fields(counts)}
+    if timeline is None:
+        return replace(topic, **counted)
+    wrong = timeline.notes.get("stamps_replaced", 0) * stamps.every - (counts.zero_stamps or 0)
+    return replace(
+        topic,
+        **counted,
+        time=timeline.source,
+        time_why=timeline.why,
+        header_minus_log_s=timeline.offset_s,
+        moved_s=tuple(moved for moved in timeline.moved_s if moved),
+        wrong_stamps=max(wrong, 0),
+        simulated_time=simulated,
+    )
 
 
 def _simulated(topics: Iterable[Topic]) -> list[str]:

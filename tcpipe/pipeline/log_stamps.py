@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -19,6 +19,24 @@ _GAP_PERIODS, _GAP_NS = 3, 300_000_000
 _STAMP = ("header.stamp.sec", "header.stamp.nanosec")
 _TIMES = 2
 """Columns before the message's own: both times of the log."""
+
+
+@dataclass(frozen=True, slots=True)
+class StampCounts:
+    """Counts over all messages of a topic; those of stamps are None where its messages have no header."""
+
+    messages_read: int
+    longest_gap_s: float | None
+    longest_gap_at_ns: int | None
+    """Log time before it."""
+    median_period_s: float | None
+    gaps: int
+    """Where log time and header agree that nothing came."""
+    zero_stamps: int | None
+    backward_stamps: int | None
+    repeated_stamps: int | None
+    duplicates: int | None
+    """Messages that repeat the one before exactly."""
 
 
 class TopicStamps:
@@ -65,25 +83,20 @@ class TopicStamps:
         log_ns, header_ns, same = self._joined()
         return TopicTimes(log_ns, header_ns, np.cumsum(~same).astype(np.float64)[:, None])
 
-    def facts(self) -> dict[str, Any]:
-        """Return counts, the usual period, and the gaps: where log time and header agree that nothing came."""
+    def counts(self) -> StampCounts:
+        """Return what was counted."""
         log_ns, header_ns, _ = self._joined()
         period_ns = float(np.median(np.diff(log_ns))) / self.every if len(log_ns) > 1 else None
         steps = np.concatenate([np.zeros(0, np.int64), *self._long_steps])
-        stamps = {
-            "zero_stamps": self._zero,
-            "backward_stamps": self._backward,
-            "repeated_stamps": self._repeated,
-            "duplicates": self._duplicates,
-        }
-        return {
-            "messages_read": self._messages,
-            "longest_gap_s": self._longest_ns / 1e9 if self._messages > 1 else None,
-            "longest_gap_at_ns": self._longest_at_ns if self._messages > 1 else None,
-            "median_period_s": None if period_ns is None else period_ns / 1e9,
-            "gaps": int(np.count_nonzero(steps > max(_GAP_PERIODS * (period_ns or 0), _GAP_NS))),
-            **({} if header_ns is None else stamps),
-        }
+        odd = (self._zero, self._backward, self._repeated, self._duplicates)
+        return StampCounts(
+            self._messages,
+            self._longest_ns / 1e9 if self._messages > 1 else None,
+            self._longest_at_ns if self._messages > 1 else None,
+            None if period_ns is None else period_ns / 1e9,
+            int(np.count_nonzero(steps > max(_GAP_PERIODS * (period_ns or 0), _GAP_NS))),
+            *((None,) * len(odd) if header_ns is None else odd),
+        )
 
     def _count_stamps(self, header_ns: Ints) -> None:
         self._zero += int(np.count_nonzero(header_ns == 0))

@@ -5,15 +5,19 @@ from __future__ import annotations
 import glob
 import logging
 import os
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import place_state
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import raster_files
+from tcpipe.formats.maps.map_facts import MapInputs, MapSummary
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.maps.text import map_lines
@@ -39,10 +43,8 @@ class AddedMap:
     """What became of a map; ``str`` of it is what the command prints."""
 
     path: Path
-    status: str
-    """``done`` or ``unchanged``."""
-    map: Mapping[str, Any]
-    """What the map is: `tcpipe.formats.maps.map_files.MapFile.summary`."""
+    status: Literal["done", "unchanged"]
+    map: MapSummary
     picture: Path
     """A quick look at it: orthophoto or shaded relief, tinted by class, white where a layer has no data."""
 
@@ -51,7 +53,7 @@ class AddedMap:
         head = f"{self.path} (quick look: {self.picture.name})"
         if self.status == "unchanged":
             head += ": nothing to do: it is made from the same files and options"
-        return plain_lines((head, *map_lines(self.map), *(f"warning: {text}" for text in self.map["warnings"])))
+        return plain_lines((head, *map_lines(self.map), *(f"warning: {text}" for text in self.map.warnings)))
 
 
 def add_map(
@@ -105,7 +107,8 @@ def add_map(
     files = _found({role: value for role, value in {**given, **layers, **tables}.items() if value})
     opened = open_store(store, create=True)
     path = opened.map_path(name)
-    inputs = _inputs(files, {"crs": crs} | _kinds(categorical, ortho_bands))
+    kinds = MapInputs({}, crs, tuple(sorted(categorical)), None if ortho_bands == "grey" else ortho_bands)
+    inputs = replace(kinds, files=_checksums(files))
     more = MoreLayers(
         {name: files[name] for name in layers},
         {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
@@ -115,7 +118,7 @@ def add_map(
     if path.exists() and not force:
         return _unchanged(name, path, inputs)
     picture = path.with_suffix(".png")
-    looks: list[tuple[Any, str]] = []
+    looks: list[tuple[NDArray[np.uint8], str]] = []
     try:
         build_map(
             path,
@@ -140,7 +143,7 @@ def add_map(
 
 
 def _refuse_layers(
-    layers: Mapping[str, Files], categorical: Mapping[str, Any], *, ortho: bool, ortho_bands: OrthoBands
+    layers: Mapping[str, Files], categorical: Iterable[str], *, ortho: bool, ortho_bands: OrthoBands
 ) -> None:
     """Raise `UsageError` for names that cannot be, classes of no layer, and colours of no orthophoto: all at once."""
     problems = [problem for name in layers if (problem := wrong_name(name, taken=SAMPLES.names()))]
@@ -156,13 +159,7 @@ def _refuse_layers(
         raise UsageError(*problems)
 
 
-def _kinds(categorical: Mapping[str, Any], ortho_bands: OrthoBands) -> dict[str, Any]:
-    """Return the options that say how rasters are read, those that are not at their default."""
-    kinds = {"categorical": sorted(categorical), "ortho_bands": "" if ortho_bands == "grey" else ortho_bands}
-    return {name: value for name, value in kinds.items() if value}
-
-
-def _unchanged(name: str, path: Path, inputs: Mapping[str, Any]) -> AddedMap:
+def _unchanged(name: str, path: Path, inputs: MapInputs) -> AddedMap:
     """Return the map that is there, its quick look drawn if there is none of it; `MapError` if it is made from something else."""
     found, picture = _same(name, path, inputs), path.with_suffix(".png")
     if not shows_map(picture, path):
@@ -201,8 +198,8 @@ def _no_file(text: str) -> str:
     return f"{text}: no file matches" if glob.has_magic(text) else f"{text}: there is no such file"
 
 
-def _inputs(files: Mapping[str, Sequence[Path]], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a map is made from: a checksum for every file of every role, in their order, and the options."""
+def _checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]:
+    """Return a checksum for every file of every role, in their order."""
     checksums: dict[str, dict[str, str]] = {}
     problems: list[str] = []
     for role, paths in files.items():
@@ -218,21 +215,21 @@ def _inputs(files: Mapping[str, Sequence[Path]], options: Mapping[str, Any]) -> 
             problems.append(f"{error.filename}: cannot be read ({error.strerror})")
     if problems:
         raise MapError(*problems)
-    return {"files": checksums, **options}
+    return checksums
 
 
-def _same(name: str, path: Path, inputs: Mapping[str, Any]) -> MapFile:
+def _same(name: str, path: Path, inputs: MapInputs) -> MapFile:
     """Return the map that is there if it is made from the same; else `MapError` says what differs."""
     try:
         found = open_map(path)
     except MapError as error:
         raise MapError(*error.problems, f"map {name}: add it anew with --force") from None
-    before = found.facts["inputs"]
-    roles = dict.fromkeys([*_ROLES, *before["files"], *inputs["files"]])
-    changes = [_change(role, before["files"].get(role, {}), inputs["files"].get(role, {})) for role in roles]
+    before = found.facts.inputs
+    roles = dict.fromkeys([*_ROLES, *before.files, *inputs.files])
+    changes = [_change(role, before.files.get(role, {}), inputs.files.get(role, {})) for role in roles]
     changes = [change for change in changes if change]
     for option in ("crs", "categorical", "ortho_bands"):
-        now, then = (made_from.get(option) or "not given" for made_from in (inputs, before))
+        now, then = (getattr(made_from, option) or "not given" for made_from in (inputs, before))
         if now != then:
             changes.append(f"--{option.replace('_', '-')} is {now}, was {then}")
     if changes:
@@ -266,8 +263,8 @@ def _agreed(opened: Store, name: str) -> ClassScheme | None:
         except MapError:
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue
-        if "terrain" in found.layers or found.facts["classes_from"] == "file":
-            own = found.facts["classes_from"] == "names"  # those values are of that raster alone
+        if "terrain" in found.layers or found.facts.classes_from == "file":
+            own = found.facts.classes_from == "names"  # those values are of that raster alone
             values = {entry.id: entry.id for entry in found.classes.classes} if own else found.id_by_value
             return ClassScheme(found.classes, values)
     return None

@@ -80,7 +80,7 @@ def verify_map(path: Path) -> Iterator[Finding]:
     for factor in source.factors:
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:
-            yield from _layer(path, level, layer, None if factor > 1 else source.facts["covered"][layer])
+            yield from _layer(path, level, layer, None if factor > 1 else source.facts.covered[layer])
 
 
 def _quick_look(path: Path) -> Iterator[Finding]:
@@ -152,7 +152,8 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
         )
         return
     manifest, recipe = typed(document, Manifest, where), document["recipe"]
-    if manifest.ingest_key != ingest_key(recipe) or directory.name != recipe_id(recipe, manifest.robot):
+    of = (ingest_key(recipe), recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
+    if of != (manifest.ingest_key, directory.name):
         yield f"{where}: its recipe is not the one that the directory is named after"
     yield from broken_checksums(directory, manifest.checksums)
     yield "files", len(manifest.checksums) + 1

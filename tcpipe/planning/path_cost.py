@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -28,46 +27,31 @@ Floats = NDArray[np.float64]
 _WGS84 = CRS.from_epsg(4326)
 
 
-@dataclass(frozen=True, slots=True)
-class PathCost:
-    """What a path costs; ``pieces`` is a checked table (`path_table.PIECES`), one row a piece in order.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathTotals:
+    """What a path costs in all, over the pieces that have a cost; ``complete`` says whether all have."""
 
-    Totals are over the pieces that have a cost; ``complete`` says whether all have. Intervals are None without held-out samples.
-    """
-
-    pieces: pa.Table
     length_m: float
+    pieces: int
+    pieces_without_cost: int
     duration_s: float
     energy_joule: float
     duration_interval_s: tuple[float, float] | None
+    """None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
+    coverage: float = COVERAGE
+    """Share of drives that an interval is to hold."""
     reasons: Mapping[str, int]
     """Pieces by reason; a piece may have several."""
+    complete: bool
 
-    @property
-    def without_cost(self) -> int:
-        """Return how many pieces have no cost."""
-        return int(self.pieces.column("duration_s").null_count)
 
-    @property
-    def complete(self) -> bool:
-        """Return whether every piece has a cost."""
-        return not self.without_cost
+@dataclass(frozen=True, slots=True)
+class PathCost:
+    """What a path costs; ``pieces`` is a checked table (`path_table.PIECES`), one row a piece in order."""
 
-    def summary(self) -> dict[str, Any]:
-        """Return the totals as JSON values."""
-        return {
-            "length_m": self.length_m,
-            "pieces": self.pieces.num_rows,
-            "pieces_without_cost": self.without_cost,
-            "duration_s": self.duration_s,
-            "energy_joule": self.energy_joule,
-            "duration_interval_s": self.duration_interval_s,
-            "energy_interval_joule": self.energy_interval_joule,
-            "coverage": COVERAGE,
-            "reasons": dict(self.reasons),
-            "complete": self.complete,
-        }
+    pieces: pa.Table
+    totals: PathTotals
 
 
 def projection_of(source: MapReader) -> Projection:
@@ -152,15 +136,19 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts)
         reasons=bits,
         reason_names=[" ".join(names_of(int(value))) for value in bits],
     )
-    return PathCost(
-        pieces=table,
+    without_cost = int(table.column("duration_s").null_count)
+    totals = PathTotals(
         length_m=float(pieces.arc_m.sum()),
+        pieces=table.num_rows,
+        pieces_without_cost=without_cost,
         duration_s=float(np.nansum(duration)),
         energy_joule=float(np.nansum(energy)),
         duration_interval_s=sums[0] if sums else None,
         energy_interval_joule=sums[1] if sums else None,
         reasons=counts_of(bits),
+        complete=not without_cost,
     )
+    return PathCost(table, totals)
 
 
 def _places(source: MapReader, pieces: Pieces) -> dict[str, Floats]:

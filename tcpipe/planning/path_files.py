@@ -2,59 +2,73 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 from tcpipe.errors import StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import read_line
-from tcpipe.formats.json_files import digest
+from tcpipe.formats.json_files import digest, recast
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.seals import file_checksum, read_sealed, write_sealed
+from tcpipe.formats.seals import file_checksum, read_sealed_as, write_sealed
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.intervals import COVERAGE
-from tcpipe.planning.path_cost import cost_of_path
+from tcpipe.planning.path_cost import PathTotals, cost_of_path
 from tcpipe.planning.path_table import check_ending, write_pieces
 
 VERSION = "1.0"
 
 
-@dataclass(frozen=True, slots=True)
-class PathResult:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedTotals(PathTotals):
+    """What a path costs in all, by which model, on which map, for which robot."""
+
+    model: str
+    map: str
+    robot: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TableTotals(NamedTotals):
+    """All of ``<table>.summary.json`` but its seal: what a table of pieces is made from, and what the path costs in all."""
+
+    key: str
+    """Hash of the path, the model and the map."""
+    sha256: str
+    """Of the table."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathResult(NamedTotals):
     """What a path costs; ``str`` of it is what the command prints."""
 
     path: Path
     out: Path | None
-    status: str
-    """``done`` or ``unchanged``."""
-    summary: Mapping[str, Any]
+    status: Literal["done", "unchanged"]
 
     @property
     def exit_code(self) -> int:
         """Return 3 if some of the path has no cost, else 0."""
-        return 0 if self.summary["complete"] else 3
+        return 0 if self.complete else 3
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and where the model has no business, as plain lines."""
-        return plain_lines(
-            (f"{self.path}: {cost_text(self.summary)}", *_reason_lines(self.summary), *self._out_lines())
-        )
+        return plain_lines((f"{self.path}: {cost_text(self)}", *_reason_lines(self), *self._out_lines()))
 
     def _out_lines(self) -> tuple[str, ...]:
         if self.out is None:
             return ()
         same = "; nothing to do: it is made from the same path, model and map"
-        return (f"{self.out}: {self.summary['pieces']} pieces{same if self.status == 'unchanged' else ''}",)
+        return (f"{self.out}: {self.pieces} pieces{same if self.status == 'unchanged' else ''}",)
 
 
-def cost_text(summary: Mapping[str, Any]) -> str:
+def cost_text(of: PathTotals) -> str:
     """Return length, time and energy with their intervals, as one line."""
-    duration = _quantity(summary["duration_s"], summary["duration_interval_s"], "s")
-    energy = _quantity(summary["energy_joule"], summary["energy_interval_joule"], "J")
-    part = "" if summary["complete"] else f", without {summary['pieces_without_cost']} of {summary['pieces']} pieces"
-    return f"{summary['length_m']:.1f} m, {duration}, {energy}{part}"
+    duration = _quantity(of.duration_s, of.duration_interval_s, "s")
+    energy = _quantity(of.energy_joule, of.energy_interval_joule, "J")
+    part = "" if of.complete else f", without {of.pieces_without_cost} of {of.pieces} pieces"
+    return f"{of.length_m:.1f} m, {duration}, {energy}{part}"
 
 
 def _quantity(value: float, interval: tuple[float, float] | None, unit: str) -> str:
@@ -65,12 +79,9 @@ def _quantity(value: float, interval: tuple[float, float] | None, unit: str) -> 
     return f"{value:.{digits}f} {unit} ({COVERAGE:.0%}: {low:.{digits}f} to {high:.{digits}f})"
 
 
-def _reason_lines(summary: Mapping[str, Any]) -> list[str]:
-    lines = [
-        f"warning: {count} of {summary['pieces']} pieces: {name.replace('_', ' ')}"
-        for name, count in summary["reasons"].items()
-    ]
-    if summary["duration_interval_s"] is None:
+def _reason_lines(of: PathTotals) -> list[str]:
+    lines = [f"warning: {count} of {of.pieces} pieces: {name.replace('_', ' ')}" for name, count in of.reasons.items()]
+    if of.duration_interval_s is None:
         lines.append("warning: no intervals: the model has too few held-out samples to tell its errors")
     return lines
 
@@ -94,14 +105,14 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
     lonlat_deg = read_line(path)
     line = {"lonlat_deg": lonlat_deg.tolist(), "version": VERSION}
     key = digest({**line, "model": model.checksum, "map": source.summary()})
-    if out is not None and (found := _summary_of(out, key)) is not None:
-        return PathResult(path, out, "unchanged", found)
+    if out is not None and (known := _totals_of(out, key)) is not None:
+        return recast(known, PathResult, path=path, out=out, status="unchanged")
     cost = cost_of_path(model, source, lonlat_deg, where=str(path))
-    summary = {"model": model.name, "map": source.name, "robot": model.robot, **cost.summary()}
+    totals = recast(cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot)
     if out is not None:
         write_pieces(out, cost.pieces)
-        write_sealed(summary_path(out), {"key": key, "sha256": file_checksum(out).sha256, **summary})
-    return PathResult(path, out, "done", summary)
+        write_sealed(summary_path(out), recast(totals, TableTotals, key=key, sha256=file_checksum(out).sha256))
+    return recast(totals, PathResult, path=path, out=out, status="done")
 
 
 def summary_path(out: Path) -> Path:
@@ -109,13 +120,12 @@ def summary_path(out: Path) -> Path:
     return out.with_name(f"{out.name}.summary.json")
 
 
-def _summary_of(out: Path, key: str) -> dict[str, Any] | None:
+def _totals_of(out: Path, key: str) -> TableTotals | None:
     """Return the totals beside a table that is made from the same, and whole; else None."""
     if not (out.is_file() and summary_path(out).is_file()):
         return None
     try:
-        found = read_sealed(summary_path(out))
+        found = read_sealed_as(summary_path(out), TableTotals)
     except StoreError:
         return None
-    same = found.get("key") == key and found.get("sha256") == file_checksum(out).sha256
-    return found if same else None
+    return found if found.key == key and found.sha256 == file_checksum(out).sha256 else None

@@ -197,7 +197,7 @@ def _draw_path(axes: Axes, plan: Plan, values: Array, scale: Normalize) -> LineC
     """Draw the path, coloured by what its metres cost; return the coloured line."""
     points = plan.xy_m
     length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))]
-    ends = np.r_[floats(plan.cost.pieces, "distance_m"), plan.cost.length_m]
+    ends = np.r_[floats(plan.cost.pieces, "distance_m"), plan.totals.length_m]
     at = ends / ends[-1] * length[-1]
     cuts = np.stack([np.interp(at, length, points[:, axis]) for axis in (0, 1)], axis=1)
     axes.plot(*points.T, color="white", lw=7.0, solid_capstyle="round", solid_joinstyle="round")
@@ -227,11 +227,10 @@ def _draw_ends(axes: Axes, plan: Plan) -> None:
 
 
 def _title(axes: Axes, plan: Plan, plans: Sequence[Plan]) -> None:
-    colour = _COLOURS[plan.objective]
-    axes.set_title(f"Least {plan.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
-    best = {name: min(other.cost.summary()[name] for other in plans) for name in _SHOWN}
-    mine = plan.cost.summary()
-    parts = [_said(name, mine[name], best[name]) for name in _SHOWN]
+    colour = _COLOURS[plan.totals.objective]
+    axes.set_title(f"Least {plan.totals.objective}", loc="left", pad=28, fontsize=16, weight="bold", color=colour)
+    totals = [other.totals for other in plans]
+    parts = [_said(name, getattr(plan.totals, name), min(getattr(of, name) for of in totals)) for name in _SHOWN]
     axes.annotate(
         "     ".join(parts), (0.0, 1.0), (0, 9), xycoords="axes fraction", textcoords="offset points", fontsize=10.5
     )
@@ -272,9 +271,9 @@ def _draw_profiles(axes: Axes, backdrop: _Backdrop, plans: Sequence[Plan]) -> No
         length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(plan.xy_m, axis=0), axis=1))]
         at = np.linspace(0.0, length[-1], max(int(length[-1] * 2.0), 2))
         height = backdrop.height_at(np.stack([np.interp(at, length, plan.xy_m[:, axis]) for axis in (0, 1)], axis=1))
-        colour, style = _COLOURS[plan.objective], _LINES[plan.objective]
-        distance = at / length[-1] * plan.cost.length_m
-        axes.plot(distance, height, color=colour, lw=2.2, ls=style, label=f"least {plan.objective}")
+        colour, style = _COLOURS[plan.totals.objective], _LINES[plan.totals.objective]
+        distance = at / length[-1] * plan.totals.length_m
+        axes.plot(distance, height, color=colour, lw=2.2, ls=style, label=f"least {plan.totals.objective}")
     axes.set_xlabel("distance [m]")
     axes.set_ylabel("height [m]")
     axes.margins(x=0.01)

@@ -10,18 +10,19 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import PathError
+from tcpipe.formats.json_files import recast
 from tcpipe.planning.bounds import could_be_better, probe_cells
 from tcpipe.planning.cost_grid import BARRED
 from tcpipe.planning.courses import COURSES
-from tcpipe.planning.path_cost import PathCost, cost_of_path, off_map_text, projection_of
+from tcpipe.planning.path_cost import PathCost, PathTotals, cost_of_path, off_map_text, projection_of
 from tcpipe.planning.reasons import names_of
 from tcpipe.planning.search import Found, least_cost_path, steps_of
 from tcpipe.planning.straight import straightened
@@ -45,38 +46,35 @@ _FEWEST_ASKED = 512
 """Cells asked about together, at least: a few seconds, more than finding the next takes."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanTotals(PathTotals):
+    """What a planned path costs in all, and how it was found."""
+
+    objective: Objective
+    """What it is the least of."""
+    grid_cost: float
+    """What it costs on the grid of cells, in the objective's unit."""
+    predicted_cells: int
+    """Cells that the model was asked about."""
+    negative_steps: int
+    """Steps that give back more than height explains, taken as free."""
+
+
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """A path, what it costs, and how it was found.
+    """A planned path.
 
     Attributes
     ----------
-    objective : what it is the least of.
     lonlat_deg, xy_m : its points, WGS 84 and in the map's CRS, shape (P, 2); from the start as given to the goal as given.
     cost : what `tcpipe predict-path` says of it.
-    grid_cost : what it costs on the grid of cells, in the objective's unit.
-    predicted_cells : cells that the model was asked about.
-    negative_steps : steps that give back more than height explains, taken as free.
+    totals : that in all, and how it was found.
     """
 
-    objective: Objective
     lonlat_deg: Floats
     xy_m: Floats
     cost: PathCost
-    grid_cost: float
-    predicted_cells: int
-    negative_steps: int
-
-    def properties(self) -> dict[str, Any]:
-        """Return what a GeoJSON feature says of it."""
-        facts: Mapping[str, Any] = self.cost.summary()
-        return {
-            "objective": self.objective,
-            **facts,
-            "grid_cost": self.grid_cost,
-            "predicted_cells": self.predicted_cells,
-            "negative_steps": self.negative_steps,
-        }
+    totals: PlanTotals
 
 
 def plan_path(
@@ -117,8 +115,15 @@ def plan_path(
     xy_m, grid_cost = search.straight(found, objective)
     lonlat = projection_of(survey.source).inverse(xy_m)
     cost = cost_of_path(survey.model, survey.source, lonlat, where="the planned path")
-    predicted = int(np.count_nonzero(survey.predicted))
-    return Plan(objective, lonlat, xy_m, cost, grid_cost, predicted, found.negative_steps)
+    totals = recast(
+        cost.totals,
+        PlanTotals,
+        objective=objective,
+        grid_cost=grid_cost,
+        predicted_cells=int(np.count_nonzero(survey.predicted)),
+        negative_steps=found.negative_steps,
+    )
+    return Plan(lonlat, xy_m, cost, totals)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Literal
 
 import numpy as np
 
 from tcpipe.errors import ModelError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
-from tcpipe.formats.geojson_lines import check_lonlat, write_lines
-from tcpipe.formats.json_files import digest, read_json
+from tcpipe.formats.geojson_lines import LineFeature, check_lonlat, line_feature
+from tcpipe.formats.json_files import digest, read_as, recast, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import broken_seal, file_checksum
 from tcpipe.planning.cost_map import CARD, CostMapCard, cost_map_key, open_cost_map, read_cost_map_card
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_files import cost_text
-from tcpipe.planning.plan import OBJECTIVES, Objective, plan_path
+from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
 from tcpipe.planning.survey import Survey, new_survey, survey_from
+from tcpipe.tables.findings import LEFT_OUT
 
 VERSION = "1.0"
 
@@ -36,6 +37,37 @@ class PlanRequest:
     cost_map: Path | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedPath(PlanTotals):
+    """Properties of the path in a plan's file."""
+
+    model: str
+    map: str
+    robot: str
+    allow_unseen: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PlanOrigin:
+    """What a plan's file is made from, and what was found with it."""
+
+    key: str
+    """Hash of the model, the map and what was asked."""
+    plans: Mapping[Objective, PlanTotals]
+    order: tuple[Objective, ...]
+    """Of ``plans``: the one that was asked for first."""
+    picture_sha256: str | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True, slots=True)
+class PlanFile:
+    """The file of a plan: GeoJSON of one line, and as a foreign member what it is made from (RFC 7946, section 6.1)."""
+
+    features: tuple[LineFeature[PlannedPath], ...]
+    tcpipe: PlanOrigin
+    type: Literal["FeatureCollection"] = "FeatureCollection"
+
+
 @dataclass(frozen=True, slots=True)
 class PlanResult:
     """What was found; ``str`` of it is what the command prints."""
@@ -43,26 +75,25 @@ class PlanResult:
     objective: Objective
     out: Path
     picture: Path | None
-    status: str
-    """``done`` or ``unchanged``."""
-    plans: Mapping[str, Mapping[str, Any]]
-    """Properties of each plan by objective, the one that was asked for first."""
+    status: Literal["done", "unchanged"]
+    plans: Mapping[Objective, PlanTotals]
+    """By objective, the one that was asked for first."""
 
     @property
     def exit_code(self) -> int:
         """Return 3 if some of the path that was asked for has no cost, else 0."""
-        return 0 if self.plans[self.objective]["complete"] else 3
+        return 0 if self.plans[self.objective].complete else 3
 
     def __str__(self) -> str:
         """Return what each path costs and where it is, as plain lines."""
         first = next(iter(self.plans.values()))
         lines = [f"least {name}: {cost_text(plan)}" for name, plan in self.plans.items()]
-        lines += [f"warning: {count} pieces: {name.replace('_', ' ')}" for name, count in first["reasons"].items()]
-        if not first["complete"]:
+        lines += [f"warning: {count} pieces: {name.replace('_', ' ')}" for name, count in first.reasons.items()]
+        if not first.complete:
             lines.append("warning: cells are so large that ground without a cost lies between; choose a smaller --step")
-        if first["negative_steps"]:
+        if first.negative_steps:
             lines.append(
-                f"warning: {first['negative_steps']} steps give back more than their height explains; taken as free"
+                f"warning: {first.negative_steps} steps give back more than their height explains; taken as free"
             )
         same = ": nothing to do: it is made from the same model, map and points" if self.status == "unchanged" else ""
         return plain_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
@@ -105,17 +136,17 @@ def plan(
     plans = {
         name: plan_path(survey, start, goal, name, allow_unseen=request.allow_unseen, step=step) for name in wanted
     }
-    properties: dict[str, dict[str, Any]] = {name: found.properties() for name, found in plans.items()}
-    about = {"key": key, "plans": properties, "order": list(properties)}
+    origin = PlanOrigin(key, {name: found.totals for name, found in plans.items()}, wanted)
     if picture is not None:
         from tcpipe.planning.picture import draw_plans  # noqa: PLC0415  matplotlib loads only to draw
 
         draw_plans(picture, source, [plans[name] for name in OBJECTIVES])
-        about["picture_sha256"] = file_checksum(picture).sha256
+        origin = replace(origin, picture_sha256=file_checksum(picture).sha256)
     asked = plans[request.objective]
     who = {"model": model.name, "map": source.name, "robot": model.robot, "allow_unseen": request.allow_unseen}
-    write_lines(out, [(asked.lonlat_deg, {**asked.properties(), **who})], {"tcpipe": about})
-    return PlanResult(request.objective, out, picture, "done", properties)
+    path = line_feature(asked.lonlat_deg, recast(asked.totals, PlannedPath, **who))
+    write_json(out, PlanFile((path,), origin))
+    return PlanResult(request.objective, out, picture, "done", origin.plans)
 
 
 def _check_names(out: Path, picture: Path | None) -> None:
@@ -146,18 +177,16 @@ def _survey(model: CostModel, source: MapFile, request: PlanRequest, card: CostM
     return survey_from(model, source, open_cost_map(request.cost_map, card))
 
 
-def _plans_of(out: Path, picture: Path | None, key: str) -> dict[str, Any] | None:
+def _plans_of(out: Path, picture: Path | None, key: str) -> dict[Objective, PlanTotals] | None:
     """Return what was found before, if it is made from the same, and whole; else None. `UsageError` for a file that is no plan."""
     if not out.exists():
         return None
     try:
-        about = read_json(out).get("tcpipe")
+        about = read_as(out, PlanFile).tcpipe
     except StoreError:
-        about = None
-    if not isinstance(about, dict):
-        raise UsageError(f"{out}: exists and is no plan; it is left alone; give another --out")
-    if about.get("key") != key:
+        raise UsageError(f"{out}: exists and is no plan; it is left alone; give another --out") from None
+    if about.key != key:
         return None
-    if picture is not None and not (picture.is_file() and file_checksum(picture).sha256 == about.get("picture_sha256")):
+    if picture is not None and not (picture.is_file() and file_checksum(picture).sha256 == about.picture_sha256):
         return None
-    return {name: about["plans"][name] for name in about["order"]}
+    return {name: about.plans[name] for name in about.order}

@@ -15,6 +15,7 @@ from tcpipe.formats.atomic import atomic_file
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import picture_text, seal_of
 from tcpipe.report.figures import CLASS_COLOURS
+from tcpipe.terrain.layers import Pixels
 
 _SIDE_PX = 900
 _TINT = 0.35
@@ -87,7 +88,7 @@ def _level(source: MapFile) -> tuple[MapFile, int]:
     return source.at(factor), max(1, -(-(longer // factor) // _SIDE_PX))
 
 
-def _thinned(level: MapFile, layer: str, step: int) -> NDArray[np.generic]:
+def _thinned(level: MapFile, layer: str, step: int) -> Pixels:
     """Return every ``step``-th pixel of a layer."""
     side = max(step, level.tile_px * 4 // step * step)
     rows, cols = level.grid.rows, level.grid.cols

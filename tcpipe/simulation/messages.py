@@ -96,12 +96,12 @@ def _stream(
     return MessageStream(topic, type_name, reading.log_time_ns, columns, fixed, publish_time_ns=reading.stamp_ns)
 
 
-def _header(stamp_ns: NDArray[np.int64]) -> dict[str, Any]:
+def _header(stamp_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
     sec, nanosec = np.divmod(stamp_ns, 1_000_000_000)
     return {"header.seq": np.arange(stamp_ns.size), "header.stamp.sec": sec, "header.stamp.nanosec": nanosec}
 
 
-def _vector(prefix: str, values: NDArray[np.float64], axes: str = "xyz") -> dict[str, Any]:
+def _vector(prefix: str, values: NDArray[np.float64], axes: str = "xyz") -> dict[str, NDArray[np.float64]]:
     return {f"{prefix}.{axis}": values[:, i] for i, axis in enumerate(axes)}
 
 

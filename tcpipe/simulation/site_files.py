@@ -25,6 +25,7 @@ from tcpipe.simulation.sensors import Noise, Reading, record
 from tcpipe.simulation.truth import Truth
 from tcpipe.simulation.world import World
 from tcpipe.terrain.classes import PAPER_CLASSES
+from tcpipe.terrain.layers import Pixels
 
 _HEIGHT_NODATA = -9999.0
 _PALETTE = {
@@ -158,7 +159,7 @@ def _write_raster(
     world: World,
     pitch_m: float,
     shift_m: tuple[float, float],
-    pixels: Callable[[World, NDArray[np.float64], NDArray[np.float64]], NDArray[Any]],
+    pixels: Callable[[World, NDArray[np.float64], NDArray[np.float64]], Pixels],
     **options: Any,
 ) -> None:
     site = world.site
@@ -166,7 +167,7 @@ def _write_raster(
     west, north = site.west_m + shift_m[0], site.south_m + site.height_m + shift_m[1]
     x = (west + (np.arange(cols) + 0.5) * pitch_m).astype(np.float64)
 
-    def strip(first: int, last: int) -> NDArray[Any]:
+    def strip(first: int, last: int) -> Pixels:
         y = (north - (np.arange(first, last) + 0.5) * pitch_m).astype(np.float64)
         return pixels(world, x[None, :], y[:, None])
 
@@ -181,17 +182,17 @@ def _write_raster(
     )
 
 
-def _height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[Any]:
+def _height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
     return np.where(world.mapped(x, y), world.height_m(x, y), _HEIGHT_NODATA).astype(np.float32)[None]
 
 
-def _ortho_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[Any]:
+def _ortho_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
     mapped = world.mapped(x, y)
     rgb = np.where(mapped[..., None], np.clip(np.round(world.ortho(x, y)), 0, 255), 0)
     return np.concatenate([np.moveaxis(rgb, -1, 0), np.where(mapped, 255, 0)[None]]).astype(np.uint8)
 
 
-def _terrain_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[Any]:
+def _terrain_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
     return np.where(world.mapped(x, y), 10 * world.terrain_class(x, y), 0).astype(np.uint8)[None]
 
 

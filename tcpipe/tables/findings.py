@@ -14,8 +14,11 @@ from numpy.typing import NDArray
 
 F = TypeVar("F")
 
-LEFT_OUT = {"json": "left out"}
+LEFT_OUT: Mapping[str, tuple[object, ...]] = {"json": (None, {}, [], ())}
 """Metadata of a field which, while it is None or empty, is no key of the JSON object."""
+
+ABSENT: Mapping[str, tuple[object, ...]] = {"json": (None,)}
+"""Metadata of a field which, while it is None, is no key of the JSON object."""
 
 Vector = tuple[float, float, float]
 

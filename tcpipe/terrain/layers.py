@@ -19,12 +19,15 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
+
+Pixels: TypeAlias = NDArray[np.uint8 | np.uint16 | np.float32 | np.float64]
+"""Pixels of a layer: bytes or floats in a map, steps above the lowest pixel in a patch."""
 
 Kind = Literal["continuous", "categorical", "relative"]
 Stack = Literal["relative", "floats", "greys", "classes"]
@@ -92,11 +95,11 @@ class Layer:
             return "greys" if self.mapped == np.uint8 else "floats"
         return "relative" if self.kind == "relative" else "classes"
 
-    def has_data(self, pixels: NDArray[Any]) -> NDArray[np.bool_]:
+    def has_data(self, pixels: Pixels) -> NDArray[np.bool_]:
         """Return which pixels of the map have data."""
         return np.isfinite(pixels) if self.mapped.kind == "f" else np.asarray(pixels != 0)
 
-    def channel(self, pixels: NDArray[Any]) -> NDArray[np.float32]:
+    def channel(self, pixels: Pixels) -> NDArray[np.float32]:
         """Return pixels of patches as a channel of the tensor, in [0, 1]."""
         one = np.float32
         if self.stored == np.uint8:

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import Layer
+from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.resampling_kernel import block_majority
 
 COARSEST_M = 1.0
@@ -47,7 +46,7 @@ def factor_for(factors: Sequence[int], map_pitch_m: float, pitch_m: float) -> in
     return max((factor for factor in factors if factor * map_pitch_m <= _SLACK * pitch_m), default=min(factors))
 
 
-def coarser_levels(layer: Layer, values: NDArray[Any], factors: Sequence[int]) -> Iterator[tuple[int, NDArray[Any]]]:
+def coarser_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iterator[tuple[int, Pixels]]:
     """Yield each factor above 1 and the layer at it.
 
     Parameters
@@ -72,12 +71,12 @@ def coarser_levels(layer: Layer, values: NDArray[Any], factors: Sequence[int]) -
         yield factor, _grey(means) if grey else means
 
 
-def _halved(values: NDArray[Any]) -> NDArray[Any]:
+def _halved(values: Pixels) -> Pixels:
     """Return means of 2 x 2 pixels; an odd last row or column is left out."""
     even = values[: values.shape[0] // 2 * 2, : values.shape[1] // 2 * 2]
     rows = even[0::2] + even[1::2]
     return np.asarray((rows[:, 0::2] + rows[:, 1::2]) * rows.dtype.type(0.25))
 
 
-def _grey(means: NDArray[np.float32]) -> NDArray[np.uint8]:
+def _grey(means: Pixels) -> NDArray[np.uint8]:
     return np.where(np.isfinite(means), np.rint(means), 0.0).astype(np.uint8)

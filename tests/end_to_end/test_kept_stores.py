@@ -51,7 +51,7 @@ def test_a_dataset_is_built_of_it(kept):
     np.testing.assert_allclose(new.patches, old.patches, atol=0.01)  # a rounded grey, a step of half a millimetre
     np.testing.assert_array_equal(new.labels, old.labels)
     sample_id = str(old.column("sample_id")[0])
-    assert explain(sample_id, dataset=kept / "zarr", store=kept / "store").facts["sample"]["sample_id"] == sample_id
+    assert explain(sample_id, dataset=kept / "zarr", store=kept / "store").facts.sample["sample_id"] == sample_id
 
 
 def contents(directory):

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import PlaceState, atomic_directory
 from tcpipe.formats.maps.class_table import read_class_scheme
 from tcpipe.formats.maps.geotiff import USES, Use
 from tcpipe.formats.maps.layer_building import LayerSource, RasterLayer, shards_of
+from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapFile, MapWriter, open_map
 from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
@@ -36,22 +37,6 @@ Files = Path | Sequence[Path]
 OrthoBands = Literal["grey", "rgb"]
 
 _RGB: tuple[Use, ...] = ("red", "green", "blue")
-
-
-@dataclass(frozen=True, slots=True)
-class MapSummary:
-    """What `build_map` made: files, share of the grid's pixels with data, share of each class among pixels with one, by layer."""
-
-    grid: MapGrid
-    sources: Mapping[str, str]
-    covered: Mapping[str, float]
-    height_min_m: float
-    height_max_m: float
-    class_share: Mapping[str, float]
-    """Of terrain."""
-    class_shares: Mapping[str, Mapping[str, float]]
-    """Of the user's own layers."""
-    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +67,10 @@ def build_map(
     agreed: ClassScheme | None = None,
     crs: str | None = None,
     pitch_m: float | None = None,
-    inputs: Mapping[str, Any] | None = None,
+    inputs: MapInputs | None = None,
     instead_of: PlaceState | None = None,
     look: Callable[[MapFile, Path], None] | None = None,
-) -> MapSummary:
+) -> MapFacts:
     """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
 
     Parameters
@@ -151,13 +136,12 @@ def build_map(
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
-            summary = _summary(grid, layers)
-            facts = {**_facts(summary), "classes_from": origin, "inputs": dict(inputs or {})}
+            facts = _facts(grid, layers, origin, inputs or MapInputs())
             writer.finish(facts, {role: _ranged(source) for role, source in layers.items()})
             write_checksums(half)
             if look is not None:
                 look(open_map(half), half)
-    return summary
+    return facts
 
 
 def _layer(raster: Raster, schemes: Mapping[str, ClassScheme]) -> Layer:
@@ -286,11 +270,10 @@ def _notes(layers: Mapping[str, LayerSource], covered: Mapping[str, float]) -> t
     return tuple(notes)
 
 
-def _summary(grid: MapGrid, layers: Mapping[str, LayerSource]) -> MapSummary:
+def _facts(grid: MapGrid, layers: Mapping[str, LayerSource], origin: str, inputs: MapInputs) -> MapFacts:
     covered = {role: layer.tally.pixels / (grid.rows * grid.cols) for role, layer in layers.items()}
     shares = {name: found for name, layer in layers.items() if (found := _shares(layer))}
-    return MapSummary(
-        grid=grid,
+    return MapFacts(
         sources={role: layer.name for role, layer in layers.items()},
         covered=covered,
         height_min_m=layers["height"].tally.low,
@@ -298,14 +281,9 @@ def _summary(grid: MapGrid, layers: Mapping[str, LayerSource]) -> MapSummary:
         class_share=shares.pop("terrain", {}),
         class_shares=shares,
         warnings=_notes(layers, covered),
+        classes_from=origin,
+        inputs=inputs,
     )
-
-
-def _facts(summary: MapSummary) -> dict[str, Any]:
-    """Return what the map keeps of its summary, as JSON values."""
-    found = {name: value for name, value in asdict(summary).items() if value or name != "class_shares"}
-    del found["grid"]
-    return found
 
 
 def _shares(source: LayerSource) -> dict[str, float]:

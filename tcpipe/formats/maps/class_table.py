@@ -69,16 +69,6 @@ def read_class_scheme(path: Path) -> ClassScheme:
     return ClassScheme(ClassTable(tuple(classes[key] for key in sorted(classes))), dict(sorted(id_by_value.items())))
 
 
-def table_to_json(table: ClassTable) -> list[dict[str, Any]]:
-    """Return a class table as JSON values."""
-    return [{"id": entry.id, "name": entry.name, "traversable": entry.traversable} for entry in table.classes]
-
-
-def table_from_json(values: list[dict[str, Any]]) -> ClassTable:
-    """Return the class table that `table_to_json` wrote."""
-    return ClassTable(tuple(TerrainClass(row["id"], row["name"], traversable=row["traversable"]) for row in values))
-
-
 def _csv_rows(text: str, path: Path) -> list[tuple[str, dict[str, Any]]]:
     reader = csv.DictReader(StringIO(text, newline=""), skipinitialspace=True)
     missing = [name for name in _COLUMNS if name not in (reader.fieldnames or ())]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from tcpipe.errors import MapError
 from tcpipe.formats.maps.mosaic import Raster
 from tcpipe.terrain.classes import ClassScheme
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import Layer
+from tcpipe.terrain.layers import Layer, Pixels
 from tcpipe.terrain.placement import LATTICE_STEP_PX, Footing, source_lattice
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.resampling_kernel import bilinear, majority, mean
@@ -39,7 +39,7 @@ class Tally:
     unnamed: set[int] = field(default_factory=set)
     unnamed_pixels: int = 0
 
-    def count(self, layer: LayerSource, shard: NDArray[Any]) -> bool:
+    def count(self, layer: LayerSource, shard: Pixels) -> bool:
         """Count the pixels of a shard and return whether any has data; `MapError` if heights are not metres of dry land."""
         if layer.layer.kind == "categorical":
             found = np.bincount(shard.reshape(-1), minlength=256)
@@ -58,7 +58,7 @@ class Tally:
                 )
         return bool(present.size)
 
-    def note_unnamed(self, values: NDArray[Any]) -> None:
+    def note_unnamed(self, values: Pixels) -> None:
         """Remember raster values that the class table does not name."""
         if values.size:
             self.unnamed_pixels += values.size
@@ -84,7 +84,7 @@ class LayerSource(Protocol):
     def tally(self) -> Tally:
         """What has been seen of it so far."""
 
-    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
+    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> Pixels:
         """Return a part of the map, shape (rows, cols): metres with NaN, or bytes with 0, as no data."""
 
     def nothing(self) -> str | None:
@@ -116,9 +116,9 @@ class RasterLayer:
         """The same without their folder."""
         return self.raster.name
 
-    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
+    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> Pixels:
         """Resample a part of the map, block by block, so that the raster's window stays small."""
-        shard: NDArray[Any] = np.empty((rows, cols), np.uint8 if self.layer.kind == "categorical" else np.float64)
+        shard: Pixels = np.empty((rows, cols), np.uint8 if self.layer.kind == "categorical" else np.float64)
         block = self._block_px(grid, row0, col0)
         for i in range(0, rows, block):
             for j in range(0, cols, block):
@@ -158,7 +158,7 @@ class RasterLayer:
         ratio = _source_px_per_px(source_lattice(grid, self.footing, self.projection, row0, 1, col0, 1))
         return _BLOCK_PX if not ratio > 2.0 else max(int(2 * _BLOCK_PX / ratio), LATTICE_STEP_PX)
 
-    def _fill(self, part: NDArray[Any], grid: MapGrid, row0: int, col0: int) -> None:
+    def _fill(self, part: Pixels, grid: MapGrid, row0: int, col0: int) -> None:
         """Resample one block of the map from the raster."""
         lattice = source_lattice(grid, self.footing, self.projection, row0, part.shape[0], col0, part.shape[1])
         part[...] = 0 if self.layer.kind == "categorical" else np.nan

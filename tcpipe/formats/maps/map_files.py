@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +31,16 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
-from tcpipe.formats.layer_descriptions import described, flags, layers_described
-from tcpipe.formats.maps.class_table import table_from_json, table_to_json
+from tcpipe.formats.json_files import plain, recast, typed
+from tcpipe.formats.layer_descriptions import Description, described, flags, layers_described
+from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
 from tcpipe.formats.seals import prove_files, read_checksums
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
-from tcpipe.terrain.classes import ClassScheme, ClassTable
+from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, missing
+from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, missing
 from tcpipe.terrain.overviews import coarser_levels, overview_factors, overview_grid
 
 TILE_PX = 512
@@ -51,6 +53,23 @@ PAPER_VERSION, MAP_VERSION = "1.1", "1.2"
 """1.2: a map has other layers than the paper's, which its key ``described`` tells of; one without is of 1.1 as before."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Attributes:
+    """What a map keeps of itself, as the attribute ``tcpipe_map``."""
+
+    version: str
+    name: str
+    grid: MapGrid
+    class_table: tuple[TerrainClass, ...]
+    id_by_value: Mapping[int, int]
+    layers: tuple[str, ...]
+    described: Mapping[str, Description] = field(default_factory=dict, metadata=LEFT_OUT)
+    factors: tuple[int, ...]
+    tile_px: int
+    height_reference_m: float
+    facts: MapFacts
+
+
 @dataclass(frozen=True, slots=True)
 class MapFile:
     """An open map; satisfies `tcpipe.terrain.tiles.MapReader`."""
@@ -61,8 +80,7 @@ class MapFile:
     layers: Mapping[str, Layer]
     tile_px: int
     height_reference_m: float
-    facts: Mapping[str, Any]
-    """What `build_map` recorded: sources, coverage, warnings."""
+    facts: MapFacts
     id_by_value: Mapping[int, int]
     """Which values of its terrain raster stood for which class ids."""
     factors: tuple[int, ...]
@@ -74,22 +92,23 @@ class MapFile:
         """Return the map at one of its ``factors``, which are the full map's."""
         return replace(self, grid=overview_grid(self.grid, factor), factors=(1,), _factor=factor)
 
-    def summary(self) -> dict[str, Any]:
-        """Return what the map is, as JSON values."""
+    def summary(self) -> MapSummary:
+        """Return what the map is as a whole."""
         grid = self.grid
-        return {
-            "name": self.name,
-            "crs": grid.crs,
-            "rows": grid.rows,
-            "cols": grid.cols,
-            "pitch_m": grid.pitch_m,
-            "bounds_m": list(grid.bounds_m),
-            "layers": list(self.layers),
-            "overviews": list(self.factors[1:]),
-            "class_table": table_to_json(self.classes),
-            **_described(self.layers),
-            **self.facts,
-        }
+        return recast(
+            self.facts,
+            MapSummary,
+            name=self.name,
+            crs=grid.crs,
+            rows=grid.rows,
+            cols=grid.cols,
+            pitch_m=grid.pitch_m,
+            bounds_m=grid.bounds_m,
+            layers=tuple(self.layers),
+            overviews=self.factors[1:],
+            class_table=self.classes.classes,
+            described=_described(self.layers),
+        )
 
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
         """Return a window of a layer as stored: NaN or, of bytes, 0 where there is no data.
@@ -139,28 +158,31 @@ def open_map(path: Path, *, proved: bool = True) -> MapFile:
     if not isinstance(found, dict) or found.get("version") not in {PAPER_VERSION, MAP_VERSION}:
         version = found.get("version") if isinstance(found, dict) else None
         raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
-    factors = tuple(found["factors"])
-    wanted = [f"{_level_path(factor)}{layer}" for factor in factors for layer in found["layers"]]
+    try:
+        kept = typed(found, _Attributes, path)
+        described = {name: kept.described.get(name, {}) for name in kept.layers}
+        layers = layers_described(described, kept.class_table, path)
+    except StoreError as error:
+        raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
+    wanted = [f"{_level_path(factor)}{layer}" for factor in kept.factors for layer in kept.layers]
     missing = [array for array in wanted if not (path / array / "zarr.json").is_file()]
     if missing:
         raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
     if proved:
         _prove(path)
-    classes = table_from_json(found["class_table"])
-    told = {name: found.get("described", {}).get(name, {}) for name in found["layers"]}
     return MapFile(
-        name=found["name"],
-        grid=MapGrid(**found["grid"]),
-        classes=classes,
-        layers=layers_described(told, classes.classes, path),
-        tile_px=found["tile_px"],
-        height_reference_m=found["height_reference_m"],
-        facts=found["facts"],
-        id_by_value={int(value): class_id for value, class_id in found["id_by_value"].items()},
-        factors=factors,
+        name=kept.name,
+        grid=kept.grid,
+        classes=ClassTable(kept.class_table),
+        layers=layers,
+        tile_px=kept.tile_px,
+        height_reference_m=kept.height_reference_m,
+        facts=kept.facts,
+        id_by_value=kept.id_by_value,
+        factors=kept.factors,
         _levels={
-            f: {layer: open_sharded(path / f"{_level_path(f)}{layer}", sparse=True) for layer in found["layers"]}
-            for f in factors
+            f: {layer: open_sharded(path / f"{_level_path(f)}{layer}", sparse=True) for layer in kept.layers}
+            for f in kept.factors
         },
     )
 
@@ -210,7 +232,7 @@ class MapWriter:
         shard_px = max(SHARD_PX // factor, TILE_PX)
         return {name: _add_layer(group, layer, grid, shard_px) for name, layer in self._layers.items()}
 
-    def write(self, layer: str, row0: int, col0: int, values: NDArray[Any]) -> None:
+    def write(self, layer: str, row0: int, col0: int, values: Pixels) -> None:
         """Write a shard whose corner is at a multiple of `SHARD_PX`; floats with NaN, bytes with 0, as no data."""
         if self._layers[layer].kind == "relative":
             if self.height_reference_m is None and np.isfinite(values).any():
@@ -220,7 +242,7 @@ class MapWriter:
         for factor, level in coarser_levels(self._layers[layer], values, self._factors):
             _put(self._levels[factor][layer], row0 // factor, col0 // factor, level)
 
-    def finish(self, facts: Mapping[str, Any], layers: Mapping[str, Layer]) -> None:
+    def finish(self, facts: MapFacts, layers: Mapping[str, Layer]) -> None:
         """Write coordinates and attributes; ``layers`` are those of the beginning, with the range that was found."""
         reference_m = self.height_reference_m or 0.0
         for factor, arrays in self._levels.items():
@@ -231,27 +253,24 @@ class MapWriter:
                 overview_grid(self._grid, factor),
                 f"{self._name}, {factor} x coarser" if factor > 1 else self._name,
             )
-        self._group.attrs.update(
-            {
-                "tcpipe_map": {
-                    "version": PAPER_VERSION if set(layers) <= set(LAYERS) else MAP_VERSION,
-                    "name": self._name,
-                    "grid": {field: getattr(self._grid, field) for field in MapGrid.__slots__},
-                    "class_table": table_to_json(self._scheme.table),
-                    "id_by_value": {str(value): class_id for value, class_id in self._scheme.id_by_value.items()},
-                    "layers": list(layers),
-                    **_described(layers),
-                    "factors": list(self._factors),
-                    "tile_px": TILE_PX,
-                    "height_reference_m": reference_m,
-                    "facts": dict(facts),
-                },
-            }
+        kept = _Attributes(
+            version=PAPER_VERSION if set(layers) <= set(LAYERS) else MAP_VERSION,
+            name=self._name,
+            grid=self._grid,
+            class_table=self._scheme.table.classes,
+            id_by_value=self._scheme.id_by_value,
+            layers=tuple(layers),
+            described=_described(layers),
+            factors=self._factors,
+            tile_px=TILE_PX,
+            height_reference_m=reference_m,
+            facts=facts,
         )
+        self._group.attrs.update({"tcpipe_map": plain(kept)})
         consolidate(self._group)
 
 
-def _put(array: Any, row0: int, col0: int, values: NDArray[Any]) -> None:
+def _put(array: Any, row0: int, col0: int, values: Pixels) -> None:
     if values.size:
         array[row0 : row0 + values.shape[0], col0 : col0 + values.shape[1]] = values.astype(array.dtype)
 
@@ -289,10 +308,9 @@ def _place(group: Any, grid: MapGrid, title: str) -> None:
 _LONG_NAMES = {"height": "height of the ground", "ortho": "grey of the orthophoto", "terrain": "terrain class"}
 
 
-def _described(layers: Mapping[str, Layer]) -> dict[str, Any]:
-    """Return what the names of layers alone do not tell, if there is anything, under ``described``."""
-    found = {name: described(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
-    return {"described": found} if found else {}
+def _described(layers: Mapping[str, Layer]) -> dict[str, Description]:
+    """Return what the names of layers alone do not tell."""
+    return {name: described(layer) for name, layer in layers.items() if name not in PAPER_LAYERS}
 
 
 def _add_layer(group: Any, layer: Layer, grid: MapGrid, shard_px: int) -> Any:

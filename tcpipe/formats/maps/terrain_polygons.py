@@ -23,7 +23,7 @@ from tcpipe.formats.maps.geotiff import burn_polygons
 from tcpipe.formats.maps.layer_building import Tally
 from tcpipe.terrain.classes import ClassScheme, name_key
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import Layer, paper_layers
+from tcpipe.terrain.layers import Layer, Pixels, paper_layers
 from tcpipe.terrain.projection import Projection, area_of
 
 PROPERTY = "class"
@@ -62,7 +62,7 @@ class PolygonLayer:
     _tree: shapely.STRtree = field(repr=False)
     tally: Tally = field(default_factory=Tally)
 
-    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> NDArray[Any]:
+    def shard(self, grid: MapGrid, row0: int, col0: int, rows: int, cols: int) -> Pixels:
         """Return class ids of a part of the map, shape (rows, cols); 0 where no polygon is."""
         left, top = grid.x_min_m + col0 * grid.pitch_m, grid.y_max_m - row0 * grid.pitch_m
         box = shapely.box(left, top - rows * grid.pitch_m, left + cols * grid.pitch_m, top)

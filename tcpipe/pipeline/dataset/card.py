@@ -25,6 +25,7 @@ from tcpipe.formats.dataset_card import (
     SplitRules,
 )
 from tcpipe.formats.dataset_files import FileFormat
+from tcpipe.formats.json_files import recast
 from tcpipe.formats.layer_descriptions import described
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import Checksum
@@ -127,8 +128,8 @@ def _split_rules(recipe: Recipe, drawn: Drawn, regions: Regions | None) -> Split
 
 
 def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistration, ...]) -> MapSource:
-    found = {"name": source.name, "layers": tuple(source.layers), **asdict(source.grid), **source.facts}
-    return MapSource(**found, sha256=sha256, registration=registration)
+    told = {"name": source.name, "layers": tuple(source.layers), "sha256": sha256, "registration": registration}
+    return recast(source.facts, MapSource, **told, **asdict(source.grid))
 
 
 def measured(samples: pa.Table, *, has_terrain: bool) -> Measured:

@@ -57,12 +57,12 @@ def test_a_prefix_is_a_bag_directory(bucket):
 
 def test_only_what_belongs_to_a_log_is_copied(bucket):
     found = inspect("s3://drives", recipe=Recipe())
-    assert [entry["path"] for entry in found["logs"]] == [
+    assert [entry.path for entry in found.logs] == [
         "s3://drives/field/bag",
         "s3://drives/field/my run.mcap",
         "s3://drives/junk.bag",
     ]
-    assert found["logs"][2]["problems"][0].startswith("s3://drives/junk.bag: not a log")
+    assert found.logs[2].problems[0].startswith("s3://drives/junk.bag: not a log")
     assert sorted(bucket[1]) == ["field/bag/bag.db3", "field/bag/metadata.yaml", "field/my run.mcap", "junk.bag"]
 
 

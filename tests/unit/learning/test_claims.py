@@ -1,25 +1,46 @@
 """Claims hold by figures alone."""
 
-import copy
+from dataclasses import replace
 
 import pytest
+from made_models import CARD
 
 from tcpipe.learning.claims import checked_claims
 from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS
+from tcpipe.learning.evaluation_facts import (
+    AblationRow,
+    EvaluateConfig,
+    EvaluatedDataset,
+    EvaluatedModel,
+    Evaluation,
+    SplitErrors,
+)
+from tcpipe.learning.metrics import Errors
 
 
 def _error(mape, rmse=1.0):
-    return {"count": 10, "rmse": rmse, "mape_percent": mape, "mape_count": 10}
+    return Errors(10, rmse, mape, 10)
 
 
 def _run(*, without_h=50.0, without_c=17.0, grass=28.0, own=17.0, ours=12.8, expected=14.0, floor=0.8):
     left = {"OCH": ours, "CH": 14.5, "OH": without_c, "OC": without_h}
-    return {
-        "splits": {"unseen": {"errors": {"w": {"all": _error(9.0, 1.0)}}, "simulation_floor": {"w": {"all": _error(8.0, floor)}}}},
-        "ablation": [{"layers": list(letters), "how": "noise", "unseen": {"E": _error(value)}} for letters, value in left.items()],
-        "energy": {who: {"unseen": _error(value)} for who, value in ((OURS, ours), (GRASS_ONLY, grass), (PER_CLASS, own))},
-        "time": {OURS: {"unseen": _error(5.0)}, EXPECTED: {"unseen": _error(expected)}},
-    }  # fmt: skip
+    errors, least = {"w": {"all": _error(9.0, 1.0)}}, {"w": {"all": _error(8.0, floor)}}
+    return Evaluation(
+        tcpipe_version="",
+        key="",
+        model=EvaluatedModel("", "", CARD.training),
+        dataset=EvaluatedDataset("", "", {}),
+        config=EvaluateConfig(),
+        splits={"unseen": SplitErrors(10, {}, (), errors, {}, least)},
+        ablation=tuple(
+            AblationRow(tuple(letters), "noise", unseen={"E": _error(value)}) for letters, value in left.items()
+        ),
+        energy={who: {"unseen": _error(value)} for who, value in ((OURS, ours), (GRASS_ONLY, grass), (PER_CLASS, own))},
+        time={OURS: {"unseen": _error(5.0)}, EXPECTED: {"unseen": _error(expected)}},
+        repeatability={},
+        warnings=(),
+        plots={},
+    )
 
 
 def _held(runs):
@@ -68,8 +89,8 @@ def test_several_trainings_count_by_their_mean():
 
 
 def test_what_was_not_measured_is_not_held():
-    run = copy.deepcopy(_run())
-    del run["energy"][PER_CLASS]
+    run = _run()
+    run = replace(run, energy={who: errors for who, errors in run.energy.items() if who != PER_CLASS})
     (claim,) = (claim for claim in checked_claims([run]) if claim.says == "one net beats per-class nets")
     assert not claim.held
     assert str(claim).startswith("not measured: ")

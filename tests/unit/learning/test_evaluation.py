@@ -12,7 +12,8 @@ from synthetic_store import small_store
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError, UsageError
-from tcpipe.learning.evaluation import EvaluateConfig
+from tcpipe.formats.json_files import plain
+from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import load_model
@@ -44,15 +45,15 @@ def test_the_figures_are_the_arrays_own(evaluated, model, dataset):
     _, values = evaluated
     unseen = open_dataset(dataset)["unseen"]
     said, labels = load_model(model).predict(unseen.patches).astype(float), unseen.labels.astype(float)
-    found = values["splits"]["unseen"]["errors"]
-    assert found["w"]["all"]["rmse"] == pytest.approx(np.sqrt(np.mean((said[:, 0] - labels[:, 0]) ** 2)), rel=1e-4)
+    found = values.splits["unseen"].errors
+    assert found["w"]["all"].rmse == pytest.approx(np.sqrt(np.mean((said[:, 0] - labels[:, 0]) ** 2)), rel=1e-4)
     energy, told = unseen.column("energy_joule"), said[:, 0] / said[:, 1]
-    assert found["E"]["all"]["mape_percent"] == pytest.approx(100 * np.mean(np.abs(told - energy) / energy), rel=1e-4)
+    assert found["E"]["all"].mape_percent == pytest.approx(100 * np.mean(np.abs(told - energy) / energy), rel=1e-4)
     mud = unseen.column("terrain_class") == 5
     times, told = unseen.column("duration_s")[mud], 1.0 / said[mud, 1]
-    assert found["T"]["mud"]["rmse"] == pytest.approx(np.sqrt(np.mean((told - times) ** 2)), rel=1e-4)
-    expected = values["time"]["expected time"]["unseen"]
-    assert expected["mape_percent"] == pytest.approx(
+    assert found["T"]["mud"].rmse == pytest.approx(np.sqrt(np.mean((told - times) ** 2)), rel=1e-4)
+    expected = values.time["expected time"]["unseen"]
+    assert expected.mape_percent == pytest.approx(
         100 * np.mean(np.abs(1.0 - unseen.column("duration_s")) / unseen.column("duration_s"))
     )
 
@@ -69,15 +70,15 @@ def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):
 
 def test_seven_input_sets(evaluated):
     _, values = evaluated
-    rows = {"".join(row["layers"]): row for row in values["ablation"]}
+    rows = {"".join(row.layers): row for row in values.ablation}
     assert list(rows) == ["OCH", "CH", "OH", "OC", "O", "C", "H"]
-    assert rows["OCH"]["test"]["w"] == values["splits"]["test"]["errors"]["w"]["all"]
-    assert rows["O"]["test"]["w"] != rows["OCH"]["test"]["w"]
+    assert rows["OCH"].test["w"] == values.splits["test"].errors["w"]["all"]
+    assert rows["O"].test["w"] != rows["OCH"].test["w"]
 
 
 def test_its_files_say_the_same(evaluated):
     place, values = evaluated
-    assert json.loads((place / "evaluation.json").read_text()) == values
+    assert json.loads((place / "evaluation.json").read_text()) == plain(values)
     with (place / "evaluation.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     row = next(
@@ -85,7 +86,7 @@ def test_its_files_say_the_same(evaluated):
         for row in rows
         if (row["split"], row["what"], row["quantity"], row["class"]) == ("unseen", "errors", "E", "mud")
     )
-    assert float(row["rmse"]) == values["splits"]["unseen"]["errors"]["E"]["mud"]["rmse"]
+    assert float(row["rmse"]) == values.splits["unseen"].errors["E"]["mud"].rmse
     page = (place / "evaluation.html").read_text()
     for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "<svg"):
         assert told in page
@@ -99,8 +100,8 @@ def test_its_files_say_the_same(evaluated):
 
 def test_a_class_that_the_model_never_saw_is_said(evaluated):
     _, values = evaluated
-    assert any(line.startswith("mud: ") and "the model never saw this class" in line for line in values["warnings"])
-    assert any("trained on another dataset" in line for line in values["warnings"])
+    assert any(line.startswith("mud: ") and "the model never saw this class" in line for line in values.warnings)
+    assert any("trained on another dataset" in line for line in values.warnings)
 
 
 def test_the_same_again_predicts_nothing(evaluated, model, dataset, monkeypatch):
@@ -152,15 +153,15 @@ def test_samples_without_a_label_are_counted(model, dataset, tmp_path, monkeypat
     )
     values = run_evaluation(model, dataset, tmp_path / "evaluation", config=CONFIG).values
     count = len(open_dataset(dataset)["unseen"])
-    assert f"3 of {count} samples of unseen have no label and are in no figure" in values["warnings"]
-    assert values["splits"]["unseen"]["errors"]["w"]["all"]["count"] == count - 3
+    assert f"3 of {count} samples of unseen have no label and are in no figure" in values.warnings
+    assert values.splits["unseen"].errors["w"]["all"].count == count - 3
 
 
 def test_without_an_unseen_area_it_says_so(model, tmp_path):
     build_dataset(tmp_path / "dataset", store=small_store(tmp_path).root, recipe=Recipe())
     values = run_evaluation(model, tmp_path / "dataset", tmp_path / "evaluation", config=CONFIG).values
-    assert list(values["splits"]) == ["test"]
-    assert any(line.startswith("the dataset has no unseen samples") for line in values["warnings"])
+    assert list(values.splits) == ["test"]
+    assert any(line.startswith("the dataset has no unseen samples") for line in values.warnings)
     assert "Table II:" not in (tmp_path / "evaluation" / "evaluation.html").read_text()
 
 

@@ -66,7 +66,7 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
         ),
     )
     found = inspect(store.root, recipe=Recipe())
-    assert (found["outdated"], found["unfinished"]) == ({"a": "0.9"}, [])
+    assert (found.outdated, found.unfinished) == ({"a": "0.9"}, ())
     with pytest.raises(
         StoreError,
         match=rf"runs/a: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again",

@@ -1,5 +1,7 @@
 """Everything read: gaps, stamps and clock steps that were put in come out; memory does not grow with the log."""
 
+from dataclasses import asdict
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -28,7 +30,7 @@ def inspected(path, streams, **options):
     write_mcap(path, streams)
     with open_log(path) as log:
         found = inspect_log(log, Recipe(), None, full=True, **options)
-    return found, {topic["name"]: topic for topic in found["topics"]}
+    return found, {topic.name: topic for topic in found.topics}
 
 
 def test_faults_that_were_put_in_are_found(tmp_path):
@@ -44,33 +46,33 @@ def test_faults_that_were_put_in_are_found(tmp_path):
         tmp_path / "a.mcap", [stream("/faulty", faulty, log_ns), stream("/stepped", stepped, log_ns)]
     )
     one = topics["/faulty"]
-    assert one["messages_read"] == one["messages"] == 3000
-    assert one["gaps"] == 1
-    assert one["longest_gap_s"] == pytest.approx(4.02)
-    assert one["median_period_s"] == pytest.approx(0.02)
+    assert one.messages_read == one.messages == 3000
+    assert one.gaps == 1
+    assert one.longest_gap_s == pytest.approx(4.02)
+    assert one.median_period_s == pytest.approx(0.02)
     kinds = ("zero_stamps", "backward_stamps", "repeated_stamps", "duplicates")
-    assert [one[kind] for kind in kinds] == [1, 1, 0, 1]
-    assert one["longest_gap_at_ns"] == log_ns[1999]
-    assert topics["/stepped"]["longest_gap_s"] == pytest.approx(4.02)  # the step of its header is none
-    assert one["time"] == "header"
-    assert one["header_minus_log_s"] == pytest.approx(-0.003)
-    assert found["clock_epochs"] == 2
-    (step,) = found["clock_steps"]
-    assert step["step_s"] == pytest.approx(7.0)
-    assert step["topics"] == ["/stepped"]
-    assert step["log_time_ns"] == log_ns[1500]
-    assert found["damage"] == []
+    assert [getattr(one, kind) for kind in kinds] == [1, 1, 0, 1]
+    assert one.longest_gap_at_ns == log_ns[1999]
+    assert topics["/stepped"].longest_gap_s == pytest.approx(4.02)  # the step of its header is none
+    assert one.time == "header"
+    assert one.header_minus_log_s == pytest.approx(-0.003)
+    assert found.clock_epochs == 2
+    (step,) = found.clock_steps
+    assert step.step_s == pytest.approx(7.0)
+    assert step.topics == ("/stepped",)
+    assert step.log_time_ns == log_ns[1500]
+    assert found.damage == ()
 
 
 def test_simulated_time_is_told_from_the_wall_clock(tmp_path):
     log_ns = START_NS + np.arange(500) * PERIOD_NS
     simulated = 5_000_000_000 + np.arange(500) * PERIOD_NS
     found, topics = inspected(tmp_path / "a.mcap", [stream("/imu", simulated, log_ns)])
-    assert topics["/imu"]["simulated_time"]
-    assert topics["/imu"]["time"] == "header" or "10 s" in topics["/imu"]["time_why"]
+    assert topics["/imu"].simulated_time
+    assert topics["/imu"].time == "header" or "10 s" in topics["/imu"].time_why
     found, topics = inspected(tmp_path / "b.mcap", [stream("/imu", simulated, simulated)])
-    assert not topics["/imu"]["simulated_time"]
-    assert any("the log's own times are simulated" in line for line in found["warnings"])
+    assert not topics["/imu"].simulated_time
+    assert any("the log's own times are simulated" in line for line in found.warnings)
 
 
 def test_a_topic_of_many_messages_is_thinned_out_and_its_counts_stay_exact(monkeypatch):
@@ -89,7 +91,7 @@ def test_a_topic_of_many_messages_is_thinned_out_and_its_counts_stay_exact(monke
         thinned.add(table[start : start + 777])
     assert len(thinned.times()[0]) <= 1000
     assert np.isin(thinned.times()[0], log_ns).all()
-    exact, about = whole.facts(), thinned.facts()
+    exact, about = asdict(whole.counts()), asdict(thinned.counts())
     for name in exact.keys() - {"median_period_s"}:
         assert about[name] == exact[name], name
     assert about["median_period_s"] == pytest.approx(0.02)
@@ -100,14 +102,14 @@ def test_exact_duplicates_are_told_from_repeated_stamps(tmp_path):
     header_ns = log_ns - 3_000_000
     log_ns[1::2] += 1_000_000
     found, topics = inspected(tmp_path / "a.mcap", [stream("/twice", header_ns, log_ns)])
-    assert (topics["/twice"]["duplicates"], topics["/twice"]["repeated_stamps"]) == (1000, 0)
-    assert topics["/twice"]["time"] == "header"
+    assert (topics["/twice"].duplicates, topics["/twice"].repeated_stamps) == (1000, 0)
+    assert topics["/twice"].time == "header"
     other = stream("/other", header_ns, log_ns)
     other.columns["angular_velocity.x"] = np.arange(2000.0)
     found, topics = inspected(tmp_path / "b.mcap", [other])
-    assert (topics["/other"]["duplicates"], topics["/other"]["repeated_stamps"]) == (0, 1000)
-    assert topics["/other"]["time"] == "log"
-    assert found["damage"] == []
+    assert (topics["/other"].duplicates, topics["/other"].repeated_stamps) == (0, 1000)
+    assert topics["/other"].time == "log"
+    assert found.damage == ()
 
 
 def test_a_recorder_that_stalls_is_no_gap_and_another_clock_is_told(tmp_path):
@@ -122,10 +124,10 @@ def test_a_recorder_that_stalls_is_no_gap_and_another_clock_is_told(tmp_path):
             stream("/c", header_ns - 60 * 10**9, header_ns),
         ],
     )
-    assert topics["/stalled"]["gaps"] == 0
-    assert topics["/c"]["moved_s"] == [pytest.approx(60.0, abs=0.01)]
-    assert topics["/b"]["moved_s"] == []
-    assert found["clock_steps"] == []
+    assert topics["/stalled"].gaps == 0
+    assert topics["/c"].moved_s == (pytest.approx(60.0, abs=0.01),)
+    assert topics["/b"].moved_s == ()
+    assert found.clock_steps == ()
 
 
 def test_what_repeats_is_compared_in_every_kind_of_column():
@@ -142,7 +144,7 @@ def test_what_repeats_is_compared_in_every_kind_of_column():
     table = pa.table(rows)
     for row in range(5):
         stamps.add(table[row : row + 1])
-    assert (stamps.facts()["duplicates"], stamps.facts()["repeated_stamps"]) == (2, 2)
+    assert (stamps.counts().duplicates, stamps.counts().repeated_stamps) == (2, 2)
 
 
 def test_a_link_that_leads_to_itself_is_refused(tmp_path):

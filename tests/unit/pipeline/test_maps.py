@@ -241,7 +241,7 @@ def test_a_map_that_another_process_adds_meanwhile_stays(site, store, tmp_path, 
     wanted = "another process has written it meanwhile" if force else r"made from something else.*--force"
     with pytest.raises(StoreError if force else MapError, match=wanted):
         add(store, "m", **site, force=force)
-    assert open_map(store / "maps/m.zarr").facts["sources"] == {"height": "h2.tif"}
+    assert open_map(store / "maps/m.zarr").facts.sources == {"height": "h2.tif"}
     assert verify(store).problems == ()
 
 
@@ -275,7 +275,7 @@ def test_tiles_come_as_patterns_and_each_is_known_by_its_content(site, store, tm
     np.testing.assert_array_equal(tiled.read("height", 0, 60, 0, 60), whole.read("height", 0, 60, 0, 60))
     files = [tmp_path / "east/dem.tif", tmp_path / "west/dem.tif"]
     hashes = [hashlib.sha256(path.read_bytes()).hexdigest() for path in files]
-    assert tiled.facts["inputs"]["files"]["height"] == dict(zip(("east/dem.tif", "west/dem.tif"), hashes, strict=True))
+    assert tiled.facts.inputs.files["height"] == dict(zip(("east/dem.tif", "west/dem.tif"), hashes, strict=True))
     assert "from dem.tif … dem.tif (2 files): 6" in str(added)
     assert add(store, "m", height=files).status == "unchanged"
     assert "the files of height come in another order" in refused(store, "m", height=files[::-1])[0]
@@ -285,7 +285,7 @@ def test_tiles_come_as_patterns_and_each_is_known_by_its_content(site, store, tm
 def test_a_tile_that_a_pattern_names_once_more_lies_where_it_is_named_last(site, store, tmp_path):
     halves(site, tmp_path)
     add(store, "m", height=[str(tmp_path / "*/dem.tif"), tmp_path / "east/dem.tif"])
-    assert list(open_map(store / "maps/m.zarr").facts["inputs"]["files"]["height"]) == ["west/dem.tif", "east/dem.tif"]
+    assert list(open_map(store / "maps/m.zarr").facts.inputs.files["height"]) == ["west/dem.tif", "east/dem.tif"]
 
 
 def test_what_names_no_file_is_said(site, store, tmp_path):

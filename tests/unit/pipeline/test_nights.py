@@ -63,7 +63,7 @@ def test_a_half_copied_log_is_superseded_when_it_is_complete_and_counts_when_it_
         f"run {half}, made from this path before, is superseded: this log holds what it held",
     )
     assert half not in counted(tmp_path)
-    assert inspect(tmp_path / "store", recipe=Recipe())["superseded"] == {half: found["run.mcap"].run_id}
+    assert inspect(tmp_path / "store", recipe=Recipe()).superseded == {half: found["run.mcap"].run_id}
     assert night()[0]["run.mcap"].notes == ()  # said once
     for place in ("run.mcap", "elsewhere.mcap"):  # back where it was, then under another name
         copy_part(whole, tmp_path / "logs" / place, 0.6)

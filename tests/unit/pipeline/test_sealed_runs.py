@@ -112,9 +112,9 @@ def test_a_document_that_is_sealed_and_lacks_something_is_named(store):
 def test_damaged_runs_are_told_by_inspect_and_report(store):
     flip(store.recipes_of("b")[0].path / "manifest.json")
     found = inspect(store.root, recipe=Recipe())
-    assert [run["run_id"] for run in found["runs"]] == ["a", "c", "d"]
-    assert len(found["damaged_runs"]) == 1
-    assert found["unfinished"] == []
+    assert [run.run_id for run in found.runs] == ["a", "c", "d"]
+    assert len(found.damaged_runs) == 1
+    assert found.unfinished == ()
     with pytest.raises(StoreError, match="is not as it was written"):
         report(store.runs_path / "b")
 

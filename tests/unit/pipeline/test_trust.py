@@ -13,6 +13,7 @@ from synthetic_store import WORLD, add_run, box, lanes, region_file, segments, s
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.parquet import write_table
 from tcpipe.formats.record_files import Sighting
@@ -277,7 +278,7 @@ def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
         store.map_path("site"),
         name="site",
         height=made / "rasters" / "height.tif",
-        inputs={"files": {"height": {"height.tif": "another"}}},
+        inputs=MapInputs({"height": {"height.tif": "another"}}),
     )
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
     assert "terrain: map site has no such layer any more" in found
@@ -287,7 +288,7 @@ def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
         store.map_path("site"),
         name="site",
         height=elsewhere["height"],
-        inputs={"files": {"height": {"height.tif": "another"}}},
+        inputs=MapInputs({"height": {"height.tif": "another"}}),
     )
     found = explain(sample, dataset=made / "zarr", store=store.root).differences
     assert found[0] == "map site gives no patch for it any more"

@@ -12,7 +12,8 @@ from physics_model import PhysicsModel
 from planning_worlds import lonlat, plane
 
 from tcpipe.errors import ModelError, PathError, UsageError
-from tcpipe.formats.geojson_lines import read_line, write_lines
+from tcpipe.formats.geojson_lines import line_feature, read_line
+from tcpipe.formats.json_files import write_json
 from tcpipe.planning.cost_map import make_cost_map
 from tcpipe.planning.path_files import predict_path, summary_path
 from tcpipe.planning.plan_files import PlanRequest, plan
@@ -36,8 +37,12 @@ def source() -> StoredMap:
 
 @pytest.fixture
 def path(source, tmp_path: Path) -> Path:
-    write_lines(tmp_path / "path.geojson", [(lonlat(source, (3.0, 12.0), (20.0, 14.0)), {})], {})
+    _write_path(tmp_path / "path.geojson", lonlat(source, (3.0, 12.0), (20.0, 14.0)))
     return tmp_path / "path.geojson"
+
+
+def _write_path(path: Path, points) -> None:
+    write_json(path, {"type": "FeatureCollection", "features": [line_feature(points, {})]})
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet", "json"])
@@ -51,10 +56,10 @@ def test_the_table_is_the_same_in_every_format(source, path, ending):
         "parquet": lambda: pyarrow.parquet.read_table(out).to_pylist(),
         "json": lambda: json.loads(out.read_text())["pieces"],
     }[ending]()
-    assert len(rows) == found.summary["pieces"] == 18
-    assert sum(row["energy_joule"] for row in rows) == pytest.approx(found.summary["energy_joule"], rel=1e-9)
+    assert len(rows) == found.pieces == 18
+    assert sum(row["energy_joule"] for row in rows) == pytest.approx(found.energy_joule, rel=1e-9)
     assert rows[0]["terrain_name"] == "grass"
-    assert json.loads(summary_path(out).read_text())["duration_s"] == found.summary["duration_s"]
+    assert json.loads(summary_path(out).read_text())["duration_s"] == found.duration_s
 
 
 def test_parquet_says_units_and_what_the_bits_mean(source, path):
@@ -71,18 +76,18 @@ def test_a_second_call_does_nothing_until_something_changes(source, path):
     second = predict_path(MODEL, source, path, out)
     assert second.status == "unchanged"
     assert "nothing to do" in str(second)
-    assert second.summary["energy_joule"] == first.summary["energy_joule"]
+    assert second.energy_joule == first.energy_joule
     out.write_text(out.read_text()[:-30])
     assert predict_path(MODEL, source, path, out).status == "done"
     assert predict_path(replace(MODEL, checksum="1" * 64), source, path, out).status == "done"
 
 
 def test_a_path_that_leaves_the_map_is_done_in_part(source, tmp_path):
-    write_lines(tmp_path / "off.geojson", [(lonlat(source, (12.0, 12.0), (30.0, 12.0)), {})], {})
+    _write_path(tmp_path / "off.geojson", lonlat(source, (12.0, 12.0), (30.0, 12.0)))
     found = predict_path(MODEL, source, tmp_path / "off.geojson", None)
     assert found.exit_code == 3
     assert "outside map" in str(found)
-    assert f"without {found.summary['pieces_without_cost']} of {found.summary['pieces']} pieces" in str(found)
+    assert f"without {found.pieces_without_cost} of {found.pieces} pieces" in str(found)
 
 
 def _request(source, **options) -> PlanRequest:
@@ -117,7 +122,7 @@ def test_a_cost_map_gives_the_same_plan_and_one_of_another_model_is_refused(sour
         for name, given in (("with.geojson", costs), ("without.geojson", None))
     ]
     ours, theirs = (found.plans["energy"] for found in plans)
-    assert ours["energy_joule"] == pytest.approx(theirs["energy_joule"], rel=1e-9)
+    assert ours.energy_joule == pytest.approx(theirs.energy_joule, rel=1e-9)
     with pytest.raises(ModelError, match="made from another model or map"):
         plan(
             replace(MODEL, checksum="1" * 64),

@@ -26,11 +26,11 @@ def test_uphill_and_downhill_on_a_plane():
     slope = 0.2 / SCALE  # the map's rise a map metre, over ground metres
     up, down = _cost(source, (2.0, 12.0), (22.0, 12.0)), _cost(source, (22.0, 12.0), (2.0, 12.0))
     metres = 20.0 * SCALE
-    assert up.length_m == pytest.approx(metres, rel=1e-6)
-    assert up.duration_s == pytest.approx(metres / velocity_mps(4, slope), rel=2e-3)
-    assert up.energy_joule == pytest.approx(metres * energy_joule(4, slope), rel=2e-3)
-    assert down.energy_joule == pytest.approx(metres * energy_joule(4, -slope), rel=1e-2)
-    assert down.energy_joule < up.energy_joule
+    assert up.totals.length_m == pytest.approx(metres, rel=1e-6)
+    assert up.totals.duration_s == pytest.approx(metres / velocity_mps(4, slope), rel=2e-3)
+    assert up.totals.energy_joule == pytest.approx(metres * energy_joule(4, slope), rel=2e-3)
+    assert down.totals.energy_joule == pytest.approx(metres * energy_joule(4, -slope), rel=1e-2)
+    assert down.totals.energy_joule < up.totals.energy_joule
 
 
 def test_a_model_of_the_velocity_along_the_surface_takes_longer_for_a_metre_of_the_map():
@@ -40,15 +40,15 @@ def test_a_model_of_the_velocity_along_the_surface_takes_longer_for_a_metre_of_t
         for label in ("fused", "ground")
     )
     longer = np.hypot(1.0, 0.4 / SCALE)  # a metre of the map on the slope
-    assert along.duration_s == pytest.approx(ground.duration_s * longer, rel=2e-3)
-    assert along.energy_joule == pytest.approx(ground.energy_joule * longer, rel=2e-3)
+    assert along.totals.duration_s == pytest.approx(ground.totals.duration_s * longer, rel=2e-3)
+    assert along.totals.energy_joule == pytest.approx(ground.totals.energy_joule * longer, rel=2e-3)
 
 
 def test_the_rest_of_a_path_is_paid_by_its_length():
     source = plane()
     found = _cost(source, (5.0, 5.0), (5.0 + 7.4 / SCALE, 5.0))
     assert found.pieces.num_rows == 8
-    assert found.duration_s == pytest.approx(7.4 / velocity_mps(4, 0.0), rel=1e-4)
+    assert found.totals.duration_s == pytest.approx(7.4 / velocity_mps(4, 0.0), rel=1e-4)
 
 
 def test_each_metre_has_the_class_under_it():
@@ -74,19 +74,19 @@ def test_each_metre_has_the_class_under_it():
 )
 def test_ground_that_training_has_not_seen_is_marked_and_still_costed(changes, reason):
     found = _cost(plane(rise_east=0.2), (4.0, 12.0), (9.0, 12.0), model=replace(MODEL, **changes))
-    assert found.reasons == {str(reason.name).lower(): found.pieces.num_rows}
-    assert found.complete
+    assert found.totals.reasons == {str(reason.name).lower(): found.pieces.num_rows}
+    assert found.totals.complete
 
 
 def test_what_cannot_be_driven_has_no_cost_and_the_lane_beside_it_is_marked():
     source = plane(classes=lambda _, north: np.where(np.abs(north - 12.0) < 0.9, 2, 4))
     through = _cost(source, (12.0, 2.0), (12.0, 22.0))
-    assert 1 <= through.without_cost <= 3
-    assert through.without_cost == through.reasons["not_traversable"]
-    assert not through.complete
+    assert 1 <= through.totals.pieces_without_cost <= 3
+    assert through.totals.pieces_without_cost == through.totals.reasons["not_traversable"]
+    assert not through.totals.complete
     beside = _cost(source, (4.0, 13.1), (20.0, 13.1))
-    assert beside.complete
-    assert beside.reasons["obstacle"] == beside.pieces.num_rows
+    assert beside.totals.complete
+    assert beside.totals.reasons["obstacle"] == beside.pieces.num_rows
 
 
 def test_holes_and_the_map_s_edge_are_told_apart():
@@ -95,23 +95,23 @@ def test_holes_and_the_map_s_edge_are_told_apart():
     found = _cost(source, (4.0, 13.0), (30.0, 13.0))
     names = found.pieces.column("reason_names").to_pylist()
     assert found.pieces.num_rows == len(names) == 27
-    assert found.reasons["nodata"] >= 2
-    assert found.reasons["outside_map"] >= 6
-    assert found.without_cost == found.reasons["nodata"] + found.reasons["outside_map"]
+    assert found.totals.reasons["nodata"] >= 2
+    assert found.totals.reasons["outside_map"] >= 6
+    assert found.totals.pieces_without_cost == found.totals.reasons["nodata"] + found.totals.reasons["outside_map"]
     assert np.isnan(found.pieces.column("energy_joule").to_numpy()[-1])
 
 
 def test_a_bend_sharper_than_any_segment_is_marked_and_paid_along_its_arc():
     found = _cost(plane(), (4.0, 4.0), (8.5, 4.0), (8.5, 8.0))
-    assert found.reasons == {"curved": 1}
-    assert found.length_m == pytest.approx(8.5 * SCALE, rel=1e-4)
+    assert found.totals.reasons == {"curved": 1}
+    assert found.totals.length_m == pytest.approx(8.5 * SCALE, rel=1e-4)
     bent = _cost(plane(), (4.0, 4.0), (8.5, 4.0), (8.5, 8.0), model=replace(MODEL, max_arc_to_chord=1.5))
-    assert bent.reasons == {}, "a model of curved segments knows bends"
+    assert bent.totals.reasons == {}, "a model of curved segments knows bends"
 
 
 def test_without_held_out_samples_there_are_no_intervals():
     found = _cost(plane(), (4.0, 4.0), (9.0, 4.0), model=replace(MODEL, residuals=made_residuals(5)))
-    assert found.energy_interval_joule is None
+    assert found.totals.energy_interval_joule is None
     assert found.pieces.column("energy_low_joule").null_count == found.pieces.num_rows
 
 
@@ -129,7 +129,7 @@ class _EnergyAlone(PhysicsModel):
 
 def test_where_the_model_says_that_nothing_moves_there_is_no_cost():
     found = _cost(plane(), (4.0, 4.0), (12.0, 4.0), model=_Stuck())
-    assert found.reasons == {"no_motion": 2}
+    assert found.totals.reasons == {"no_motion": 2}
     assert np.flatnonzero(np.isnan(found.pieces.column("energy_joule").to_numpy())).tolist() == [3, 4]
 
 

@@ -38,9 +38,9 @@ def test_on_open_ground_of_one_kind_every_objective_is_the_straight_line():
         found = _plan(source, (3.2, 4.1), (26.7, 19.9), objective)
         assert len(found.xy_m) == 2
         straight = np.hypot(23.5, 15.8) / 0.9996
-        assert found.cost.length_m == pytest.approx(straight, rel=1e-5)
+        assert found.totals.length_m == pytest.approx(straight, rel=1e-5)
         np.testing.assert_allclose(found.lonlat_deg, lonlat(source, (3.2, 4.1), (26.7, 19.9)), atol=1e-9)
-    assert found.predicted_cells == 0
+    assert found.totals.predicted_cells == 0
 
 
 def test_the_way_round_a_wall_keeps_off_it():
@@ -48,9 +48,9 @@ def test_the_way_round_a_wall_keeps_off_it():
     corner = np.array([(13.5, 22.0), (16.5, 22.0)]) + np.array([500_000.0, 5_200_000.0 - 30.0])
     points = np.concatenate([found.xy_m[:1], corner, found.xy_m[-1:]])
     least = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
-    assert least <= found.cost.length_m < least + 4.0
-    assert found.cost.complete
-    assert "obstacle" not in found.cost.reasons
+    assert least <= found.totals.length_m < least + 4.0
+    assert found.totals.complete
+    assert "obstacle" not in found.totals.reasons
 
 
 def test_the_fast_road_is_taken_for_time_and_the_ellipse_grows_to_find_it():
@@ -61,8 +61,10 @@ def test_the_fast_road_is_taken_for_time_and_the_ellipse_grows_to_find_it():
     assert found.xy_m[:, 1].max() > 5_200_000.0 - 36.0 + 24.0
     x = np.linspace(0.01, 14.99, 2000)
     best = (2.0 * np.hypot(x, 2.0) / slow + (30.0 - 2.0 * x) / fast).min() / 0.9996
-    assert best * 0.98 < found.cost.duration_s < best * 1.03
-    assert found.cost.duration_s < _plan(source, (3.0, 22.0), (33.0, 22.0), "distance", survey=survey).cost.duration_s
+    assert best * 0.98 < found.totals.duration_s < best * 1.03
+    assert (
+        found.totals.duration_s < _plan(source, (3.0, 22.0), (33.0, 22.0), "distance", survey=survey).totals.duration_s
+    )
 
 
 def test_looking_at_less_of_the_map_finds_the_same_path():
@@ -73,7 +75,7 @@ def test_looking_at_less_of_the_map_finds_the_same_path():
         lazy = new_survey(MODEL, source, 1.0)
         one, other = (_plan(source, (4.0, 10.0), (16.0, 12.0), objective, survey=survey) for survey in (lazy, whole))
         np.testing.assert_array_equal(one.xy_m, other.xy_m)
-        assert one.predicted_cells < 0.7 * other.predicted_cells
+        assert one.totals.predicted_cells < 0.7 * other.totals.predicted_cells
 
 
 def test_a_road_out_of_sight_is_found_without_a_cost_map(caplog):
@@ -83,9 +85,9 @@ def test_a_road_out_of_sight_is_found_without_a_cost_map(caplog):
     with caplog.at_level("INFO", "tcpipe"):
         found = _plan(source, (6.0, 22.0), (66.0, 22.0), "energy", model=model, survey=lazy)
     straight, metres = energy_joule(7, 0.0) * 60.0, 60.0 / 0.9996
-    assert found.cost.length_m > 1.03 * metres
-    assert found.cost.energy_joule < 0.95 * straight
-    assert found.predicted_cells < 0.5 * lazy.predicted.size
+    assert found.totals.length_m > 1.03 * metres
+    assert found.totals.energy_joule < 0.95 * straight
+    assert found.totals.predicted_cells < 0.5 * lazy.predicted.size
     ground, first, *rest = caplog.messages
     assert ground.startswith("looking at the ground of")
     assert "without --cost-map" in first
@@ -119,7 +121,7 @@ def test_no_way_says_what_would_open_one():
     with pytest.raises(PathError, match="--allow-unseen crosses it"):
         _plan(mud, (4.0, 4.0), (20.0, 4.0), "distance", model=grass_only)
     found = _plan(mud, (4.0, 4.0), (20.0, 4.0), "time", model=grass_only, allow_unseen=True)
-    assert found.cost.reasons["class_not_seen"] >= 3
+    assert found.totals.reasons["class_not_seen"] >= 3
 
 
 def test_an_end_on_ground_that_is_not_known_says_so_before_all_the_map_is_looked_at():
@@ -135,9 +137,9 @@ def test_a_model_that_takes_no_classes_keeps_to_what_the_map_s_own_allow():
     source = plane(30.0, classes=_wall)
     model = replace(MODEL, channels=("height",), classes=ClassTable((TerrainClass(1, "all", traversable=True),)))
     found = _plan(source, (4.0, 4.0), (26.0, 4.0), "time", model=model)
-    assert found.cost.complete
-    assert found.cost.length_m > 40.0
-    assert set(found.cost.reasons) <= {"curved"}
+    assert found.totals.complete
+    assert found.totals.length_m > 40.0
+    assert set(found.totals.reasons) <= {"curved"}
 
 
 def test_a_model_of_heights_alone_needs_no_other_layer_and_its_plans_can_be_drawn(tmp_path):

@@ -320,7 +320,7 @@ def test_a_rasters_own_class_names_say_what_its_values_mean(tmp_path, as_categor
     wanted = np.zeros(50, np.uint8)
     wanted[[4, 10, 11]] = 5, 4, 7
     assert found.tolist() == wanted.tolist()
-    assert source.facts["classes_from"] == "names"
+    assert source.facts.classes_from == "names"
     assert any("12 (water)" in note or "values 0, 1, 2" in note for note in summary.warnings)
 
 
@@ -334,7 +334,7 @@ def test_names_that_the_class_table_lacks_are_not_guessed(tmp_path):
     (tmp_path / "c.csv").write_text("value,id,name,traversable\n4,1,meadow,yes\n")
     _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path, classes=tmp_path / "c.csv")
     assert source.read("terrain", 5, 6, 36, 37).tolist() == [[1]]
-    assert source.facts["classes_from"] == "file"
+    assert source.facts.classes_from == "file"
 
 
 def test_attribute_tables_without_names_or_with_ranges_leave_values_as_ids(tmp_path):
@@ -342,7 +342,7 @@ def test_attribute_tables_without_names_or_with_ranges_leave_values_as_ids(tmp_p
     path = named_raster(tmp_path, {4: "", 5: ""})
     _, source = built(tmp_path, height=tmp_path / "h.tif", terrain=path)
     assert source.read("terrain", 5, 6, 0, 400)[0, 4::8].tolist() == [0, *range(1, 8), *[0] * 42]
-    assert source.facts["classes_from"] == "default"
+    assert source.facts.classes_from == "default"
 
 
 def test_palette_indices_are_class_values_and_what_is_transparent_is_nodata(tmp_path):
@@ -482,8 +482,8 @@ ODDITIES = {
 def test_odd_rasters_of_others_as_height(tmp_path, name):
     path, wanted = shared_data(f"rasters/{name}"), ODDITIES[name]
     if wanted is None:
-        summary, _ = built(tmp_path, height=path)
-        assert summary.grid.crs.startswith("EPSG:326")
+        _, source = built(tmp_path, height=path)
+        assert source.grid.crs.startswith("EPSG:326")
     else:
         with pytest.raises(MapError, match=wanted) as caught:
             built(tmp_path, height=path)
@@ -521,8 +521,8 @@ def test_odd_rasters_of_others_as_ortho(tmp_path, name):
 def test_the_map_of_a_real_site(tmp_path):
     site = shared_data("warthog_grass_a")
     layers = {name: site / f"{name}.tif" for name in ("height", "ortho", "terrain")}
-    summary, source = built(tmp_path, **layers)
-    assert (summary.grid.crs, summary.grid.pitch_m, summary.grid.rows) == ("EPSG:32750", 0.25, 400)
+    _, source = built(tmp_path, **layers)
+    assert (source.grid.crs, source.grid.pitch_m, source.grid.rows) == ("EPSG:32750", 0.25, 400)
     with rasterio.open(layers["height"]) as dataset:
         original = dataset.read(1, masked=True)
     np.testing.assert_allclose(heights(source), original.filled(np.nan), atol=1e-5)

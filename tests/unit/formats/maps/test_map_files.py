@@ -12,12 +12,23 @@ from map_worlds import World
 
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.building import build_map
+from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
 from tcpipe.formats.seals import write_checksums
 from tcpipe.terrain.classes import PAPER_SCHEME
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import paper_layers
 
+FACTS = MapFacts(
+    sources={},
+    covered={},
+    height_min_m=0.0,
+    height_max_m=0.0,
+    class_share={},
+    warnings=(),
+    classes_from="default",
+    inputs=MapInputs(),
+)
 WORLD = World("EPSG:31256", -68_000.0, 215_000.0, side_m=20.0)
 
 
@@ -60,11 +71,11 @@ def test_gdal_opens_each_layer_in_its_place(path):
 def test_an_open_map_knows_what_it_is(path):
     source = open_map(path)
     assert (source.name, tuple(source.layers), source.classes.count) == ("garden", ("height", "ortho", "terrain"), 7)
-    assert source.facts["sources"] == {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif"}
+    assert source.facts.sources == {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif"}
     assert source.read("height", 3, 5, 7, 11).shape == (2, 4)
-    summary = json.loads(json.dumps(source.summary()))
-    assert (summary["crs"], summary["rows"], summary["pitch_m"]) == (WORLD.crs, 200, 0.1)
-    assert summary["covered"] == {"height": 1.0, "ortho": 1.0, "terrain": 1.0}
+    summary = source.summary()
+    assert (summary.crs, summary.rows, summary.pitch_m) == (WORLD.crs, 200, 0.1)
+    assert summary.covered == {"height": 1.0, "ortho": 1.0, "terrain": 1.0}
 
 
 def test_overviews_are_maps_of_the_same_ground(path):
@@ -97,7 +108,7 @@ def test_overviews_across_shards_have_no_seam(tmp_path):
         for col in (0, SHARD_PX):
             for layer, values in (("height", height), ("terrain", ids)):
                 writer.write(layer, row, col, values[row : row + SHARD_PX, col : col + SHARD_PX])
-    writer.finish({}, layers)
+    writer.finish(FACTS, layers)
     write_checksums(tmp_path / "m.zarr")
     for factor in (2, 32):
         level, side = open_map(tmp_path / "m.zarr").at(factor), 2100 // factor

@@ -1,0 +1,132 @@
+"""What an evaluation found, ``evaluation.json``: errors by split, quantity and class, beside what the labels' own noise allows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias, TypedDict
+
+from tcpipe.balance.repeats import Floor
+from tcpipe.learning.metrics import Errors
+from tcpipe.learning.model_card import Training
+from tcpipe.tables.findings import ABSENT
+
+KIND = "tcpipe evaluation"
+
+SPLITS = ("test", "unseen")
+
+ErrorsByClass: TypeAlias = Mapping[str, Mapping[str, Errors]]
+"""By quantity, then by the name of a class, or `tcpipe.learning.metrics.ALL`."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluateConfig:
+    """How much is evaluated."""
+
+    draws: int = 5
+    """Draws of noise that each ablated input set is the mean of."""
+    baselines: bool = True
+    """Train the networks of Wei & Isler."""
+    retrain: bool = False
+    """Train a network for each input set of the ablation, too."""
+    seed: int = 0
+    """Of the noise."""
+    plotted: int = 21
+    """Patches a class in the pictures."""
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedModel:
+    """Which model was evaluated."""
+
+    name: str
+    checksum: str
+    training: Training
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedDataset:
+    """On which dataset."""
+
+    name: str
+    sha256: str
+    """Over the checksums of its files."""
+    samples: Mapping[str, int]
+    """By split."""
+
+
+@dataclass(frozen=True, slots=True)
+class SplitErrors:
+    """Tables I and II of one split, and what its labels' deviations, or the simulator, allow."""
+
+    samples: int
+    classes: Mapping[str, int]
+    """Samples by the name of their class."""
+    class_order: tuple[str, ...]
+    errors: ErrorsByClass
+    label_floor: ErrorsByClass
+    simulation_floor: ErrorsByClass | None = field(default=None, metadata=ABSENT)
+    """Of what can be predicted at best where the samples were simulated."""
+
+    @property
+    def floors(self) -> dict[str, ErrorsByClass]:
+        """Return what an error can hardly be less than, by its key."""
+        simulated = {} if self.simulation_floor is None else {"simulation_floor": self.simulation_floor}
+        return {"label_floor": self.label_floor, **simulated}
+
+
+@dataclass(frozen=True, slots=True)
+class AblationRow:
+    """A row of table III: layers that are left, how the others went, and the errors on each split by quantity."""
+
+    layers: tuple[str, ...]
+    how: Literal["noise", "retrained"]
+    test: Mapping[str, Errors] | None = field(default=None, metadata=ABSENT)
+    unseen: Mapping[str, Errors] | None = field(default=None, metadata=ABSENT)
+
+    def on(self, split: str) -> Mapping[str, Errors]:
+        """Return the errors on a split that was evaluated."""
+        return (self.test if split == "test" else self.unseen) or {}
+
+
+Plotted = TypedDict(  # a dataclass has no field called class
+    "Plotted",
+    {
+        "class": list[str],
+        "E_measured": list[float | None],
+        "T_measured": list[float | None],
+        "E_predicted": list[float | None],
+        "T_predicted": list[float | None],
+    },
+)
+"""Measured and predicted E [J] and T [s] of some samples of every class."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evaluation:
+    """All of evaluation.json."""
+
+    kind: str = KIND
+    schema_version: int = 1
+    tcpipe_version: str
+    key: str
+    """Hash of model, dataset and options: the same key, the same evaluation."""
+    model: EvaluatedModel
+    dataset: EvaluatedDataset
+    config: EvaluateConfig
+    splits: Mapping[str, SplitErrors]
+    ablation: tuple[AblationRow, ...]
+    energy: Mapping[str, Mapping[str, Errors]]
+    """Table IV: errors of E by predictor and split."""
+    time: Mapping[str, Mapping[str, Errors]]
+    """Table V: errors of T by predictor and split."""
+    repeatability: Mapping[str, Floor | None]
+    """How well each label repeats itself where ground was driven twice; None where none was."""
+    warnings: tuple[str, ...]
+    plots: Mapping[str, Plotted]
+    """By split."""
+
+    @property
+    def ordered_splits(self) -> list[str]:
+        """Return the splits that were evaluated, in the paper's order."""
+        return [split for split in SPLITS if split in self.splits]
