@@ -137,11 +137,12 @@ def sample_tiles(tiles: Tiles, ground: Ground, chosen: NDArray[np.int64], out: S
             if not whole:
                 _mark_classed(classes, good)
         count = whole_patch if whole else int(good.sum())
+        if count < whole_patch:
+            _fill_gaps(rise, good)
+        lowest, clipped = _store_height(rise, ground.step_m, heights)
         if count == whole_patch:
-            lowest, clipped = _store_height(rise, ground.step_m, heights)
             along, left = _slopes(rise, side)
         else:
-            lowest, clipped = _store_good_height(rise, good, ground.step_m, heights)
             along, left = _good_slopes(rise, good, side)
             _clear(out, n, good)
         entry, share = np.int64(0), 0.0
@@ -399,22 +400,16 @@ def _store_height(rise: NDArray[np.float32], step_m: float, out: NDArray[np.uint
 
 
 @kernel
-def _store_good_height(
-    rise: NDArray[np.float32], good: NDArray[np.uint8], step_m: float, out: NDArray[np.uint16]
-) -> tuple[np.float32, int]:
-    """Store heights as `_store_height` does, of good pixels alone."""
-    lowest, clipped = np.float32(np.inf), 0
+def _fill_gaps(rise: NDArray[np.float32], good: NDArray[np.uint8]) -> None:
+    """Set heights without data to the smallest that has some, 0 where none has: it stays the smallest, and none of them is high."""
+    lowest = np.float32(np.inf)
     for k in range(rise.size):
         if good[k]:
             lowest = min(lowest, rise[k])
     lowest = lowest if np.isfinite(lowest) else np.float32(0.0)
     for k in range(rise.size):
-        out[k] = HEIGHT_NODATA
-        if good[k]:
-            above = rise[k] - lowest
-            clipped += above > np.float32(1.0)
-            out[k] = np.uint16(min(above * np.float32(1.0 / step_m) + np.float32(0.5), np.float32(HEIGHT_NODATA - 1)))
-    return lowest, clipped
+        if not good[k]:
+            rise[k] = lowest
 
 
 @kernel
@@ -423,6 +418,7 @@ def _clear(out: Stacks, n: int, good: NDArray[np.uint8]) -> None:
     for k in range(good.size):
         if not good[k]:
             row, col = k // out.relative.shape[1], k % out.relative.shape[1]
+            out.relative[n, row, col] = HEIGHT_NODATA
             out.floats[:, n, row, col] = np.nan
             out.greys[:, n, row, col] = 0
             out.classes[:, n, row, col] = 0
