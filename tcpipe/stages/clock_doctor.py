@@ -21,6 +21,7 @@ from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
 _FINE_S = 0.004
+_TURNED_OVER_M = 1.0
 
 
 def clock_findings(streams: Streams, inputs: FusionInputs) -> Findings[ClockFacts]:
@@ -39,7 +40,14 @@ def clock_findings(streams: Streams, inputs: FusionInputs) -> Findings[ClockFact
         if offset.drifts or offset.noted:
             warnings.append(_said(found, role, offset, entry))
     pairs = tuple(ClockPair(**_told(pair), determined=pair.determined) for pair in found.pairs)
-    facts = ClockFacts(epoch, found.reference, pairs, offsets, position_offset_s=found.position_offset_s or None)
+    facts = ClockFacts(
+        epoch,
+        found.reference,
+        pairs,
+        offsets,
+        position_offset_s=found.position_offset_s or None,
+        heading_offset_s=found.heading_offset_s or None,
+    )
     return Findings(tuple(warnings), facts)
 
 
@@ -86,13 +94,18 @@ def _means(found: ClockOffsets, role: str) -> str:
 
 
 def with_offset_cost(track: pa.Table, clocks: ClockFacts) -> pa.Table:
-    """Return the track with what an unresolved offset of the fixes' clock costs: the way driven in it, in the positions' deviations."""
-    offset_s = clocks.position_offset_s
-    if not offset_s:
+    """Return the track with what an unresolved offset costs, in the positions' deviations.
+
+    Of the fixes' clock the way that is driven in it; of the IMU's what it turns in it, over the metre in which the fixes set that right.
+    """
+    driven_s, turned_s = clocks.position_offset_s or 0.0, clocks.heading_offset_s or 0.0
+    if not (driven_s or turned_s):
         return track
+    aside_m = turned_s * _TURNED_OVER_M * floats(track, "yaw_rate_radps")
     for axis, name in zip("xyz", ("east", "north", "up"), strict=True):
         column = f"{axis}_std_m"
-        raised = np.hypot(floats(track, column), offset_s * floats(track, f"{name}_velocity_mps"))
+        lost_m = np.hypot(driven_s * floats(track, f"{name}_velocity_mps"), aside_m if axis != "z" else 0.0)
+        raised = np.hypot(floats(track, column), lost_m)
         track = track.set_column(track.column_names.index(column), track.schema.field(column), pa.array(raised))
     return track
 

@@ -85,9 +85,13 @@ def _gap_edges(rows: pa.Table, rate_hz: float) -> NDArray[np.bool_]:
 def clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     """Return whether a clock of the run stepped or is noted as off, or motion or power had to be stamped with the time of the recorder.
 
+    What an IMU's little offset costs is in the positions' deviations.
     Commands are left out: they mostly have no stamp of their own, and a label does not depend on theirs.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
     clocks = info.findings.facts.clock_offsets
-    off = clocks is not None and any(offset.noted or offset.drifts for offset in clocks.offsets.values())
+    off = clocks is not None and any(
+        (offset.noted or offset.drifts) and not (role == "imu" and clocks.heading_offset_s)
+        for role, offset in clocks.offsets.items()
+    )
     return recorder or off or streams.findings.facts.epochs > 1

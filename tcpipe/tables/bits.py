@@ -52,7 +52,7 @@ class Quality(IntFlag):
     VOLTAGE_OUT_OF_RANGE = 1 << 7
     """The voltage leaves the range of the robot profile."""
     CLOCK_DOUBTFUL = 1 << 8
-    """A clock of the segment's run stepped, drifts or seems constantly off, or the recorder's time had to be used."""
+    """A clock of the segment's run stepped, drifts or seems off (an IMU's by more than 0.15 s), or the recorder's time had to be used."""
     PHYSICS_OUTLIER = 1 << 9
     """The power is more than four robust standard deviations from what rolling resistance and grade, fitted on the run, predict."""
     NOT_AT_LIMIT = 1 << 10

@@ -237,7 +237,8 @@ class ClockOffset:
 class ClockFacts:
     """The sensors' clocks in one epoch: all pairs compared, and by role each one's offset from the reference.
 
-    ``position_offset_s`` times the velocity is in the track's position deviations: by so much the fixes' clock may be off [s].
+    ``position_offset_s`` times the velocity is in the track's position deviations: by so much the fixes' clock may be off [s]. So is
+    ``heading_offset_s`` times the yaw rate, over a metre: the IMU's clock is off by that, and labels rest on the others'.
     """
 
     epoch: int
@@ -245,6 +246,7 @@ class ClockFacts:
     pairs: tuple[ClockPair, ...]
     offsets: Mapping[str, ClockOffset]
     position_offset_s: float | None = field(default=None, metadata=LEFT_OUT)
+    heading_offset_s: float | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -78,7 +78,9 @@ def test_a_short_drive_says_what_it_cannot_tell(tmp_path):
 def test_what_an_offset_costs_is_the_way_driven_in_it():
     """0.2 s at 0.6 m/s east and 0.8 m/s north: 0.12 and 0.16 m, beside 0.05 m that were claimed."""
     velocity, std = {"east": 0.6, "north": 0.8, "up": 0.0}, dict.fromkeys("xyz", 0.05)
-    columns = {f"{axis}_velocity_mps": [value, -value] for axis, value in velocity.items()}
+    columns = {f"{axis}_velocity_mps": [value, -value] for axis, value in velocity.items()} | {
+        "yaw_rate_radps": [0.0, 1.2]
+    }
     track = pa.table(columns | {f"{axis}_std_m": [value] * 2 for axis, value in std.items()})
     facts = ClockFacts(0, "imu", (), {}, position_offset_s=0.2)
     found = with_offset_cost(track, facts)
@@ -86,3 +88,6 @@ def test_what_an_offset_costs_is_the_way_driven_in_it():
     assert found.column("y_std_m").to_pylist() == pytest.approx([(0.16**2 + 0.05**2) ** 0.5] * 2)
     assert found.column("z_std_m").to_pylist() == [0.05, 0.05]
     assert with_offset_cost(track, replace(facts, position_offset_s=None)) is track
+    turned = with_offset_cost(track, replace(facts, position_offset_s=None, heading_offset_s=0.1))
+    assert turned.column("x_std_m").to_pylist() == pytest.approx([0.05, 0.13])  # 1.2 rad/s for 0.1 s, over a metre
+    assert turned.column("z_std_m").to_pylist() == [0.05, 0.05]

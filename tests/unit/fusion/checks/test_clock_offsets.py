@@ -106,6 +106,22 @@ def test_what_the_clock_of_the_fixes_may_be_off_by_is_a_cost_of_positions():
     assert _settled((pair("imu", "wheel_odometry", 0.1),)).position_offset_s == 0.0
 
 
+def test_a_gyroscope_that_is_a_little_late_is_a_matter_of_the_heading():
+    def found(offset_s):
+        turning = {"by": "yaw rate"}
+        pairs = (
+            pair("wheel_odometry", "imu", -offset_s, **turning),
+            pair("visual_odometry", "imu", -offset_s, **turning),
+        )
+        return _settled((*pairs, pair("visual_odometry", "wheel_odometry", 0.0)))
+
+    assert found(0.1).heading_offset_s == pytest.approx(0.1)
+    assert found(0.3).heading_offset_s == found(0.01).heading_offset_s == 0.0
+    assert (
+        _settled((pair("wheel_odometry", "imu", -0.1, by="yaw rate"),)).heading_offset_s == 0.0
+    )  # who is late is not known
+
+
 HALF_HOUR = np.arange(0.0, 1900.0, 0.04)
 
 
