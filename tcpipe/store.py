@@ -99,10 +99,6 @@ class RunDirectory:
         """Read the labelled segments (schema LABELLED_SEGMENTS)."""
         return self.table("segments")
 
-    def labelled_segments(self) -> LabelledSegments:
-        """Read the labelled segments as a checked level, with the run's info and ledger."""
-        return LabelledSegments(self.segments(), self.manifest.info, self.manifest.ledger_m)
-
     def track(self) -> GatedTrack:
         """Read the gated track as a checked level."""
         return GatedTrack(self.table("track"), self.manifest.info)

@@ -32,7 +32,7 @@ _WINDS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class MapGround:
     """Cells of a map, (R, C), row 0 in the north: class id or `CLOSED`, and gradient (metres up a metre east and north), (R, C, 2).
 
     ``x_min_m`` and ``y_max_m`` are the outer corner of cell (0, 0), ``cell_m`` its side. ``up`` and ``down`` are the ranges of slope of its
@@ -73,7 +73,7 @@ class Patch:
     polygon: BaseGeometry
 
 
-def offered(ground: Ground, terrain_class: int, slope: int) -> NDArray[np.bool_]:
+def offered(ground: MapGround, terrain_class: int, slope: int) -> NDArray[np.bool_]:
     """Return which cells offer a class and a range of slope, (R, C): a cell offers the two slopes of its fall line."""
     found: NDArray[np.bool_] = (ground.terrain_class == terrain_class) & (
         (ground.up if _sign(slope) > 0 else ground.down) == slope
@@ -81,7 +81,7 @@ def offered(ground: Ground, terrain_class: int, slope: int) -> NDArray[np.bool_]
     return found
 
 
-def thin_ground(ground: Ground, terrain_class: int, slope: int, driven_xy_m: Floats) -> Iterator[Patch]:
+def thin_ground(ground: MapGround, terrain_class: int, slope: int, driven_xy_m: Floats) -> Iterator[Patch]:
     """Yield the patches of connected ground that offers a class and a range of slope and was not driven so, the largest first.
 
     Parameters
@@ -118,7 +118,7 @@ def _largest(free: NDArray[np.bool_]) -> list[tuple[Ints, Ints]]:
     return [(part // free.shape[1], part % free.shape[1]) for part in parts]
 
 
-def _patch(ground: Ground, row: Ints, col: Ints, terrain_class: int, slope: int) -> Patch:
+def _patch(ground: MapGround, row: Ints, col: Ints, terrain_class: int, slope: int) -> Patch:
     boxes = shapely.box(col, -row - 1, col + 1, -row)  # in whole cells: edges that meet are equal
     corner_m = np.array([ground.x_min_m, ground.y_max_m])
     polygon = shapely.transform(shapely.union_all(boxes), lambda cells: corner_m + cells * ground.cell_m)

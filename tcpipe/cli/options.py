@@ -43,7 +43,6 @@ SEED = click.IntRange(0, 2**32 - 1)
 """What every generator of random numbers takes."""
 OUTPUT_DIRECTORY = Place(places.output_directory, written=True)
 OUTPUT_FILE = Place(places.output_file, written=True)
-INPUT = Place(places.input_path)
 INPUT_FILE = Place(places.input_file)
 INPUT_DIRECTORY = Place(places.input_directory)
 LOG = Place(places.input_path, urls=True)

@@ -82,14 +82,6 @@ def read_row_group(path: Path, group: int, columns: list[str]) -> pa.Table:
         raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
 
 
-def row_count(path: Path) -> int:
-    """Return the number of rows of a Parquet file from its footer."""
-    try:
-        return int(pq.read_metadata(path).num_rows)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
-
-
 def column_names(path: Path) -> list[str]:
     """Return the names of the columns of a Parquet file from its footer."""
     return list(read_schema(path).names)

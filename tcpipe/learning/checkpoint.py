@@ -20,7 +20,7 @@ _STATE = "state"
 
 
 @dataclass(slots=True)
-class Progress:
+class TrainingProgress:
     """Losses so far; ``best_epoch`` counts from 1, as does ``epoch``."""
 
     key: str
@@ -32,14 +32,16 @@ class Progress:
     """Epoch, loss, loss of the held-out fold."""
 
 
-def write_checkpoint(path: Path, progress: Progress, parts: Mapping[str, Mapping[str, NDArray[np.generic]]]) -> None:
+def write_checkpoint(
+    path: Path, progress: TrainingProgress, parts: Mapping[str, Mapping[str, NDArray[np.generic]]]
+) -> None:
     """Write where training stands and its weights, whole or not at all."""
     state = np.frombuffer(json.dumps(asdict(progress)).encode(), np.uint8)  # keeps what is infinite or not a number
     arrays = {f"{part}/{name}": array for part, named in parts.items() for name, array in named.items()}
     write_arrays(path, {_STATE: state, **arrays})
 
 
-def read_checkpoint(path: Path, key: str) -> tuple[Progress, dict[str, Arrays]]:
+def read_checkpoint(path: Path, key: str) -> tuple[TrainingProgress, dict[str, Arrays]]:
     """Return what `write_checkpoint` wrote.
 
     Raises
@@ -63,10 +65,10 @@ def read_checkpoint(path: Path, key: str) -> tuple[Progress, dict[str, Arrays]]:
     return progress, dict(parts)
 
 
-def _progress(found: Any) -> Progress:
-    """Return what was saved of a `Progress`; ValueError, TypeError or KeyError where it is none."""
+def _progress(found: Any) -> TrainingProgress:
+    """Return what was saved of a `TrainingProgress`; ValueError, TypeError or KeyError where it is none."""
     history = [(int(epoch), float(loss), float(held)) for epoch, loss, held in found["history"]]
-    made = Progress(**{**found, "best_loss": float(found["best_loss"]), "history": history})
+    made = TrainingProgress(**{**found, "best_loss": float(found["best_loss"]), "history": history})
     if [row[0] for row in history] != list(range(1, made.epoch + 1)) or made.best_epoch not in range(made.epoch + 1):
         raise ValueError(made)
     return made

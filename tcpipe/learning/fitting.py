@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
 from tcpipe.errors import ModelError
-from tcpipe.learning.checkpoint import Arrays, Progress, read_checkpoint, write_checkpoint
+from tcpipe.learning.checkpoint import Arrays, TrainingProgress, read_checkpoint, write_checkpoint
 from tcpipe.learning.keras_backend import load_keras
 from tcpipe.learning.losses import Loss, keras_loss, loss_factors, mean_loss
 from tcpipe.learning.network import Architecture, named_weights, resnet18
@@ -80,7 +80,7 @@ class Fitted:
 
     network: Any
     scale: tuple[float, ...]
-    progress: Progress
+    progress: TrainingProgress
     spent: Spent
 
 
@@ -107,7 +107,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
     network = resnet18(shape, seed=config.seed, start=start.tolist())
     network.compile(keras.optimizers.Adam(config.learning_rate), loss=keras_loss(factors))
     network.optimizer.build(network.trainable_variables)
-    progress = Progress(key)
+    progress = TrainingProgress(key)
     best: Arrays = named_weights(network)
     if checkpoint.exists():
         progress, parts = read_checkpoint(checkpoint, key)
@@ -208,7 +208,7 @@ def _restore(network: Any, parts: dict[str, Arrays], checkpoint: Path) -> None:
     )
 
 
-def _say(name: str, progress: Progress, config: FitConfig, spent: Spent) -> None:
+def _say(name: str, progress: TrainingProgress, config: FitConfig, spent: Spent) -> None:
     epoch, loss, held = progress.history[-1]
     logger.info(
         "%s: epoch %d of at most %d: loss %.4f, held-out fold %.4f (best %.4f in epoch %d); %.0f samples/s, %.1f %% of the time feeding",

@@ -17,7 +17,7 @@ from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
-from tcpipe.learning.checkpoint import Progress, read_checkpoint
+from tcpipe.learning.checkpoint import TrainingProgress, read_checkpoint
 from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
 from tcpipe.learning.keras_backend import device_name
 from tcpipe.learning.model_card import KIND, ModelCard, Seen, TrainedOn, Training, is_current
@@ -302,7 +302,7 @@ def class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _told(task: Task, config: FitConfig, progress: Progress, key: str) -> Training:
+def _told(task: Task, config: FitConfig, progress: TrainingProgress, key: str) -> Training:
     """Return what a model card tells of its training."""
     return Training(
         key=key,

@@ -34,7 +34,7 @@ _LAGS_M: Floats = 2.0 ** np.arange(13.0)
 
 
 @dataclass(frozen=True, slots=True)
-class Errors:
+class RelativeErrors:
     """Relative errors of one quantity: truth over prediction, less one.
 
     Attributes
@@ -72,7 +72,7 @@ class Errors:
         return float(np.sqrt(max(pairs[0] + 2.0 * float(pairs[1:] @ correlation[1:]), 0.0)))
 
 
-def errors_of(residuals: Mapping[str, NDArray[np.generic]]) -> dict[str, Errors] | None:
+def errors_of(residuals: Mapping[str, NDArray[np.generic]]) -> dict[str, RelativeErrors] | None:
     """Return the errors of ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
 
     Parameters
@@ -98,7 +98,7 @@ def errors_of(residuals: Mapping[str, NDArray[np.generic]]) -> dict[str, Errors]
 
 def _errors(
     error: Floats, class_id: NDArray[np.int64], first: NDArray[np.int64], second: NDArray[np.int64], lag_m: Floats
-) -> Errors:
+) -> RelativeErrors:
     tails = (1.0 - COVERAGE) / 2.0
     mean, low, high = (np.full(256, value) for value in (error.mean(), *np.quantile(error, (tails, 1.0 - tails))))
     spread = np.full(256, error.std())
@@ -109,7 +109,7 @@ def _errors(
             low[number], high[number] = np.quantile(own, (tails, 1.0 - tails))
     low, high = np.minimum(low, mean), np.maximum(high, mean)
     standard = (error - mean[class_id]) / np.where(spread[class_id] > 0.0, spread[class_id], 1.0)
-    return Errors(mean, low, high, _LAGS_M, _correlation(standard[first] * standard[second], lag_m))
+    return RelativeErrors(mean, low, high, _LAGS_M, _correlation(standard[first] * standard[second], lag_m))
 
 
 def _correlation(products: Floats, lag_m: Floats) -> Floats:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,20 +71,6 @@ def waves(seed: int, *, count: int, total: float, wavelength_m: tuple[float, flo
         )
         for _ in range(count)
     )
-
-
-class Region(Protocol):
-    """A part of the ground with one class."""
-
-    @property
-    def class_id(self) -> int:
-        """Terrain class inside."""
-
-    def depth_m(self, u: Float, v: Float) -> Float:
-        """Return about how far (u, v) lies inside [m]; positive inside, zero exactly on the border."""
-
-    def may_touch(self, box: tuple[float, float, float, float]) -> bool:
-        """Return False only where no point of the box (u0, v0, u1, v1) is nearer than a metre."""
 
 
 @dataclass(frozen=True, slots=True)

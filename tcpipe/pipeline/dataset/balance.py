@@ -24,7 +24,16 @@ from tcpipe.balance.cells import (
 )
 from tcpipe.balance.correlation import correlations, residuals
 from tcpipe.balance.repeats import Floor, repeatability, repeated_pairs
-from tcpipe.balance.thin_ground import CELL_M, CLOSED, Ground, Patch, cell_classes, cell_gradients, offered, thin_ground
+from tcpipe.balance.thin_ground import (
+    CELL_M,
+    CLOSED,
+    MapGround,
+    Patch,
+    cell_classes,
+    cell_gradients,
+    offered,
+    thin_ground,
+)
 from tcpipe.formats.dataset_card import Balance, CellRow
 from tcpipe.formats.geojson import Feature, FeatureCollection, PolygonGeometry
 from tcpipe.formats.maps.map_files import MapFile
@@ -198,7 +207,7 @@ def _bounds_in(source: MapFile, crs: CRS) -> tuple[float, float, float, float]:
     return found
 
 
-def _close(ground: Ground, taken: Sequence[BaseGeometry]) -> None:
+def _close(ground: MapGround, taken: Sequence[BaseGeometry]) -> None:
     """Close the cells that any of the areas reaches into."""
     rows, cols = np.nonzero(ground.terrain_class != CLOSED)
     x_m, y_m = ground.x_min_m + (cols + 0.5) * ground.cell_m, ground.y_max_m - (rows + 0.5) * ground.cell_m
@@ -209,7 +218,7 @@ def _close(ground: Ground, taken: Sequence[BaseGeometry]) -> None:
         ground.terrain_class[rows[inside], cols[inside]] = CLOSED
 
 
-def _ground(source: MapFile) -> Ground:
+def _ground(source: MapFile) -> MapGround:
     """Read the cells of a map from its coarsest level, strip by strip."""
     level = source.at(source.factors[-1]) if len(source.factors) > 1 else source
     grid = level.grid
@@ -228,7 +237,7 @@ def _ground(source: MapFile) -> Ground:
         classes.append(np.where(known, kinds, np.int16(CLOSED)))
         gradients.append(gradient)
     shape = (0, grid.cols // pixels)
-    return Ground(
+    return MapGround(
         np.concatenate([np.empty(shape, np.int16), *classes]),
         np.concatenate([np.empty((*shape, 2)), *gradients]),
         grid.x_min_m,

@@ -48,7 +48,7 @@ CARD_COLUMNS = ("run_id", "robot", "split", "fold", "terrain_name", "quality", *
 """Columns of samples.parquet that the card is made from."""
 
 
-class Measured(TypedDict):
+class SampleFigures(TypedDict):
     """What the card says of the samples by their `CARD_COLUMNS` alone."""
 
     samples: int
@@ -132,7 +132,7 @@ def _map_source(source: MapFile, sha256: str, registration: tuple[MapRegistratio
     return recast(source.facts, MapSource, **told, **asdict(source.grid))
 
 
-def measured(samples: pa.Table, *, has_terrain: bool) -> Measured:
+def measured(samples: pa.Table, *, has_terrain: bool) -> SampleFigures:
     """Return what the card says of the samples by their `CARD_COLUMNS` alone: it can be measured again at any time."""
     return {
         "samples": samples.num_rows,

@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from tcpipe.balance.cells import SLOPE_NAMES
-from tcpipe.balance.thin_ground import CLOSED, Ground, cell_classes, cell_gradients, offered, thin_ground
+from tcpipe.balance.thin_ground import CLOSED, MapGround, cell_classes, cell_gradients, offered, thin_ground
 
 UP, DOWN, LEVEL = SLOPE_NAMES.index("5° to 10°"), SLOPE_NAMES.index("-10° to -5°"), SLOPE_NAMES.index("-2° to 2°")
 
@@ -32,10 +32,10 @@ def test_a_cell_has_a_class_if_all_of_it_may_be_driven_and_most_is_of_one():
 
 
 def slope_of(rows, cols, rise=0.12):
-    """Ground of class 4 that rises to the east, by 7° if nothing is said; 4 m cells."""
+    """MapGround of class 4 that rises to the east, by 7° if nothing is said; 4 m cells."""
     gradient = np.zeros((rows, cols, 2))
     gradient[..., 0] = rise
-    return Ground(np.full((rows, cols), 4, np.int16), gradient, 1000.0, 2000.0, 4.0)
+    return MapGround(np.full((rows, cols), 4, np.int16), gradient, 1000.0, 2000.0, 4.0)
 
 
 def test_ground_offers_its_fall_line_up_and_down():

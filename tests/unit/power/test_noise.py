@@ -6,7 +6,7 @@ from made_tracks import stamps
 from scipy.signal import lfilter
 
 from tcpipe.power.energy import energy_joule
-from tcpipe.power.noise import energy_noise, resolution
+from tcpipe.power.noise import _steady, energy_noise, median_period_s, resolution, squared_weights_s2
 from tcpipe.power.rails import rail, samples
 from tcpipe.power.signal_model import local_scale, signal_model
 
@@ -155,3 +155,20 @@ def test_what_a_faster_source_would_leave():
     truth = energy_joule([record(t, amp)], STARTS, ENDS, rule="exact")
     error = energy_joule(fast, STARTS, ENDS, rule="exact") - truth
     assert np.sqrt(told) == pytest.approx(error.std(), rel=0.25)
+
+
+def test_the_median_period_needs_two_samples():
+    assert median_period_s(samples(ZERO + np.array([0, 50_000_000]), np.zeros(2))) == pytest.approx(0.05)
+    assert median_period_s(samples(ZERO + np.array([0]), np.zeros(1))) == np.inf
+
+
+def test_weights_of_a_record_that_ends_with_the_span():
+    """By hand: joined by lines, samples a second apart weigh a half, one and a half second."""
+    at = ZERO + np.arange(3) * 1_000_000_000
+    assert squared_weights_s2(at, at[:1], at[2:], averaged=False) == pytest.approx([1.5], rel=1e-6)
+
+
+def test_a_span_uses_the_samples_in_it_and_one_on_either_side():
+    at = ZERO + np.arange(10) * 1_000_000_000
+    used = _steady(at, ZERO + np.array([2_500_000_000]), ZERO + np.array([4_500_000_000]))
+    assert np.flatnonzero(used).tolist() == [2, 3, 4, 5]

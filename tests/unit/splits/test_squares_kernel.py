@@ -72,3 +72,11 @@ def test_a_share_is_of_our_own_ground():
     index = np.zeros(1, np.int64)
     assert shared_fraction(ours, theirs, index, index) == pytest.approx([0.25])
     assert shared_fraction(theirs, ours, index, index) == pytest.approx([1.0])
+
+
+def test_a_square_whose_corner_is_nearest_is_found_behind_others_whose_centres_are_nearer():
+    """By hand: eight squares 2 m away, and a ninth, turned by 45 degrees, whose centre is farther and whose corner is nearer."""
+    ours = squares(np.zeros((1, 2)), np.zeros(1))
+    centres = np.array([[3.0, 0.0]] * 8 + [[0.0, 3.1]])
+    theirs = squares(centres, np.array([0.0] * 8 + [np.pi / 4.0]))
+    assert nearest_m(ours, theirs) == pytest.approx([3.1 - 0.5 - np.sqrt(0.5)], abs=1e-12)
