@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tcpipe.errors import ModelError
 from tcpipe.formats.weights import write_arrays
-from tcpipe.learning.checkpoint import Progress, read_checkpoint, write_checkpoint
+from tcpipe.learning.checkpoint import TrainingProgress, read_checkpoint, write_checkpoint
 
 PARTS = {part: {"a": np.arange(6.0), "b/c": np.ones((2, 3), np.float32)} for part in ("now", "best", "optimizer")}
 LOSSES = st.floats()  # infinite and not a number, too
@@ -20,7 +20,7 @@ def test_what_is_saved_is_read(tmp_path_factory, best_loss, losses, data):
     path = tmp_path_factory.mktemp("state") / "model.checkpoint"
     history = [(number + 1, *pair) for number, pair in enumerate(losses)]
     best = data.draw(st.integers(0, len(history)))
-    progress = Progress("key", len(history), best, best_loss, history)
+    progress = TrainingProgress("key", len(history), best, best_loss, history)
     write_checkpoint(path, progress, PARTS)
     found, parts = read_checkpoint(path, "key")
     assert repr(found) == repr(progress)  # nan is not nan
@@ -31,7 +31,7 @@ def test_what_is_saved_is_read(tmp_path_factory, best_loss, losses, data):
 @given(st.data())
 def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("state") / "model.checkpoint"
-    write_checkpoint(path, Progress("key"), PARTS)
+    write_checkpoint(path, TrainingProgress("key"), PARTS)
     raw = bytearray(path.read_bytes())
     at = data.draw(st.integers(0, len(raw) - 1))
     if data.draw(st.booleans()):
@@ -48,7 +48,7 @@ def test_a_damaged_one_is_told_or_as_it_was(tmp_path_factory, data):
         assert told.startswith(f"{path}: ")
         assert "\n" not in told
         return
-    assert found == Progress("key")
+    assert found == TrainingProgress("key")
     assert all(np.array_equal(parts[part][name], array) for part in PARTS for name, array in PARTS[part].items())
 
 
