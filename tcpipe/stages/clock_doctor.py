@@ -67,7 +67,7 @@ def _said(found: ClockOffsets, role: str, offset: RoleOffset, entry: str) -> str
             if offset.drifts
             else f"differ by {abs(offset.offset_s):.2f} s {constant}"
         )
-        cost = "; every position's deviation counts that much driving in" if GNSS in {role, found.reference} else ""
+        cost = "; the deviations of positions count what is driven in it" if GNSS in {role, found.reference} else ""
         return (
             f"{role} and {found.reference}: their stamps {by}, and no two other sensors agree on which of them is off: "
             f"nothing is corrected or advised{cost}"

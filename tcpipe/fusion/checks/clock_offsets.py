@@ -127,12 +127,19 @@ class ClockOffsets:
 
     @property
     def position_offset_s(self) -> float:
-        """By how much the fixes' clock may be off [s]: the robot's speed times this is an error of every position."""
+        """By how much the fixes' clock may be off [s]: the robot's speed times this is an error of every position.
+
+        Its offset where it is blamed; where nobody is, each clock is as likely the right one as the next.
+        """
         gnss = self.offsets.get(GNSS)
         if gnss is None or not (gnss.noted or gnss.drifts):
             return 0.0
         drifted_s = abs(gnss.drift_s_per_h) * self.span_s / 7200.0 if gnss.drifts else 0.0
-        return abs(gnss.offset_s) + drifted_s
+        if gnss.blamed:
+            return abs(gnss.offset_s) + drifted_s
+        others = [0.0, *(offset.offset_s for role, offset in self.offsets.items() if role != GNSS)]
+        apart = [0.0, *(abs(gnss.offset_s - other_s) + drifted_s for other_s in others)]
+        return math.sqrt(sum(each**2 for each in apart) / len(apart))
 
     @property
     def heading_offset_s(self) -> float:

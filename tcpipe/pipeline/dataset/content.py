@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import MapRegistration, Removal
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.pipeline.dataset.findings import findings_in_words, findings_of_runs
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
 from tcpipe.pipeline.dataset.removal import removed_by_ground
@@ -135,7 +136,9 @@ def gather_content(
     sources = tuple(open_map(path) for path in inputs.map_paths)
     lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
-        raise DatasetError(_nothing_sampled(pool.segments, lost_m, sources))
+        raise DatasetError(
+            _nothing_sampled(pool.segments, lost_m, sources), *_why_uncertain(pool.segments, lost_m, inputs, recipe)
+        )
     drawn = draw_splits(pool.segments, sampled, sources[0].grid, regions, recipe, earlier=earlier)
     split = drawn.assigned.split
     arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
@@ -193,6 +196,19 @@ def _nothing_sampled(segments: pa.Table, lost_m: Mapping[Loss, float], sources: 
         f"{names}: none of {segments.num_rows} segments gives a sample ({where}); the runs lie around "
         f"{lon:.5f}, {lat:.5f} (lon, lat), {'; '.join(_covered(source, alone=len(sources) == 1) for source in sources)}"
     )
+
+
+def _why_uncertain(segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inputs, recipe: Recipe) -> list[str]:
+    """Return how well positions are known, and what ingest found, where that is what most is lost to."""
+    uncertain_m = lost_m.get(Loss.POSITION_UNCERTAIN, 0.0)
+    if uncertain_m == 0.0 or uncertain_m < max(lost_m.values()):
+        return []
+    known_m = float(np.median(floats(segments, "position_std_m")))
+    how_sure = (
+        f"positions are known to {known_m:.2f} m (median standard deviation), wanted {recipe.sample.max_position_std_m:g} m: mend what "
+        "follows, or accept patches that lie so far off: [sample] max_position_std_m in the recipe"
+    )
+    return [how_sure, *findings_in_words(findings_of_runs(inputs.sources))]
 
 
 def _covered(source: MapFile, *, alone: bool) -> str:

@@ -26,7 +26,7 @@ def findings_of_runs(runs: Sequence[RunSource]) -> tuple[RunFinding, ...]:
     found = (
         RunFinding(next(iter(of.values())), tuple(of), sum(samples[run_id] for run_id in of)) for of in told.values()
     )
-    return tuple(sorted(found, key=lambda finding: (-finding.samples, finding.example)))
+    return tuple(sorted(found, key=lambda finding: -finding.samples))
 
 
 def doubtful(quality: pa.ChunkedArray) -> Doubtful:
@@ -54,5 +54,5 @@ def findings_in_words(findings: Sequence[RunFinding]) -> list[str]:
 
 
 def _counted(finding: RunFinding) -> str:
-    runs = f"run {finding.runs[0]}" if len(finding.runs) == 1 else f"{len(finding.runs)} runs"
-    return f"{runs} ({finding.samples} samples)"
+    runs = finding.runs[0] if len(finding.runs) == 1 else f"{len(finding.runs)} runs"
+    return f"{runs} ({finding.samples} sample{'' if finding.samples == 1 else 's'})"

@@ -99,9 +99,14 @@ def test_a_yaw_rate_does_not_speak_for_a_speed():
 
 
 def test_what_the_clock_of_the_fixes_may_be_off_by_is_a_cost_of_positions():
+    """Two clocks that differ by 0.1 s: either is right; three: 0.4 and 0.2 s apart, or not at all."""
+    agreed = pair("visual_odometry", "wheel_odometry", 0.0)
     drifting = Pair("gnss", "wheel_odometry", "speed", 0.1, 0.002, 0.9, 0.36, 0.01)
-    assert _settled((drifting,), 3600.0).position_offset_s == pytest.approx(0.1 + 0.18)
-    assert _settled((pair("gnss", "wheel_odometry", -0.1),)).position_offset_s == pytest.approx(0.1)
+    assert _settled((drifting, agreed), 3600.0).position_offset_s == pytest.approx(0.1 + 0.18)
+    assert _settled((pair("gnss", "wheel_odometry", -0.1), agreed)).position_offset_s == pytest.approx(0.1)
+    assert _settled((pair("gnss", "wheel_odometry", -0.1),)).position_offset_s == pytest.approx(0.1 * 0.5**0.5)
+    three = _settled((pair("gnss", "wheel_odometry", 0.2), pair("wheel_odometry", "imu", 0.2, by="yaw rate")))
+    assert three.position_offset_s == pytest.approx(((0.4**2 + 0.2**2) / 3) ** 0.5)
     assert _settled((pair("gnss", "wheel_odometry", 0.01),)).position_offset_s == 0.0
     assert _settled((pair("imu", "wheel_odometry", 0.1),)).position_offset_s == 0.0
 

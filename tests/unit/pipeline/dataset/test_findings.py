@@ -6,6 +6,7 @@ import pytest
 from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
+from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.findings import doubt_in_words, doubtful, findings_in_words, findings_of_runs
@@ -27,7 +28,7 @@ def test_lines_that_differ_by_their_figures_are_one_cause():
     assert (power.runs, power.samples) == (("a",), 10)
     assert findings_in_words((late, power)) == [
         f"found at ingest of 2 runs (40 samples): {LATE.format('0.21')}",
-        "found at ingest of run a (10 samples): power: none",
+        "found at ingest of a (10 samples): power: none",
     ]
 
 
@@ -51,6 +52,23 @@ def test_any_bit_makes_a_sample_doubtful_once():
     assert doubt_in_words(found, 4) == "doubtful: 2 of 4 samples (50.0 %) carry a quality flag: 2 curved, 1 near gap"
     nothing = doubtful(pa.chunked_array([pa.array([], pa.uint16())]))
     assert (nothing.samples, nothing.share, nothing.by_bit) == (0, 0.0, {})
+
+
+def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_found(tmp_path):
+    store = Store(tmp_path / "store")
+    store.root.mkdir()
+    add_world(store, tmp_path)
+    table = segments("a", *lanes([0.0], -10.0, 10.0))
+    place = table.column_names.index("position_std_m")
+    table = table.set_column(place, table.schema.field(place), pa.array(np.full(table.num_rows, 0.3)))
+    add_run(store, "a", table, warnings=(LATE.format(0.4),))
+    with pytest.raises(DatasetError) as caught:
+        build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    nothing, how_sure, found = caught.value.problems
+    assert "20 m position uncertain" in nothing
+    assert "known to 0.30 m" in how_sure
+    assert "max_position_std_m" in how_sure
+    assert found == f"found at ingest of a (0 samples): {LATE.format(0.4)}"
 
 
 @pytest.fixture(scope="module")
