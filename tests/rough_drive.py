@@ -5,7 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory, no_rejections
 from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rotation_vector_from_quat, rpy_from_matrix
+from tcpipe.tables.findings import StretchFacts
 
 GRAVITY_MPS2 = 9.80665
 RATE_HZ = 200
@@ -156,4 +158,22 @@ def initial(truth, *, yaw_error=0.03):
         tilt_std_rad=0.02,
         yaw_std_rad=0.05,
         velocity_enu_mps=truth.velocity[0],
+    )
+
+
+def true_track(truth):
+    """A track that is the truth, 20 rows a second, and claims a centimetre and a centimetre a second."""
+    rows = np.arange(0, truth.stamp_ns.size, RATE_HZ // 20)
+    return Trajectory(
+        stamp_ns=truth.stamp_ns[rows],
+        position_enu_m=truth.position[rows],
+        quat_xyzw=quat_from_matrix(truth.rotation[rows]),
+        velocity_enu_mps=truth.velocity[rows],
+        angular_velocity_radps=truth.turn[rows],
+        position_std_m=np.full((rows.size, 3), 0.01),
+        yaw_std_rad=np.full(rows.size, 0.005),
+        forward_velocity_std_mps=np.full(rows.size, 0.01),
+        rejections=no_rejections(),
+        displacement_std_m=np.full((rows.size, 1), 0.01) * DISPLACEMENT_LAGS_S,
+        facts=StretchFacts({}, {}, {}, 0),
     )

@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
+from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.stamp_jitter import steadied
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
@@ -31,6 +32,10 @@ class FusionInputs:
     counts: dict[str, dict[str, int]] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
     refused: frozenset[str] = frozenset()
+    arm: Arm | None = None
+    """What is known of the antenna's arm where it was mended or nobody stated it."""
+    imu_tilt: Tilt | None = None
+    """Roll and pitch of the IMU's mounting that were taken out."""
 
     def note(self, role: str, prepared: Prepared) -> None:
         """Remember what was set aside."""

@@ -10,6 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.audit import Tally, audited
+from tcpipe.fusion.checks.mounting import (
+    ArmEvidence,
+    TiltEvidence,
+    antenna_doubt,
+    arm_evidence,
+    tilt_evidence,
+    with_antenna_doubt,
+)
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import InitialState
@@ -26,13 +34,15 @@ from tcpipe.tables.levels import Streams
 
 @dataclass(slots=True)
 class Fused:
-    """Every stretch's trajectory, facts and columns, and how it was audited; how long no track could be placed [s]."""
+    """Every stretch's trajectory, facts and columns, its audit, what it tells of mountings; how long no track could be placed [s]."""
 
     found: list[Trajectory] = field(default_factory=list)
     facts: list[StretchFacts] = field(default_factory=list)
     columns: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
     disagreements: list[Disagreement] = field(default_factory=list)
     tallies: list[Tally] = field(default_factory=list)
+    arms: list[ArmEvidence | None] = field(default_factory=list)
+    tilts: list[TiltEvidence | None] = field(default_factory=list)
     skipped_s: float = 0.0
 
 
@@ -49,15 +59,26 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
         initial = _initial(stretch, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
         trajectory = _estimate(stretch, initial, output_ns, config)
-        # 3. What came out is held against what went in.
+        # 3. What it tells of how antenna and IMU are mounted, and what nobody knows of it.
+        fused.arms.append(arm_evidence(trajectory, stretch.measurements))
+        fused.tilts.append(tilt_evidence(trajectory, stretch.measurements))
+        trajectory = _doubted(trajectory, stretch, inputs)
+        # 4. What came out is held against what went in.
         trajectory, audit = audited(trajectory, stretch.measurements)
         fused.disagreements += (replace(each, epoch=stretch.epoch) for each in audit.disagreements)
         fused.tallies += audit.tallies
         fused.found.append(trajectory)
         fused.facts.append(stretch_facts(stretch, initial, trajectory))
-        # 4. What else is known at the track's stamps.
+        # 5. What else is known at the track's stamps.
         fused.columns.append(_columns(stretch, trajectory, inputs, streams, config))
     return fused
+
+
+def _doubted(found: Trajectory, stretch: Stretch, inputs: FusionInputs) -> Trajectory:
+    """Return the trajectory with what is not known of a mended or unstated mounting."""
+    gnss = stretch.measurements.gnss
+    covariance = None if gnss is None else antenna_doubt(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
+    return found if covariance is None else with_antenna_doubt(found, covariance)
 
 
 def _initial(stretch: Stretch, last: Trajectory | None) -> InitialState:

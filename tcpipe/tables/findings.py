@@ -173,6 +173,15 @@ class SensorChecks:
 
 
 @dataclass(frozen=True, slots=True)
+class MountingFacts:
+    """What was mended: by how much the antenna was moved in base_link, how well its place is known, roll and pitch of the IMU."""
+
+    antenna_moved_m: Vector | None = field(default=None, metadata=LEFT_OUT)
+    antenna_std_m: Vector | None = field(default=None, metadata=LEFT_OUT)
+    imu_tilt_rad: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+
+
+@dataclass(frozen=True, slots=True)
 class Disagreement:
     """A time in which a sensor says other than the track, beyond what both claim (`tcpipe.fusion.checks.audit`).
 
@@ -356,6 +365,7 @@ class RunFacts:
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
+    mounting: MountingFacts | None = field(default=None, metadata=LEFT_OUT)
     audit: AuditFacts | None = field(default=None, metadata=LEFT_OUT)
     clock_offsets: ClockFacts | None = field(default=None, metadata=LEFT_OUT)
     gate: GateFacts | None = field(default=None, metadata=LEFT_OUT)

@@ -234,7 +234,8 @@ def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64])
             scale_seen=m.gnss is not None,
         )
         known = np.asarray(np.isfinite(source.yaw_rate_radps))
-        if known.sum() > 1:
+        skids = role == WHEELS and m.imu is not None  # their turn is not what fed the track
+        if known.sum() > 1 and not skids:
             rate = means(source.stamp_ns[known], source.yaw_rate_radps[known, None]) * step_s
             noise = _noise(source.yaw_rate_var[known], source)
             yield _turn(role, _sums(rate, windows), _sums(turned[:, 2:], windows), noise, turn_std)

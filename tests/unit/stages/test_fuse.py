@@ -22,7 +22,7 @@ SECONDS = 40.0
 
 
 def sensor(xyz=(0.0, 0.0, 0.0), quat=(0.0, 0.0, 0.0, 1.0)):
-    return Sensor("/topic", "pkg/msg/Type", "frame", "test", xyz, quat)
+    return Sensor("/topic", "pkg/msg/Type", "frame", "test", xyz, quat, placed_by="recipe")
 
 
 def filled(schema, stamp, **known):

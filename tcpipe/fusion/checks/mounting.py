@@ -1,0 +1,280 @@
+"""How antenna and IMU are really mounted, by what a first track and the sensors say of the same motion.
+
+An antenna that sits off where it is thought to be goes round with the robot. In windows of 40 s the fixes, less the path that an odometry
+draws with the track's attitude, are a place, a scale and a turn of that path, and the arm's error turned by the attitude; the first three
+are each window's own, the last is that of the run. So is a lag of the fixes, which at one speed looks like an antenna further back, and is
+told from it where the speed changes. What the turns do not show stays at what is known beforehand. Wheels do not see the robot slide aside
+while it turns, and a turning point ahead of base_link looks like an antenna behind it: so much stays unknown.
+
+An IMU that is pitched against the robot feels a slope that the robot does not climb: its forward specific force, less acceleration, over
+gravity, against the rise of the track. One that is rolled sees a part of every turn about its y axis: on any plane a robot turns about its
+own z axis, so the rate about y follows the rate about z.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.measurements import (
+    VISUAL,
+    WHEELS,
+    BodyVelocities,
+    InertialMeasurements,
+    Measurements,
+    Positions,
+)
+from tcpipe.fusion.signals import interval_means, median_period_ns, seconds
+from tcpipe.fusion.trajectory import Trajectory
+from tcpipe.geometry.rotation import inverse, matrix_from_quat, product, quat_from_rpy, rotate
+
+Floats = NDArray[np.float64]
+
+ARM_STD_M = 0.5
+"""An antenna of which nothing is known sits within the size of a robot."""
+LATE_STD_S = 0.1
+"""What is known beforehand of the lag of its stamps."""
+
+_GRAVITY_MPS2 = 9.80665
+_WINDOW_S = 40.0
+_FEWEST = 20
+_WILD = 5.0
+_TURNING_POINT_STD_M = {WHEELS: 0.1, VISUAL: 0.01}
+_MOVES_MPS = 0.3
+_BLOCK_S = 10.0
+_LEAST_TILT_STD_RAD = 0.004
+
+
+@dataclass(frozen=True, slots=True)
+class ArmEvidence:
+    """Normal equations of an arm's error [m] and the lag of the fixes [s], one for each of W windows, weighted by what is left.
+
+    Attributes
+    ----------
+    matrix, vector : shapes (W, 4, 4) and (W, 4).
+    unseen_std_m : how far the odometry's own turning point may be off base_link.
+    """
+
+    matrix: Floats
+    vector: Floats
+    unseen_std_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Arm:
+    """An arm's error in base_link axes [m] and the lag of the fixes [s], shape (4,), and their covariance, shape (4, 4)."""
+
+    error: Floats
+    covariance: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class TiltEvidence:
+    """Sums over B blocks: of the rate about z squared, its product with that about y, rows moved, and the slope felt beyond the track's."""
+
+    turning: Floats
+    beside: Floats
+    moving: Floats
+    felt: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Tilt:
+    """Roll and pitch of an IMU against how it is taken to be mounted [rad], shape (2,), with standard deviations."""
+
+    rad: Floats
+    std_rad: Floats
+
+
+def arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
+    """Return what one stretch tells of the antenna's arm; None without fixes or odometry."""
+    role, source = (VISUAL, m.visual) if m.visual is not None else (WHEELS, m.wheels)
+    if m.gnss is None or source is None or found.stamp_ns.size < _FEWEST:
+        return None
+    rotation, path = matrix_from_quat(found.quat_xyzw), _drawn(found, source)
+    zero = int(found.stamp_ns[0])
+    row_s, fix_s = seconds(found.stamp_ns, zero), seconds(m.gnss.stamp_ns, zero)
+    known = (fix_s > row_s[0]) & (fix_s < row_s[-1])
+    fix_s = fix_s[known]
+
+    def at(values: Floats) -> Floats:
+        columns = values.reshape(values.shape[0], -1).T
+        return np.column_stack([np.interp(fix_s, row_s, c) for c in columns])
+
+    axes = np.concatenate((rotation[:, :2, :], -found.velocity_enu_mps[:, :2, None]), axis=2)
+    axes = at(axes).reshape(-1, 2, 4)
+    place = m.gnss.position_enu_m[known, :2] - axes[:, :, :3] @ np.asarray(m.gnss.lever_arm_m)
+    drawn, claim = at(path), np.sqrt(m.gnss.variance_m2[known, :2].mean(1))
+    told = []
+    for begin in np.arange(0.0, row_s[-1], _WINDOW_S):
+        rows = (fix_s >= begin) & (fix_s < begin + _WINDOW_S)
+        if rows.sum() >= _FEWEST:
+            told.append(_window(place[rows], drawn[rows], axes[rows], float(np.median(claim[rows]))))
+    if not told:
+        return None
+    return ArmEvidence(
+        np.stack([matrix for matrix, _ in told]),
+        np.stack([vector for _, vector in told]),
+        _TURNING_POINT_STD_M[role],
+    )
+
+
+def _drawn(found: Trajectory, source: BodyVelocities) -> Floats:
+    """Return the horizontal path that an odometry draws with the track's attitude [m], shape (N, 2)."""
+    zero = int(found.stamp_ns[0])
+    row_s, step_s = seconds(found.stamp_ns, zero), np.diff(seconds(found.stamp_ns, zero))
+    rotation = matrix_from_quat(found.quat_xyzw)
+    point = np.nan_to_num(source.velocity_mps)
+    said = interval_means(seconds(source.stamp_ns, zero), point, row_s[:-1], row_s[1:])
+    turn = (found.angular_velocity_radps[1:] + found.angular_velocity_radps[:-1]) / 2.0
+    body = said - np.cross(turn, source.lever_arm_m)
+    steps = np.einsum("kij,kj->ki", (rotation[1:] + rotation[:-1]) / 2.0, body)[:, :2] * step_s[:, None]
+    return np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
+
+
+def _window(place: Floats, drawn: Floats, axes: Floats, claim_m: float) -> tuple[Floats, Floats]:
+    """Return the normal equations of arm and lag in one window, its own place, scale and turn taken out; wild fixes are left out."""
+    path = drawn - drawn.mean(0)
+    rows = np.ones(len(place), np.bool_)
+    matrix, vector = np.zeros((4, 4)), np.zeros(4)
+    for _ in range(2):
+        own = np.zeros((rows.sum(), 2, 4))
+        own[:, 0, 0] = own[:, 1, 1] = 1.0
+        own[:, 0, 2], own[:, 1, 2] = path[rows].T
+        own[:, 0, 3], own[:, 1, 3] = -path[rows, 1], path[rows, 0]
+        basis = _basis(own.reshape(-1, 4))
+        arm, target = axes[rows].reshape(-1, 4), (place - path)[rows].reshape(-1)
+        arm, target = (values - basis @ (basis.T @ values) for values in (arm, target))
+        solved = np.linalg.lstsq(arm, target, rcond=1e-6)[0]
+        left = np.linalg.norm((target - arm @ solved).reshape(-1, 2), axis=1)
+        weight = 1.0 / max(claim_m, float(np.sqrt(np.mean(left**2) / 2.0))) ** 2
+        matrix, vector = weight * arm.T @ arm, weight * arm.T @ target
+        wild = left > _WILD * max(float(np.median(left)), claim_m)
+        if not wild.any():
+            break
+        rows[np.flatnonzero(rows)[wild]] = False
+    return matrix, vector
+
+
+def _basis(columns: Floats) -> Floats:
+    """Return orthonormal columns that span the given ones (N, k): standing still has no path."""
+    left, size, _ = np.linalg.svd(columns, full_matrices=False)
+    spanning: Floats = left[:, size > 1e-6 * size[0]]
+    return spanning
+
+
+def solve_arm(told: Sequence[ArmEvidence | None], moved_m: Floats, *, height_std_m: float = ARM_STD_M) -> Arm | None:
+    """Return the error of the arm by all stretches, and how well it is known; None without evidence.
+
+    Fixes of one window err together: by how windows scatter more than their fixes claim (Huber's sandwich), they count as fewer. No
+    deviation is beyond what is known beforehand.
+
+    Parameters
+    ----------
+    told : of each stretch.
+    moved_m : [m], shape (3,), by how much the arm was mended already; it is part of the error that is returned.
+    height_std_m : how well the antenna's height is known beforehand.
+    """
+    evidence = [each for each in told if each is not None]
+    if not evidence:
+        return None
+    matrix, vector = (np.concatenate([getattr(e, name) for e in evidence]) for name in ("matrix", "vector"))
+    vector = vector + matrix[:, :, :3] @ moved_m
+    known = np.array([ARM_STD_M, ARM_STD_M, height_std_m, LATE_STD_S])
+    prior = np.diag(1.0 / known**2)
+    alike = np.linalg.inv(matrix.sum(0) + prior)
+    scatter = vector - matrix @ (alike @ vector.sum(0))
+    windows = len(matrix)
+    spread = scatter.T @ scatter * windows / max(windows - 1, 1)
+    fewer = max(1.0, float(np.mean(np.diag(alike @ (spread + prior) @ alike) / np.diag(alike))))
+    covariance = np.linalg.inv(matrix.sum(0) / fewer + prior)
+    error = covariance @ vector.sum(0) / fewer
+    covariance[np.diag_indices(2)] += max(e.unseen_std_m for e in evidence) ** 2
+    beyond = np.minimum(known / np.sqrt(np.diag(covariance)), 1.0)
+    return Arm(error, covariance * np.outer(beyond, beyond))
+
+
+def antenna_doubt(arm: Arm | None, tilt: Tilt | None, lever_arm_m: tuple[float, float, float]) -> Floats | None:
+    """Return the covariance of arm and lag that what was mended leaves, shape (4, 4): a tilted IMU moves an antenna above it."""
+    if arm is None and tilt is None:
+        return None
+    covariance = np.zeros((4, 4)) if arm is None else arm.covariance.copy()
+    if tilt is not None:
+        covariance[np.diag_indices(2)] += (tilt.std_rad[::-1] * lever_arm_m[2]) ** 2
+    return covariance
+
+
+def unknown_arm() -> Arm:
+    """Return what is known of an arm of which nothing tells."""
+    return Arm(np.zeros(4), np.diag(np.square([ARM_STD_M] * 3 + [0.0])))
+
+
+def tilt_evidence(found: Trajectory, m: Measurements) -> TiltEvidence | None:
+    """Return what one stretch tells of the IMU's roll and pitch; None without fixes, which tell the slope, or a usable IMU."""
+    if m.imu is None or m.gnss is None or not m.imu.accelerometer_usable or found.stamp_ns.size < _FEWEST:
+        return None
+    zero = int(found.stamp_ns[0])
+    row_s, imu_s = seconds(found.stamp_ns, zero), seconds(m.imu.stamp_ns, zero)
+    felt = interval_means(imu_s, m.imu.specific_force_mps2[:, :1], row_s[:-1], row_s[1:])[:, 0]
+    rate = interval_means(imu_s, m.imu.angular_velocity_radps[:, 1:], row_s[:-1], row_s[1:])
+    velocity = (found.velocity_enu_mps[1:] + found.velocity_enu_mps[:-1]) / 2.0
+    speed = np.linalg.norm(velocity, axis=1)
+    ahead = np.sum(matrix_from_quat(found.quat_xyzw)[:-1, :, 0] * velocity, axis=1)
+    quicker = np.diff(np.sign(ahead.mean()) * np.linalg.norm(found.velocity_enu_mps, axis=1)) / np.diff(row_s)
+    moving = (speed > _MOVES_MPS) & (np.sign(ahead) == np.sign(ahead.mean()))
+    rise = np.sign(ahead) * velocity[:, 2] / np.maximum(speed, _MOVES_MPS)
+    beyond = np.where(moving, (felt - quicker) / _GRAVITY_MPS2 - rise, 0.0)
+    rate = rate - np.median(rate, axis=0)
+    block = max(1, round(_BLOCK_S * 1e9 / median_period_ns(found.stamp_ns)))
+    first = np.arange(0, row_s.size - 1, block)
+    sums = (rate[:, 1] ** 2, rate[:, 0] * rate[:, 1], moving.astype(np.float64), beyond)
+    return TiltEvidence(*(np.add.reduceat(values, first) for values in sums))
+
+
+def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
+    """Return roll and pitch of the IMU by all stretches, with deviations from how blocks of ten seconds scatter; None if nothing tells."""
+    evidence = [each for each in told if each is not None]
+    if not evidence:
+        return None
+    turning, beside, moving, felt = (
+        np.concatenate([getattr(e, name) for e in evidence]) for name in TiltEvidence.__slots__
+    )
+    if turning.sum() <= 0.0 or moving.sum() <= 0.0:
+        return None
+    angles = np.array([_ratio(beside, turning), _ratio(-felt, moving)])
+    return Tilt(angles[:, 0], angles[:, 1])
+
+
+def _ratio(above: Floats, below: Floats) -> tuple[float, float]:
+    """Return the ratio of two sums over blocks, and its deviation by the scatter of the blocks."""
+    value = float(above.sum() / below.sum())
+    blocks = len(above)
+    std = float(np.sqrt(np.sum((above - value * below) ** 2) * blocks / max(blocks - 1, 1))) / float(below.sum())
+    return value, float(np.hypot(std, _LEAST_TILT_STD_RAD)) if blocks > 1 else float("inf")
+
+
+def levelled(imu: InertialMeasurements, tilt_rad: Floats) -> InertialMeasurements:
+    """Return the measurements of an IMU whose roll and pitch against the robot are taken out."""
+    base_from_unit = quat_from_rpy(float(tilt_rad[0]), float(tilt_rad[1]), 0.0)
+    return replace(
+        imu,
+        angular_velocity_radps=rotate(base_from_unit, imu.angular_velocity_radps),
+        specific_force_mps2=rotate(base_from_unit, imu.specific_force_mps2),
+        quat_xyzw=product(imu.quat_xyzw, inverse(base_from_unit)),
+    )
+
+
+def rearmed(gnss: Positions, error_m: Floats) -> Positions:
+    """Return the fixes of an antenna whose place in base_link is mended."""
+    x, y, z = (np.asarray(gnss.lever_arm_m) + error_m).tolist()
+    return replace(gnss, lever_arm_m=(x, y, z))
+
+
+def with_antenna_doubt(found: Trajectory, covariance: Floats) -> Trajectory:
+    """Return the trajectory with what is not known of arm and lag in its position: it turns with the robot, and lasts."""
+    columns = np.concatenate((matrix_from_quat(found.quat_xyzw), -found.velocity_enu_mps[:, :, None]), axis=2)
+    doubt_m2 = np.einsum("kij,jl,kil->ki", columns, covariance, columns)
+    return replace(found, position_std_m=np.sqrt(found.position_std_m**2 + doubt_m2))

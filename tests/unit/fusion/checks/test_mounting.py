@@ -1,0 +1,160 @@
+"""How antenna and IMU are mounted, told from a drive whose truth is known."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rough_drive import drive, measured, true_track
+from scipy.spatial.transform import Rotation
+
+from tcpipe.fusion.checks.mounting import (
+    ARM_STD_M,
+    Tilt,
+    antenna_doubt,
+    arm_evidence,
+    levelled,
+    rearmed,
+    solve_arm,
+    solve_tilt,
+    tilt_evidence,
+    unknown_arm,
+    with_antenna_doubt,
+)
+from tcpipe.fusion.measurements import Measurements
+
+NOWHERE = np.zeros(3)
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return drive(240.0, 5)
+
+
+@pytest.fixture(scope="module")
+def sensors(truth):
+    return measured(truth, 5)
+
+
+@pytest.fixture(scope="module")
+def track(truth):
+    return true_track(truth)
+
+
+def arm_of(track, sensors, moved_m=NOWHERE, **known):
+    return solve_arm([arm_evidence(track, sensors)], moved_m, **known)
+
+
+def deviations(arm):
+    return np.sqrt(np.diag(arm.covariance))
+
+
+def tilted(imu, roll_deg, pitch_deg):
+    """What a unit says that is mounted so against what it is taken for."""
+    turned = Rotation.from_euler("xyz", [roll_deg, pitch_deg, 0.0], degrees=True)
+    return replace(
+        imu,
+        angular_velocity_radps=turned.inv().apply(imu.angular_velocity_radps),
+        specific_force_mps2=turned.inv().apply(imu.specific_force_mps2),
+    )
+
+
+def test_an_antenna_where_it_is_stated_is_left_there(track, sensors):
+    arm = arm_of(track, sensors)
+    assert np.abs(arm.error[:2]).max() < 0.05
+    assert (np.abs(arm.error) < 4 * deviations(arm)).all()
+    assert deviations(arm)[:2].max() < 0.05
+
+
+def test_an_antenna_stated_elsewhere_is_found_and_stays_found(track, sensors):
+    wrong = np.array([0.4, -0.3, 0.0])
+    off = replace(sensors, gnss=rearmed(sensors.gnss, wrong))
+    assert off.gnss.lever_arm_m == pytest.approx((0.6, -0.4, 0.8))
+    arm = arm_of(track, off, height_std_m=0.05)
+    assert arm.error[:2] == pytest.approx(-wrong[:2], abs=0.05)
+    mended = replace(off, gnss=rearmed(off.gnss, arm.error[:3]))
+    again = arm_of(track, mended, arm.error[:3], height_std_m=0.05)
+    assert again.error == pytest.approx(arm.error, abs=1e-3)
+
+
+def test_a_lag_is_told_from_an_antenna_further_back_by_the_changes_of_speed(track, sensors):
+    """Fixes whose stamps are late by 0.1 s: each place was left 0.1 s before its stamp."""
+    late = replace(sensors.gnss, stamp_ns=sensors.gnss.stamp_ns + 100_000_000)
+    arm = arm_of(track, replace(sensors, gnss=late))
+    assert arm.error[3] == pytest.approx(0.1, abs=0.03)
+    assert np.abs(arm.error[:2]).max() < 0.06
+
+
+def test_a_wrong_fix_now_and_then_and_for_a_while_moves_no_antenna(track, sensors):
+    place = sensors.gnss.position_enu_m.copy()
+    place[::50] += 3.0
+    place[400:800] += [0.4, 0.3, 0.0]
+    arm = arm_of(track, replace(sensors, gnss=replace(sensors.gnss, position_enu_m=place)))
+    assert np.abs(arm.error[:2]).max() < 0.1
+
+
+def test_what_no_turn_shows_stays_unknown(track, sensors):
+    """Straight ahead on the level at one speed, an arm is but a constant."""
+    at_s = (track.stamp_ns - track.stamp_ns[0]) * 1e-9
+    straight = replace(
+        track,
+        position_enu_m=np.outer(at_s, [0.8, 0.0, 0.0]),
+        quat_xyzw=np.tile([0.0, 0.0, 0.0, 1.0], (at_s.size, 1)),
+        velocity_enu_mps=np.tile([0.8, 0.0, 0.0], (at_s.size, 1)),
+        angular_velocity_radps=np.zeros((at_s.size, 3)),
+    )
+    ahead = np.tile([0.8, 0.0, 0.0], (sensors.visual.stamp_ns.size, 1))
+    fix_s = (sensors.gnss.stamp_ns - track.stamp_ns[0]) * 1e-9
+    gnss = replace(sensors.gnss, position_enu_m=np.outer(fix_s, [0.8, 0.0, 0.0]) + sensors.gnss.lever_arm_m)
+    visual = replace(sensors.visual, velocity_mps=ahead, lever_arm_m=(0.0, 0.0, 0.0))
+    arm = arm_of(straight, Measurements(gnss=gnss, visual=visual))
+    assert arm.error == pytest.approx(np.zeros(4), abs=1e-6)
+    assert deviations(arm)[:3] == pytest.approx(np.full(3, ARM_STD_M), rel=0.02)
+
+
+def test_wheels_do_not_see_where_the_robot_turns_about(track, sensors):
+    arm = arm_of(track, replace(sensors, visual=None))
+    assert (deviations(arm)[:2] >= 0.1).all()
+    assert arm_evidence(track, replace(sensors, visual=None, wheels=None)) is None
+    assert arm_evidence(track, replace(sensors, gnss=None)) is None
+    assert solve_arm([], NOWHERE) is None
+
+
+@pytest.mark.parametrize(("roll_deg", "pitch_deg"), [(0.0, 0.0), (0.0, 5.0), (4.0, -3.0)])
+def test_a_tilted_imu_is_found(track, sensors, roll_deg, pitch_deg):
+    unit = tilted(sensors.imu, roll_deg, pitch_deg)
+    tilt = solve_tilt([tilt_evidence(track, replace(sensors, imu=unit))])
+    assert np.degrees(tilt.rad) == pytest.approx([roll_deg, pitch_deg], abs=1.0)
+    assert (np.abs(np.degrees(tilt.rad) - [roll_deg, pitch_deg]) < 4 * np.degrees(tilt.std_rad)).all()
+    assert np.degrees(tilt.std_rad).max() < 1.0
+
+
+def test_levelling_undoes_a_tilt(sensors):
+    there_and_back = levelled(tilted(sensors.imu, 4.0, -3.0), np.radians([4.0, -3.0]))
+    for name in ("angular_velocity_radps", "specific_force_mps2"):
+        assert getattr(there_and_back, name) == pytest.approx(getattr(sensors.imu, name), abs=1e-9)
+
+
+def test_without_fixes_or_force_nothing_tells_a_tilt(track, sensors):
+    assert tilt_evidence(track, replace(sensors, gnss=None)) is None
+    assert tilt_evidence(track, replace(sensors, imu=None)) is None
+    assert tilt_evidence(track, replace(sensors, imu=replace(sensors.imu, accelerometer_usable=False))) is None
+    assert solve_tilt([]) is None
+
+
+def test_what_is_not_known_of_an_arm_turns_with_the_robot(track):
+    """An arm known to 0.3 m ahead: of a robot that looks north, north is unknown; the lag costs what is driven in it."""
+    north = replace(
+        track,
+        quat_xyzw=np.tile(Rotation.from_euler("z", 90, degrees=True).as_quat(), (track.stamp_ns.size, 1)),
+        velocity_enu_mps=np.tile([0.0, 0.9, 0.0], (track.stamp_ns.size, 1)),
+    )
+    doubted = with_antenna_doubt(north, np.diag([0.09, 0.0, 0.0, 0.01]))
+    assert doubted.position_std_m[:, 0] == pytest.approx(0.01)
+    assert doubted.position_std_m[:, 1] == pytest.approx(np.sqrt(0.01**2 + 0.3**2 + 0.09**2))
+
+
+def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
+    assert antenna_doubt(None, None, (0.0, 0.0, 1.0)) is None
+    tilt = Tilt(np.zeros(2), np.array([0.02, 0.01]))
+    doubt = antenna_doubt(unknown_arm(), tilt, (0.0, 0.0, 0.9))
+    assert np.diag(doubt) == pytest.approx([0.25 + 0.009**2, 0.25 + 0.018**2, 0.25, 0.0])

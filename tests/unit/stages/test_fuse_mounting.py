@@ -1,0 +1,111 @@
+"""When a mounting is mended, when it is left as somebody stated it, and the lines that a person can put into the recipe."""
+
+import tomllib
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from tcpipe.fusion.checks.mounting import Arm, ArmEvidence, Tilt, TiltEvidence
+from tcpipe.fusion.measurements import InertialMeasurements, Measurements, Positions
+from tcpipe.stages import fuse_mounting
+from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_mounting_findings import mounting_findings
+from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.tables.levels import Sensor, Streams
+
+ARM_M = (0.1, 0.0, 0.9)
+TRUE = np.array([0.3, -0.2, 0.0, 0.0])
+
+
+def streams(placed_by):
+    gnss = Sensor("/fix", "x/msg/Y", "gps", "why", ARM_M, placed_by=placed_by)
+    imu = Sensor("/imu", "x/msg/Y", "imu", "why", (0.0, 0.1, 0.2), placed_by="tf_static")
+    return Streams({}, {"gnss": gnss, "imu": imu}, "husky")
+
+
+def inputs(arm_m=ARM_M):
+    stamp_ns = np.arange(5, dtype=np.int64)
+    gnss = Positions(stamp_ns, np.zeros((5, 3)), np.ones((5, 3)), arm_m)
+    imu = InertialMeasurements(
+        stamp_ns, np.zeros((5, 3)), np.tile([0.0, 0.0, 9.8], (5, 1)), np.full((5, 4), np.nan), 0.01, 0.1
+    )
+    return FusionInputs((15.0, 47.0, 400.0), {0: Measurements(gnss=gnss, imu=imu)})
+
+
+def turns_that_show(arm, *, moved_m=(0.0, 0.0, 0.0), std_m=0.05, windows=9):
+    """Windows that all tell the same error of the arm, less what was moved already."""
+    matrix = np.diag([1.0, 1.0, 1.0, 1.0]) / std_m**2
+    left = arm - np.append(moved_m, 0.0)
+    return ArmEvidence(np.tile(matrix, (windows, 1, 1)), np.tile(matrix @ left, (windows, 1)), 0.0)
+
+
+def slope_that_shows(roll_rad, pitch_rad):
+    ones = np.ones(30)
+    return TiltEvidence(ones, roll_rad * ones, ones, -pitch_rad * ones)
+
+
+def test_an_antenna_that_nobody_placed_is_put_where_the_turns_show_it_and_then_left():
+    log, taken = streams("assumed"), inputs()
+    first = fuse_mounting._mended(taken, Fused(arms=[turns_that_show(TRUE)]), log)
+    assert first.measurements[0].gnss.lever_arm_m == pytest.approx((0.4, -0.2, 0.9), abs=1e-3)
+    moved_m = np.asarray(first.measurements[0].gnss.lever_arm_m) - ARM_M
+    assert fuse_mounting._mended(first, Fused(arms=[turns_that_show(TRUE, moved_m=moved_m)]), log) is None
+    told = mounting_findings(first, log)
+    assert told.facts.antenna_moved_m == pytest.approx(moved_m)
+    (line,) = told.warnings
+    assert "nobody states where its antenna sits" in line
+    entry = tomllib.loads(line.rsplit("under [read.placement]: ", 1)[1])["gnss"]
+    assert entry["xyz_m"] == pytest.approx([0.4, -0.2, 0.9], abs=0.01)
+
+
+def test_an_antenna_that_nobody_placed_and_nothing_shows_is_unknown_by_a_robots_size():
+    found = fuse_mounting._mended(inputs(), Fused(), streams("assumed"))
+    assert found.measurements[0].gnss.lever_arm_m == pytest.approx(ARM_M)
+    assert np.sqrt(np.diag(found.arm.covariance))[:3] == pytest.approx([0.5, 0.5, 0.5])
+
+
+def test_a_stated_antenna_is_moved_only_where_the_turns_surely_contradict():
+    log = streams("tf_static")
+    for agrees in (turns_that_show(0.05 * TRUE), turns_that_show(TRUE, std_m=0.5)):
+        assert fuse_mounting._mended(inputs(), Fused(arms=[agrees]), log) is None
+    found = fuse_mounting._mended(inputs(), Fused(arms=[turns_that_show(TRUE)]), log)
+    (line,) = mounting_findings(found, log).warnings
+    assert line.startswith("gnss: the turns contradict that its antenna sits at (0.10, 0.00, 0.90) m (tf_static)")
+
+
+def test_while_the_imu_is_being_turned_a_stated_antenna_is_not_judged():
+    evidence = Fused(arms=[turns_that_show(TRUE)], tilts=[slope_that_shows(0.0, 0.08)])
+    found = fuse_mounting._mended(inputs(), evidence, streams("tf_static"))
+    assert found.measurements[0].gnss.lever_arm_m == pytest.approx(ARM_M)
+    assert found.imu_tilt.rad == pytest.approx([0.0, 0.08])
+
+
+def test_a_tilted_imu_is_turned_and_what_is_left_added_until_nothing_is():
+    log = streams("tf_static")
+    assert fuse_mounting._mended(inputs(), Fused(tilts=[slope_that_shows(0.01, 0.01)]), log) is None
+    first = fuse_mounting._mended(inputs(), Fused(tilts=[slope_that_shows(0.0, 0.07)]), log)
+    second = fuse_mounting._mended(first, Fused(tilts=[slope_that_shows(0.01, 0.01)]), log)
+    assert second.imu_tilt.rad == pytest.approx([0.0, 0.08])
+    assert fuse_mounting._mended(second, Fused(tilts=[slope_that_shows(0.01, 0.002)]), log) is None
+    turned = Rotation.from_euler("xyz", [0.0, 0.08, 0.0])
+    felt = second.measurements[0].imu.specific_force_mps2
+    assert felt == pytest.approx(np.tile(turned.apply([0.0, 0.0, 9.8]), (5, 1)), abs=0.01)
+    told = mounting_findings(second, log)
+    assert told.facts.imu_tilt_rad == pytest.approx((0.0, 0.08))
+    (line,) = told.warnings
+    assert "rolled by 0.0° and pitched by 4.6° against its mounting (tf_static)" in line
+    entry = tomllib.loads(line.rsplit("under [read.placement]: ", 1)[1])["imu"]
+    assert entry == {"xyz_m": [0, 0.1, 0.2], "rpy_rad": pytest.approx([0.0, 0.08, 0.0], abs=1e-4)}
+
+
+def test_nothing_mended_is_nothing_said():
+    told = mounting_findings(inputs(), streams("tf_static"))
+    assert (told.warnings, told.facts) == ((), None)
+
+
+def test_both_are_said_where_both_were_mended():
+    taken = inputs((0.2, 0.0, 0.9))
+    taken.arm, taken.imu_tilt = Arm(np.array([0.1, 0, 0, 0]), np.eye(4)), Tilt(np.array([0.05, 0.0]), np.zeros(2))
+    told = mounting_findings(taken, streams("recipe"))
+    assert [line.split(":")[0] for line in told.warnings] == ["gnss", "imu"]
