@@ -20,7 +20,7 @@ _BY_LIBRARY = {
         learning/losses.py:keras_loss.loss learning/models.py:Model.network learning/models.py:write_model learning/models.py:set_weights
         learning/network.py:resnet18 learning/network.py:_normed learning/network.py:_basic_block learning/network.py:named_weights""",
     "torch": "dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_tensors",
-    "rasterio": """formats/maps/geotiff.py:TilePool._dataset formats/maps/geotiff.py:_grey formats/maps/geotiff.py:_open_as
+    "rasterio": """formats/maps/geotiff.py:RasterTiles._dataset formats/maps/geotiff.py:_grey formats/maps/geotiff.py:_open_as
         formats/maps/geotiff.py:_refuse_unplaced formats/maps/geotiff.py:_choose_bands formats/maps/geotiff.py:_scaling
         formats/maps/geotiff.py:_vertical_unit_m formats/maps/geotiff.py:_described""",
     "zarr": """formats/maps/map_files.py:_put formats/maps/map_files.py:_place formats/maps/map_files.py:_add_layer

@@ -61,7 +61,7 @@ class Span:
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class ChunkLayout:
     """The parts of a span's chunks that hold wanted messages, laid one after the other: ``size`` bytes in all.
 
     ``places`` gives of each chunk, by its number, where a piece starts and stops in it, and where it is laid; ``offset`` where each
@@ -328,7 +328,7 @@ def spans(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted:
         first = after
 
 
-def layout(entries: Entries) -> Layout:
+def layout(entries: Entries) -> ChunkLayout:
     """Return the pieces of a span's chunks that hold its messages."""
     begins = np.ones(len(entries.offset), np.bool_)
     far = entries.offset[1:] - entries.end[:-1] > _GAP_BYTES
@@ -340,7 +340,7 @@ def layout(entries: Entries) -> Layout:
     places: dict[int, list[tuple[int, int, int]]] = {}
     for chunk, *place in zip(*(values.tolist() for values in (entries.chunk[at], start, stop, to)), strict=True):
         places.setdefault(chunk, []).append((place[0], place[1], place[2]))
-    return Layout(places, offset, int((stop - start).sum()))
+    return ChunkLayout(places, offset, int((stop - start).sum()))
 
 
 def excerpt(

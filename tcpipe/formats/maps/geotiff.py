@@ -107,7 +107,7 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """What one raster file is that can play its role; `TilePool.read` reads it.
+    """What one raster file is that can play its role; `RasterTiles.read` reads it.
 
     ``affine`` is (a, b, c, d, e, f) of x = a·col + b·row + c, y = d·col + e·row + f at pixel *corners*; ``crs`` is WKT, or empty where
     the file has none; ``warnings`` are plain sentences.
@@ -138,7 +138,7 @@ class Tile:
 
 
 @dataclass(slots=True)
-class TilePool:
+class RasterTiles:
     """Files that are open: a few of them, those that were read last."""
 
     _open: dict[Path, Any] = field(default_factory=dict)
@@ -194,9 +194,9 @@ def _grey(
 
 
 @contextmanager
-def tile_pool() -> Iterator[TilePool]:
+def raster_tiles() -> Iterator[RasterTiles]:
     """Read tiles, with GDAL set up as `_CONFIG` says."""
-    pool = TilePool()
+    pool = RasterTiles()
     with rasterio.Env(**_CONFIG):
         try:
             yield pool

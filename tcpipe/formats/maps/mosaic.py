@@ -19,7 +19,7 @@ from pyproj import CRS
 from pyproj.exceptions import CRSError
 
 from tcpipe.errors import MapError
-from tcpipe.formats.maps.geotiff import Tile, TilePool, Use, read_tile, tile_pool
+from tcpipe.formats.maps.geotiff import RasterTiles, Tile, Use, raster_tiles, read_tile
 
 MAX_FILES = 100_000
 """Of one layer."""
@@ -47,7 +47,7 @@ class Raster:
     tiles: tuple[Tile, ...]
     _corners: NDArray[np.int64] = field(repr=False)
     """First row, last row (not included), first column, last column of each tile, shape (T, 4)."""
-    _pool: TilePool = field(repr=False)
+    _pool: RasterTiles = field(repr=False)
 
     @property
     def name(self) -> str:
@@ -55,7 +55,7 @@ class Raster:
         return _label([tile.path for tile in self.tiles], of=lambda path: path.name)
 
     def read(self, row0: int, row1: int, col0: int, col1: int) -> tuple[NDArray[Any], NDArray[np.bool_]]:
-        """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.TilePool.read` does of one tile."""
+        """Return a window, and which of its pixels have data, as `tcpipe.formats.maps.geotiff.RasterTiles.read` does of one tile."""
         low = np.maximum(self._corners[:, ::2], (row0, col0))
         high = np.minimum(self._corners[:, 1::2], (row1, col1))
         values = np.zeros((row1 - row0, col1 - col0), self.tiles[0].dtype)
@@ -97,7 +97,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
     _refuse_odd(tiles, "CRS", _crs_keys(tiles), "gdalwarp -t_srs EPSG:n in.tif out.tif")
     _refuse_odd(tiles, "type and bands", [tile.kind for tile in tiles], "gdal_translate -ot T -b n in.tif out.tif")
     affine, corners = _laid(tiles)
-    with tile_pool() as pool:
+    with raster_tiles() as pool:
         yield Raster(
             label=_label(paths),
             role=role,
