@@ -250,12 +250,13 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
     return Outcome(
         start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed,
         bits=numbers(table["quality"]).tolist(), placed=placed.tolist(),
-        driven_m=sum(labelled.ledger_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=_wheels_m(read),
+        driven_m=sum(labelled.ledger_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
         kept_m=labelled.ledger_m.get("kept", 0.0), said=list(dict.fromkeys(labelled.info.findings.warnings)),
     )  # fmt: skip
 
 
-def _wheels_m(read: Streams) -> float:
+def wheels_m(read: Streams) -> float:
+    """Return the way that the wheels tell [m]; NaN without."""
     if "wheel_odometry" not in read.tables:
         return float("nan")
     table = read.tables["wheel_odometry"]

@@ -61,6 +61,8 @@ class Figures:
     width: dict[str, float] = field(default_factory=dict)
     """Median deviation over RMS error."""
     doubted: float = float("nan")
+    doubted_clean: float = 0.0
+    """Of the same sensors without a fault."""
     kept_good: float = float("nan")
     """Of the labels outside the fault's window whose errors are within twice those of the clean log, the share that no bit doubts."""
     good: float = float("nan")
@@ -170,6 +172,7 @@ def _share(hit: np.ndarray, block: np.ndarray) -> Share:
 def _yield(made: Figures, pool: _Pool, clean: _Pool) -> None:
     good = ~pool.inside_window
     outside = int(good.sum())
+    made.doubted_clean = float(clean.doubt.mean()) if clean.doubt.size else 0.0
     for name in QUANTITIES:
         known = clean.error[name][np.isfinite(clean.error[name])]
         if known.size:
@@ -191,16 +194,17 @@ def _failures(made: Figures, cell: Cell, outcomes: Sequence[Outcome]) -> list[st
     for name, shares in made.inside.items():
         if (beyond := 1.0 - shares[2].value) > _MOST_BEYOND[name]:
             found.append(f"{name} {beyond:.0%} beyond 2 sigma")
-    scaled = (
-        "gnss" not in SETS[cell.sensors]
-    )  # else the odometry's scale is one error common to a run: of three drives there are three
-    if scaled:
+    left_out = SETS[cell.sensors]
+    if (
+        scaled := "gnss" not in left_out
+    ):  # else the odometry's scale is one error of a run: of three drives there are three
         found += [f"{name} sigma {w:.1f} RMS" for name, w in made.width.items() if w > _WIDEST]
-    if cell.fault.calibrated:
-        found += _uncalibrated(made) if scaled and len(SETS[cell.sensors]) <= 1 else []
+    most_is_good, fewest_kept = made.good >= 0.5, _FEWEST_KEPT * (1.0 - made.doubted_clean)
+    if cell.fault.calibrated and scaled and len(left_out) <= 1:
+        found += _uncalibrated(made)
         if made.doubted > _MOST_DOUBT:
             found.append(f"{made.doubted:.0%} doubted")
-    elif made.kept_good < _FEWEST_KEPT and made.good >= 0.5:  # else most is rightly doubted
+    elif most_is_good and made.kept_good < fewest_kept:
         found.append(f"{made.kept_good:.0%} of good metres kept")
     harmed = bool(found) or made.refused > 0 or made.doubted > _MOST_DOUBT
     missing = [o for o in outcomes if not re.search(cell.fault.said, "\n".join(o.said).lower())]
@@ -262,10 +266,9 @@ def page(every: Sequence[Figures]) -> str:
 
 def _line(made: Figures) -> str:
     quantities = [_quantity(made, name) for name in QUANTITIES]
-    true_m = made.ladder["true"] or 1.0
-    ladder = ", ".join(
-        f"{100 * made.ladder[name] / true_m:.0f}" for name in ("steady", "labelled", "undoubted", "sampled")
-    )
+    true_m = made.ladder.get("true") or 1.0
+    steps = ("steady", "labelled", "undoubted", "sampled") if made.ladder else ()
+    ladder = ", ".join(f"{100 * made.ladder[name] / true_m:.0f}" for name in steps)
     bits = ", ".join(f"{name} {share:.0%}" for name, share in sorted(made.bits.items(), key=lambda item: -item[1])[:3])
     said = "<br>".join(line.replace("|", "/")[:160] for line in made.said)
     verdict = "; ".join(made.failures) or "ok"
