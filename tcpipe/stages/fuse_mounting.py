@@ -16,7 +16,7 @@ from tcpipe.tables.levels import Streams
 
 _ROUNDS = 3
 _SURE = 4.0  # standard deviations
-_SURE_OF_ARM = 5.0
+_SURE_OF_ARM = 4.0
 _LEAST_TILT_RAD = np.radians(1.0)
 _LEAST_ARM_M = 0.1
 _SETTLED_M = 0.02

@@ -49,6 +49,7 @@ _CHANCE = 0.01
 _FEWEST_FIXES = 5
 _MAX_GAP_NS = 500_000_000
 _MOVES_M = 0.5
+_STANDS_MPS = 0.1
 _MOSTLY = 0.5
 _NO_ARM_M = 1.0
 _FEWEST_WINDOWS = 4
@@ -225,9 +226,12 @@ def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64])
     for role, source in m.odometries().items():
         axes = slice(0, 1 if role == WHEELS else 2)
         point = way + np.cross(turned, source.lever_arm_m)
+        said = means(source.stamp_ns, source.velocity_mps[:, axes]) * step_s
+        if role == WHEELS:  # that turn while the robot stands: it is stuck, and they are right
+            said[(np.abs(point[:, :1]) < _STANDS_MPS * step_s) & (np.abs(said) > _STANDS_MPS * step_s)] = np.nan
         yield _way(
             role,
-            _sums(means(source.stamp_ns, source.velocity_mps[:, axes]) * step_s, windows),
+            _sums(said, windows),
             _sums(point[:, axes], windows),
             _noise(source.variance_m2ps2[:, 0], source),
             way_std,

@@ -7,7 +7,7 @@ told from it where the speed changes. What the turns do not show stays at what i
 while it turns, and a turning point ahead of base_link looks like an antenna behind it: so much stays unknown.
 
 An IMU that is pitched against the robot feels a slope that the robot does not climb: its forward specific force, less acceleration, over
-gravity, against the rise of the track. One that is rolled sees a part of every turn about its y axis: on any plane a robot turns about its
+gravity, against the rise of the fixes. One that is rolled sees a part of every turn about its y axis: on any plane a robot turns about its
 own z axis, so the rate about y follows the rate about z.
 """
 
@@ -27,7 +27,7 @@ from tcpipe.fusion.measurements import (
     Measurements,
     Positions,
 )
-from tcpipe.fusion.signals import interval_means, median_period_ns, seconds
+from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, product, quat_from_rpy, rotate
 
@@ -42,9 +42,10 @@ _GRAVITY_MPS2 = 9.80665
 _WINDOW_S = 40.0
 _FEWEST = 20
 _WILD = 5.0
-_TURNING_POINT_STD_M = {WHEELS: 0.1, VISUAL: 0.01}
+_TURNING_POINT_STD_M = {WHEELS: 0.06, VISUAL: 0.01}
 _MOVES_MPS = 0.3
 _BLOCK_S = 10.0
+_CLIMB_S = 4.0
 _LEAST_TILT_STD_RAD = 0.004
 
 
@@ -55,7 +56,7 @@ class ArmEvidence:
     Attributes
     ----------
     matrix, vector : shapes (W, 4, 4) and (W, 4).
-    unseen_std_m : how far the odometry's own turning point may be off base_link.
+    unseen_std_m : how far ahead of base_link the odometry's own turning point may be.
     """
 
     matrix: Floats
@@ -73,7 +74,7 @@ class Arm:
 
 @dataclass(frozen=True, slots=True)
 class TiltEvidence:
-    """Sums over B blocks: of the rate about z squared, its product with that about y, rows moved, and the slope felt beyond the track's."""
+    """Sums over B blocks: of the rate about z squared, its product with that about y, rows moved, and the slope felt beyond the fixes'."""
 
     turning: Floats
     beside: Floats
@@ -192,16 +193,16 @@ def solve_arm(told: Sequence[ArmEvidence | None], moved_m: Floats, *, height_std
     fewer = max(1.0, float(np.mean(np.diag(alike @ (spread + prior) @ alike) / np.diag(alike))))
     covariance = np.linalg.inv(matrix.sum(0) / fewer + prior)
     error = covariance @ vector.sum(0) / fewer
-    covariance[np.diag_indices(2)] += max(e.unseen_std_m for e in evidence) ** 2
+    covariance[0, 0] += max(e.unseen_std_m for e in evidence) ** 2
     beyond = np.minimum(known / np.sqrt(np.diag(covariance)), 1.0)
     return Arm(error, covariance * np.outer(beyond, beyond))
 
 
 def antenna_doubt(arm: Arm | None, tilt: Tilt | None, lever_arm_m: tuple[float, float, float]) -> Floats | None:
-    """Return the covariance of arm and lag that what was mended leaves, shape (4, 4): a tilted IMU moves an antenna above it."""
+    """Return the covariance of the arm that what was mended leaves [m²], shape (3, 3): a tilted IMU moves an antenna above it."""
     if arm is None and tilt is None:
         return None
-    covariance = np.zeros((4, 4)) if arm is None else arm.covariance.copy()
+    covariance = np.zeros((3, 3)) if arm is None else arm.covariance[:3, :3].copy()
     if tilt is not None:
         covariance[np.diag_indices(2)] += (tilt.std_rad[::-1] * lever_arm_m[2]) ** 2
     return covariance
@@ -224,14 +225,34 @@ def tilt_evidence(found: Trajectory, m: Measurements) -> TiltEvidence | None:
     speed = np.linalg.norm(velocity, axis=1)
     ahead = np.sum(matrix_from_quat(found.quat_xyzw)[:-1, :, 0] * velocity, axis=1)
     quicker = np.diff(np.sign(ahead.mean()) * np.linalg.norm(found.velocity_enu_mps, axis=1)) / np.diff(row_s)
-    moving = (speed > _MOVES_MPS) & (np.sign(ahead) == np.sign(ahead.mean()))
-    rise = np.sign(ahead) * velocity[:, 2] / np.maximum(speed, _MOVES_MPS)
+    climb, known = _climb_mps(m.gnss, found.stamp_ns)
+    moving = known & (speed > _MOVES_MPS) & (np.sign(ahead) == np.sign(ahead.mean()))
+    rise = np.sign(ahead) * climb / np.maximum(speed, _MOVES_MPS)
     beyond = np.where(moving, (felt - quicker) / _GRAVITY_MPS2 - rise, 0.0)
     rate = rate - np.median(rate, axis=0)
     block = max(1, round(_BLOCK_S * 1e9 / median_period_ns(found.stamp_ns)))
     first = np.arange(0, row_s.size - 1, block)
     sums = (rate[:, 1] ** 2, rate[:, 0] * rate[:, 1], moving.astype(np.float64), beyond)
     return TiltEvidence(*(np.add.reduceat(values, first) for values in sums))
+
+
+def _climb_mps(gnss: Positions, stamp_ns: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return how fast the fixes climb in each row's interval, wild ones bridged, and where they tell it, shape (N - 1,).
+
+    The track would not do: an IMU that is surely pitched may have led it off the fixes.
+    """
+    zero, reach_ns = int(stamp_ns[0]), int(_CLIMB_S * 0.5e9)
+    height = gnss.position_enu_m[:, 2]
+    if height.size > 4:
+        padded = np.pad(height, 2, mode="edge")
+        height = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
+    before, after = stamp_ns[:-1] - reach_ns, stamp_ns[1:] + reach_ns
+    fix_s = seconds(gnss.stamp_ns, zero)
+    low, high = (np.interp(seconds(at_ns, zero), fix_s, height) for at_ns in (before, after))
+    longest_ns = max(int(_CLIMB_S * 1e9), 3 * median_period_ns(gnss.stamp_ns))
+    inside = (before >= gnss.stamp_ns[0]) & (after <= gnss.stamp_ns[-1])
+    known = inside & ~in_gap(gnss.stamp_ns, before, after, longest_ns=longest_ns)
+    return (high - low) / ((after - before) * 1e-9), known
 
 
 def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
@@ -273,8 +294,8 @@ def rearmed(gnss: Positions, error_m: Floats) -> Positions:
     return replace(gnss, lever_arm_m=(x, y, z))
 
 
-def with_antenna_doubt(found: Trajectory, covariance: Floats) -> Trajectory:
-    """Return the trajectory with what is not known of arm and lag in its position: it turns with the robot, and lasts."""
-    columns = np.concatenate((matrix_from_quat(found.quat_xyzw), -found.velocity_enu_mps[:, :, None]), axis=2)
-    doubt_m2 = np.einsum("kij,jl,kil->ki", columns, covariance, columns)
+def with_antenna_doubt(found: Trajectory, covariance_m2: Floats) -> Trajectory:
+    """Return the trajectory with what is not known of the arm in its position: it turns with the robot, and lasts."""
+    rotation = matrix_from_quat(found.quat_xyzw)
+    doubt_m2 = np.einsum("kij,jl,kil->ki", rotation, covariance_m2, rotation)
     return replace(found, position_std_m=np.sqrt(found.position_std_m**2 + doubt_m2))

@@ -169,3 +169,16 @@ def test_a_track_shorter_than_a_window_has_nothing_to_audit(track, sensors):
     same, found = audited(replace(track, **few), sensors)
     assert found == audit.Audit((), ())
     assert same.stamp_ns.size == 40
+
+
+def test_wheels_that_turn_while_the_robot_stands_are_stuck_not_wrong(track, sensors):
+    here = replace(track, position_enu_m=np.tile(track.position_enu_m[:1], (track.stamp_ns.size, 1)))
+    for dug_in, telling in (
+        (sensors.wheels, 0),
+        (replace(sensors.wheels, velocity_mps=0.0 * sensors.wheels.velocity_mps), 1),
+    ):
+        _, found = audited(here, replace(sensors, wheels=dug_in, visual=None, gnss=None))
+        assert [each for each in found.disagreements if each.sensor == "wheel_odometry"] == []
+        compared = list(audit._comparisons(here, replace(sensors, wheels=dug_in), audit._windows(here.stamp_ns)))
+        (way,) = [one for one in compared if one.sensor == "wheel_odometry"]
+        assert way.told.mean() == pytest.approx(telling, abs=0.1)

@@ -113,7 +113,7 @@ def test_what_no_turn_shows_stays_unknown(track, sensors):
 
 def test_wheels_do_not_see_where_the_robot_turns_about(track, sensors):
     arm = arm_of(track, replace(sensors, visual=None))
-    assert (deviations(arm)[:2] >= 0.1).all()
+    assert deviations(arm)[0] >= 0.06
     assert arm_evidence(track, replace(sensors, visual=None, wheels=None)) is None
     assert arm_evidence(track, replace(sensors, gnss=None)) is None
     assert solve_arm([], NOWHERE) is None
@@ -142,19 +142,19 @@ def test_without_fixes_or_force_nothing_tells_a_tilt(track, sensors):
 
 
 def test_what_is_not_known_of_an_arm_turns_with_the_robot(track):
-    """An arm known to 0.3 m ahead: of a robot that looks north, north is unknown; the lag costs what is driven in it."""
+    """An arm known to 0.3 m ahead: of a robot that looks north, north is unknown."""
     north = replace(
         track,
         quat_xyzw=np.tile(Rotation.from_euler("z", 90, degrees=True).as_quat(), (track.stamp_ns.size, 1)),
         velocity_enu_mps=np.tile([0.0, 0.9, 0.0], (track.stamp_ns.size, 1)),
     )
-    doubted = with_antenna_doubt(north, np.diag([0.09, 0.0, 0.0, 0.01]))
+    doubted = with_antenna_doubt(north, np.diag([0.09, 0.0, 0.0]))
     assert doubted.position_std_m[:, 0] == pytest.approx(0.01)
-    assert doubted.position_std_m[:, 1] == pytest.approx(np.sqrt(0.01**2 + 0.3**2 + 0.09**2))
+    assert doubted.position_std_m[:, 1] == pytest.approx(np.hypot(0.01, 0.3))
 
 
 def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
     assert antenna_doubt(None, None, (0.0, 0.0, 1.0)) is None
     tilt = Tilt(np.zeros(2), np.array([0.02, 0.01]))
     doubt = antenna_doubt(unknown_arm(), tilt, (0.0, 0.0, 0.9))
-    assert np.diag(doubt) == pytest.approx([0.25 + 0.009**2, 0.25 + 0.018**2, 0.25, 0.0])
+    assert np.diag(doubt) == pytest.approx([0.25 + 0.009**2, 0.25 + 0.018**2, 0.25])
