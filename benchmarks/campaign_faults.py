@@ -316,7 +316,7 @@ FAULTS: dict[str, Fault] = {
         Fault("GNSS 0.1 s late", ("gnss",), None, "late", readings=_of("gnss", _late(0.1))),
         Fault("GNSS 0.2 s late", ("gnss",), None, "late", readings=_of("gnss", _late(0.2))),
         Fault("IMU 0.1 s late", ("imu",), None, "late", readings=_of("imu", _late(0.1))),
-        Fault("straight ahead", route="straight"),
+        Fault("straight ahead", route="straight", calibrated=True),
         Fault("receipt stamps, laggy odometry", ("wheels",), None, messages=_receipt_beside_laggy),
         Fault("slow simulated time", messages=_slow_simulation, true_ns=_from_simulated),
         # Odometry and IMU that lie

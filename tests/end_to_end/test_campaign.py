@@ -35,13 +35,14 @@ def test_labels_of_a_clean_log_are_true_and_not_doubted(clean):
         assert found.inside[name][2].value > 0.9
 
 
-@pytest.mark.parametrize("name", ["GNSS 0.2 s late", "wrong fix", "metres, none claimed"])
+@pytest.mark.parametrize("name", ["GNSS 0.2 s late", "metres, none claimed", "IMU pitched by 5 deg", "wrong fix"])
 def test_no_label_is_sure_and_wrong(name, clean):
     """Of the labels that no bit doubts, few lie beyond two deviations."""
     found = figures(Cell("all", 10.0, FAULTS[name]), clean)
     assert not found.traces
     for label in LABELS:
         assert 1.0 - found.inside[label][2].value <= 0.1 if label in found.inside else found.doubted > 0.5
+    assert "start" not in found.inside or 1.0 - found.inside["start"][2].value <= 0.15
 
 
 @pytest.mark.parametrize("name", ["5 s", "never moves", "GNSS covariance NaN"])
