@@ -41,6 +41,8 @@ LATE_STD_S = 0.1
 _GRAVITY_MPS2 = 9.80665
 _WINDOW_S = 40.0
 _FEWEST = 20
+_FEWEST_WINDOWS = 3
+"""Errors of the fixes last: how far windows disagree is not told by fewer."""
 _WILD = 5.0
 _TURNING_POINT_STD_M = {WHEELS: 0.06, VISUAL: 0.01}
 _MOVES_MPS = 0.3
@@ -168,7 +170,7 @@ def _basis(columns: Floats) -> Floats:
 
 
 def solve_arm(told: Sequence[ArmEvidence | None], moved_m: Floats, *, height_std_m: float = ARM_STD_M) -> Arm | None:
-    """Return the error of the arm by all stretches, and how well it is known; None without evidence.
+    """Return the error of the arm by all stretches, and how well it is known; None without evidence of three windows.
 
     Fixes of one window err together: by how windows scatter more than their fixes claim (Huber's sandwich), they count as fewer. No
     deviation is beyond what is known beforehand.
@@ -183,6 +185,8 @@ def solve_arm(told: Sequence[ArmEvidence | None], moved_m: Floats, *, height_std
     if not evidence:
         return None
     matrix, vector = (np.concatenate([getattr(e, name) for e in evidence]) for name in ("matrix", "vector"))
+    if len(matrix) < _FEWEST_WINDOWS:
+        return None
     vector = vector + matrix[:, :, :3] @ moved_m
     known = np.array([ARM_STD_M, ARM_STD_M, height_std_m, LATE_STD_S])
     prior = np.diag(1.0 / known**2)

@@ -92,6 +92,12 @@ def test_a_wrong_fix_now_and_then_and_for_a_while_moves_no_antenna(track, sensor
     assert np.abs(arm.error[:2]).max() < 0.1
 
 
+def test_what_only_two_windows_show_is_no_evidence(track, sensors):
+    told = arm_evidence(track, sensors)
+    two = replace(told, matrix=told.matrix[:2], vector=told.vector[:2])
+    assert solve_arm([two], np.zeros(3)) is None
+
+
 def test_what_no_turn_shows_stays_unknown(track, sensors):
     """Straight ahead on the level at one speed, an arm is but a constant."""
     at_s = (track.stamp_ns - track.stamp_ns[0]) * 1e-9
