@@ -9,12 +9,12 @@ import numpy as np
 from tcpipe.errors import FusionError
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
+from tcpipe.stages.fuse_agreeing import fuse_agreeing
 from tcpipe.stages.fuse_audit import audit_findings
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, rejections_table
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
-from tcpipe.stages.fuse_mounting import fuse_mounted
 from tcpipe.stages.fuse_mounting_findings import mounting_findings
-from tcpipe.stages.fuse_sanity import sane_inputs, without_lone_sensors
+from tcpipe.stages.fuse_sanity import sane_inputs
 from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -38,17 +38,13 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     """
     # 1. Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
     inputs, sanity = sane_inputs(prepare_inputs(streams, config), streams)
-    # 2. Each stretch for itself: where it starts, filter and smoother; again where that shows other mountings.
-    inputs, fused = fuse_mounted(inputs, streams, config)
-    # 3. A sensor that is alone against the others in most of the way is of another drive: then without it.
-    if (again := without_lone_sensors(inputs, sanity, fused.tallies, streams)) is not None:
-        inputs, sanity = again
-        inputs, fused = fuse_mounted(inputs, streams, config)
+    # 2. Each stretch for itself: where it starts, filter and smoother; again where that shows other mountings, or a sensor to be alone.
+    inputs, sanity, fused = fuse_agreeing(inputs, sanity, streams, config)
     if not fused.found:
         raise FusionError(_nothing(streams, inputs), *sanity.warnings)
     table = TRACK.table(**{name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]})
     datum = None if inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
-    # 4. What was left out, where sensors disagree with the track, and whether their clocks agree.
+    # 3. What was left out, where sensors disagree with the track, and whether their clocks agree.
     summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     clocks = clock_findings(streams, inputs)
     table = with_offset_cost(table, clocks.facts)

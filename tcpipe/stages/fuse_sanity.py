@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from tcpipe.fusion.checks.audit import Tally, alone_in_most
 from tcpipe.fusion.checks.sensors import CommandedSpeed, Refusal, check_sensors
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
@@ -29,23 +28,13 @@ def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, F
     checks = check_sensors(
         inputs.measurements[epoch], command=_command(streams, epoch), stated=stated, felt=_felt(streams)
     )
-    return _left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
+    return left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
 
 
-def without_lone_sensors(
-    inputs: FusionInputs, sanity: Findings[SensorChecks], tallies: Sequence[Tally], streams: Streams
-) -> tuple[FusionInputs, Findings[SensorChecks]] | None:
-    """Return the inputs without the sensors that two others contradict in most of the way, and why; None where there are none."""
-    lone = alone_in_most(tallies)
-    if not lone:
-        return None
-    why = "in most of the way the others contradict it, and not each other (another clock, drive or unit?)"
-    return _left_out(inputs, sanity, [Refusal(role, why) for role in lone], streams)
-
-
-def _left_out(
+def left_out(
     inputs: FusionInputs, before: Findings[SensorChecks], refusals: Sequence[Refusal], streams: Streams
 ) -> tuple[FusionInputs, Findings[SensorChecks]]:
+    """Return the inputs without refused sensors, with why and the warnings that name the mending line."""
     refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
     reasons = {**before.facts.refused, **{refusal.role: refusal.why for refusal in refusals}}

@@ -51,13 +51,14 @@ _MAX_GAP_NS = 500_000_000
 _MOVES_M = 0.5
 _STANDS_MPS = 0.1
 _MOSTLY = 0.5
+_LITTLE = 0.1
 _NO_ARM_M = 1.0
 _FEWEST_WINDOWS = 4
 _SCALES = (0.5, 2.0)
 _LASTING_MPS = 0.02
 _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 _TURN_SCALE_STD = {WHEELS: 0.3, VISUAL: 0.03, IMU: 0.01}
-_LASTING_RADPS = {WHEELS: 0.02, VISUAL: 0.01, IMU: 0.003}
+_LASTING_RADPS = {WHEELS: 0.02, VISUAL: 0.004, IMU: 0.003}
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +168,11 @@ def undecided_in_most(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
     A position that is off while ways and turns agree is known to be off by how much, and stands in the deviations.
     """
     return tuple((t.sensor, t.what) for t in _summed(tallies) if t.what != "position" and _most(t.undecided, t.moving))
+
+
+def consistent(tallies: Iterable[Tally]) -> bool:
+    """Return whether nothing is contradicted undecided in more than a little of the way, positions included."""
+    return all(t.undecided <= _LITTLE * t.moving for t in _summed(tallies))
 
 
 def _most(windows: int, moving: int) -> bool:

@@ -44,7 +44,7 @@ _FEWEST = 20
 _FEWEST_WINDOWS = 3
 """Errors of the fixes last: how far windows disagree is not told by fewer."""
 _WILD = 5.0
-_TURNING_POINT_STD_M = {WHEELS: 0.06, VISUAL: 0.01}
+_TURNING_POINT_STD_M = {WHEELS: 0.03, VISUAL: 0.01}
 _MOVES_MPS = 0.3
 _BLOCK_S = 10.0
 _CLIMB_S = 4.0

@@ -119,7 +119,7 @@ def test_what_no_turn_shows_stays_unknown(track, sensors):
 
 def test_wheels_do_not_see_where_the_robot_turns_about(track, sensors):
     arm = arm_of(track, replace(sensors, visual=None))
-    assert deviations(arm)[0] >= 0.06
+    assert deviations(arm)[0] >= 0.03
     assert arm_evidence(track, replace(sensors, visual=None, wheels=None)) is None
     assert arm_evidence(track, replace(sensors, gnss=None)) is None
     assert solve_arm([], NOWHERE) is None

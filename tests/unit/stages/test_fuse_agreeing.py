@@ -1,0 +1,94 @@
+"""Which sensor is left out where they contradict each other: the one that is alone, or the one without which the others agree."""
+
+import numpy as np
+import pytest
+
+from tcpipe.fusion.checks.audit import Tally
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.recipe import FuseConfig
+from tcpipe.stages import fuse_agreeing
+from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.tables.findings import Findings, SensorChecks
+from tcpipe.tables.levels import Sensor, Streams
+
+STAMP_NS = np.arange(5, dtype=np.int64)
+ROLES = ("gnss", "imu", "wheel_odometry", "visual_odometry")
+STREAMS = Streams({}, {role: Sensor(f"/{role}", "x/msg/Y", role, "why") for role in ROLES}, "husky")
+NOTHING = Findings((), SensorChecks())
+
+
+def odometry():
+    return BodyVelocities(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3)), np.zeros(5), np.ones(5))
+
+
+def inputs(*, visual=True, imu=True):
+    quat = np.full((5, 4), np.nan)
+    heard = Measurements(
+        gnss=Positions(STAMP_NS, np.zeros((5, 3)), np.ones((5, 3))),
+        imu=InertialMeasurements(STAMP_NS, np.zeros((5, 3)), np.zeros((5, 3)), quat, 0.01, 0.1) if imu else None,
+        wheels=odometry(),
+        visual=odometry() if visual else None,
+    )
+    return FusionInputs((15.0, 47.0, 400.0), {0: heard})
+
+
+def contradicted(windows, *, alone=0, sensor="visual_odometry"):
+    return [Tally(sensor, "displacement", 20, windows, alone)]
+
+
+@pytest.fixture
+def fusing(monkeypatch):
+    """Fuse by a table: what the audit says of each set of sensors; all others are contradicted."""
+    tried = []
+
+    def put(told):
+        def fuse(given, *_):
+            (heard,) = given.measurements.values()
+            tried.append(frozenset(heard.sensors()))
+            return Fused(tallies=told.get(tried[-1], contradicted(15)))
+
+        monkeypatch.setattr(fuse_agreeing, "fuse_stretches", fuse)
+        monkeypatch.setattr(fuse_agreeing, "fuse_mounted", lambda given, *rest: (given, fuse(given, *rest)))
+        return tried
+
+    return put
+
+
+def agreed(given):
+    found, sanity, _ = fuse_agreeing.fuse_agreeing(given, NOTHING, STREAMS, FuseConfig())
+    return set(found.measurements[0].sensors()), sanity
+
+
+def test_sensors_that_agree_are_fused_once(fusing):
+    tried = fusing({frozenset(ROLES): contradicted(2)})
+    sensors, sanity = agreed(inputs())
+    assert (sensors, sanity.facts.refused, len(tried)) == (set(ROLES), {}, 1)
+
+
+def test_one_that_is_alone_in_most_of_the_way_is_left_out(fusing):
+    tried = fusing({frozenset(ROLES): contradicted(0, alone=15, sensor="gnss")})
+    sensors, sanity = agreed(inputs())
+    assert sensors == set(ROLES) - {"gnss"}
+    assert len(tried) == 2
+    assert "/gnss is not fused: in most of the way the others contradict it" in sanity.warnings[0]
+
+
+def test_the_one_without_which_the_others_agree_is_left_out(fusing):
+    fusing({frozenset(ROLES) - {"imu"}: contradicted(1)})
+    sensors, sanity = agreed(inputs())
+    assert sensors == set(ROLES) - {"imu"}
+    assert list(sanity.facts.refused) == ["imu"]
+
+
+def test_where_either_of_two_would_do_nobody_can_tell_and_none_is_left_out(fusing):
+    fusing({frozenset(ROLES) - {role}: contradicted(1) for role in ("imu", "gnss")})
+    sensors, sanity = agreed(inputs())
+    assert (sensors, sanity.facts.refused) == (set(ROLES), {})
+
+
+def test_of_two_sensors_nobody_can_tell_and_nothing_is_tried(fusing):
+    tried = fusing({frozenset({"gnss"}): contradicted(0), frozenset({"wheel_odometry"}): contradicted(0)})
+    sensors, _ = agreed(inputs(visual=False, imu=False))
+    assert sensors == {"gnss", "wheel_odometry"}
+    assert len(tried) == 1
