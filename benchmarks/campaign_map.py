@@ -5,6 +5,7 @@ A tiny drive is ingested and a dataset built on the map. Right is a refusal, or 
 
 from __future__ import annotations
 
+import re
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -37,7 +38,7 @@ class MapResult:
     @property
     def failures(self) -> list[str]:
         """What is not as it should be."""
-        told = self.refused or any("feet" in line or "foot" in line for line in self.said)
+        told = self.refused or any(re.search(r"\b(feet|foot)\b", line) for line in self.said)
         return [] if told or self.slope_rms_deg < 2.0 else [f"slopes {self.slope_rms_deg:.0f} deg off, feet not named"]
 
 

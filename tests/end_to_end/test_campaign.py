@@ -13,6 +13,7 @@ import campaign
 from campaign_drives import FIRST_SEED, Fault, outcome_of, simulated
 from campaign_faults import FAULTS, Cell, cells
 from campaign_figures import LABELS, Figures, Result, figures_of
+from campaign_map import MapResult
 
 LENGTH_M = campaign.QUICK_LENGTH_M
 
@@ -78,3 +79,8 @@ def empty():
 def test_cells_are_many_and_named_once():
     names = [cell.name for cell in cells()]
     assert len(names) == len(set(names)) >= 80
+
+
+def test_a_footprint_is_no_word_about_feet():
+    assert MapResult(["nearest train footprint 0.00 m"], False, 18.0).failures
+    assert not MapResult(["its heights seem to be feet"], False, 18.0).failures
