@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import FusionError
 from tcpipe.fusion import error_state_kernel as kernel
 from tcpipe.fusion.course import course_of
+from tcpipe.fusion.fix_errors import FixErrors, find_fix_errors
 from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements, part
 from tcpipe.fusion.process import (
@@ -43,9 +44,9 @@ from tcpipe.fusion.standing import standing_intervals
 from tcpipe.fusion.timeline import EventTimeline, build_timeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.findings import StretchFacts, vector
+from tcpipe.tables.findings import Reopening, StretchFacts, vector
 
-_WIDTH = 30  # of a row of outputs, see `error_state_kernel._saved`; 81 more with covariances
+_WIDTH = kernel.SAVED  # of a row of outputs; 81 more with covariances
 _BLOCK = 2048
 _KEPT_BLOCKS = 12
 """Blocks whose forward pass is kept at once: about 2.2 kB an event, 55 MB."""
@@ -55,23 +56,23 @@ _Store = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], ND
 _ROLES = {kernel.GNSS_POSITION: GNSS, kernel.WHEEL_VELOCITY: WHEELS, kernel.VISUAL_VELOCITY: VISUAL}
 _DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
 _DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2}
-_MANY_FIXES, _SCATTERS_LITTLE = 50, 0.5
-_ODOMETRY_HOLDS_M = 0.1
-"""What odometry drifts in half a minute: a lasting error of the fixes that is smaller is followed, a larger one is averaged."""
-_LASTS_S = 30.0
+_MANY_FIXES = 50
+_LEAST_ERROR_M = 1e-4
+_NO_ERROR = np.empty(0)
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _LEVELLING_NS = 60_000_000_000
 _NEVER = 1e18
 _FIXED = 1e-6
-_MANY_REFUSED = 0.1
-_GNSS_FACTORS = (16.0, 256.0)
 _LOCK_OUT = {
     kernel.GNSS_POSITION: (5.0, 15.0, 5.0),
     kernel.WHEEL_VELOCITY: (5.0, 5.0, 0.3),
     kernel.VISUAL_VELOCITY: (5.0, 5.0, 0.3),
 }
+_DOUBTED = (5.0, 2.0, 2.0, 1.0)
+_GROWS_NS = 3_000_000_000
+_PASSES = 3
 """Refusals in a row, and seconds since the last accepted measurement, after which a gate reopens; the seconds where no other sensor
-of velocity is heard."""
+of velocity is heard. `_DOUBTED`: the same of fixes whose error is part of the state; the 1 says that it is lifted, and not the pose."""
 
 
 def run_error_state(
@@ -105,22 +106,47 @@ def run_error_state(
     """
     if measurements.imu is None and output_ns.size:
         initial = _levelled(measurements, initial, output_ns, gate_probability)
-    timeline = build_timeline(measurements, standing_intervals(measurements), output_ns)
-    run = _Run(timeline, measurements, gate_probability, lags=_lags(output_ns), covariances=covariances)
-    outputs = run.smoothed(initial) if smooth else run.filtered(initial)
-    if run.refused_share(kernel.GNSS_POSITION) > _MANY_REFUSED:
-        softer = _softened(run, initial, measurements, gate_probability)
-        if softer is not None:
-            run, outputs = softer, (softer.smoothed(initial) if smooth else softer.filtered(initial))
-    lasting_m2 = _lasting_variance(run, measurements)
-    if lasting_m2[0] > _ODOMETRY_HOLDS_M**2:
-        run = _less_often(run, measurements, gate_probability, lasting_m2[0])
-        outputs = run.smoothed(initial) if smooth else run.filtered(initial)
-    run.lasting_m2 = lasting_m2
-    run.unseen_scale_std = _unseen_scale_std(run, measurements)
+    standing = standing_intervals(measurements)
+    errors = find_fix_errors(measurements)
+    suspects: tuple[Reopening, ...] = ()
+    doubted = errors is not None and errors.matters
+    for _ in range(_PASSES):
+        heard = _counted(measurements, errors, doubted=doubted)
+        timeline = build_timeline(heard, standing, output_ns)
+        run = _Run(timeline, heard, gate_probability, lags=_lags(output_ns), covariances=covariances)
+        if doubted:
+            run.doubt_fixes(errors, suspects)
+        outputs = run.filtered(initial, keep=smooth)
+        found = tuple(reopening for reopening in _reopenings(timeline, run) if reopening.role == GNSS)
+        if suspects or not (run.fixes_contradict() if not doubted else run.carried and found):
+            break
+        # Once more: with an error of the fixes as part of the state, then with what led up to where they were off.
+        doubted, suspects = True, found if doubted else ()
+    run.suspects = suspects
+    if smooth:
+        run.smooth(outputs)
+    if errors is not None and not doubted:
+        run.lasting_m2 = _at_outputs(errors, heard, output_ns)
+    run.unseen_scale_std = _unseen_scale_std(run, heard)
     if not np.isfinite(outputs).all():
         raise FusionError("fusion: the estimate is not finite; look at the streams' values with tcpipe inspect --full")
     return _trajectory(timeline, outputs, run, output_ns)
+
+
+def _counted(measurements: Measurements, errors: FixErrors | None, *, doubted: bool) -> Measurements:
+    """Return the measurements with the variance of fixes that counts from one to the next: the claim, where nothing else holds the rest."""
+    if errors is None or measurements.gnss is None:
+        return measurements
+    variance = errors.white_m2 if doubted else np.maximum(errors.white_m2, measurements.gnss.variance_m2)
+    return replace(measurements, gnss=replace(measurements.gnss, variance_m2=variance))
+
+
+def _at_outputs(errors: FixErrors, measurements: Measurements, output_ns: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return what lasts of the fixes' errors at each wanted stamp [m²], shape (N, 3)."""
+    if measurements.gnss is None:
+        return np.zeros((output_ns.size, 3))
+    nearest = np.searchsorted(measurements.gnss.stamp_ns, output_ns).clip(0, measurements.gnss.stamp_ns.size - 1)
+    return np.asarray(errors.lasting_m2[nearest])
 
 
 def _levelled(
@@ -136,35 +162,6 @@ def _levelled(
     return replace(initial, quat_xyzw=quat_from_matrix(outputs[0, 0:9].reshape(3, 3)))
 
 
-def _softened(run: _Run, initial: InitialState, measurements: Measurements, gate_probability: float) -> _Run | None:
-    """Return a run whose GNSS variances are raised until few fixes are refused; None where that does not help."""
-    for factor in _GNSS_FACTORS:
-        variance = run.timeline.variance.copy()
-        variance[run.timeline.kind == kernel.GNSS_POSITION] *= factor
-        trial = _Run(
-            replace(run.timeline, variance=variance),
-            measurements,
-            gate_probability,
-            lags=run.lags,
-            covariances=run.covariances,
-            gnss_factor=factor,
-        )
-        trial.filtered(initial)
-        if trial.refused_share(kernel.GNSS_POSITION) <= _MANY_REFUSED:
-            return trial
-    return None
-
-
-def _lasting_variance(run: _Run, measurements: Measurements) -> NDArray[np.float64]:
-    """Return what the fixes err by together [m²], shape (3,): where they scatter far less than they claim, the rest of it lasts."""
-    of_gnss = (run.timeline.kind == kernel.GNSS_POSITION) & (run.verdict == kernel.ACCEPTED)
-    if measurements.gnss is None or of_gnss.sum() < _MANY_FIXES:
-        return np.zeros(3)
-    scatter = float(np.mean(run.nis[of_gnss])) / _DOF[kernel.GNSS_POSITION]
-    share = 1.0 - scatter if scatter < _SCATTERS_LITTLE else 0.0
-    return np.asarray(share * np.median(run.timeline.variance[of_gnss], axis=0))
-
-
 def _unseen_scale_std(run: _Run, measurements: Measurements) -> float:
     """Return what the fixes cannot tell of the odometry's scale: their error at both ends of the ground that they span.
 
@@ -178,23 +175,8 @@ def _unseen_scale_std(run: _Run, measurements: Measurements) -> float:
         return own
     few_m2 = np.median(run.timeline.variance[of_gnss, 0]) if of_gnss.sum() < _MANY_FIXES else 0.0
     span_m = np.linalg.norm(np.ptp(run.timeline.value[of_gnss, :2], axis=0))
-    return float(min(own, np.sqrt(2.0 * max(run.lasting_m2[0], few_m2)) / max(span_m, 1e-3)))
-
-
-def _less_often(run: _Run, measurements: Measurements, gate_probability: float, lasting_m2: float) -> _Run:
-    """Return a run that counts an error of the fixes that lasts once in half a minute, or less often where odometry knows no better."""
-    gnss = measurements.gnss
-    fixes = 1.0 if gnss is None else max(1.0, _LASTS_S * 1e9 / median_period_ns(gnss.stamp_ns))
-    variance = run.timeline.variance.copy()
-    variance[run.timeline.kind == kernel.GNSS_POSITION] *= min(fixes, lasting_m2 / _ODOMETRY_HOLDS_M**2)
-    return _Run(
-        replace(run.timeline, variance=variance),
-        measurements,
-        gate_probability,
-        lags=run.lags,
-        covariances=run.covariances,
-        gnss_factor=run.gnss_factor,
-    )
+    lasting_m2 = run.lasting_error_m() ** 2
+    return float(min(own, np.sqrt(2.0 * max(lasting_m2, few_m2)) / max(span_m, 1e-3)))
 
 
 @dataclass(slots=True)
@@ -205,9 +187,10 @@ class _Memory:
     P: NDArray[np.float64]
     refused: NDArray[np.float64]
     silent: NDArray[np.float64]
+    opened: NDArray[np.float64]
 
     def copy(self) -> _Memory:
-        return _Memory(self.x.copy(), self.P.copy(), self.refused.copy(), self.silent.copy())
+        return _Memory(self.x.copy(), self.P.copy(), self.refused.copy(), self.silent.copy(), self.opened.copy())
 
 
 class _Run:
@@ -221,16 +204,19 @@ class _Run:
         *,
         lags: Sequence[int],
         covariances: bool = False,
-        gnss_factor: float = 1.0,
     ) -> None:
         self.lags = lags
         self.covariances = covariances
         self._width = _WIDTH + 81 if covariances else _WIDTH
         self.timeline = timeline
-        self.lasting_m2 = np.zeros(3)
-        self.gnss_factor = gnss_factor
+        self.lasting_m2 = np.zeros((1, 3))
         count = timeline.stamp_ns.size
         self.nis = np.full(count, np.nan)
+        self.innovation = np.full((count, 3), np.nan)
+        self.suspects: tuple[Reopening, ...] = ()
+        self.start_error_m2 = np.empty(0)  # of the fixes, where the state holds it
+        self.kept_error, self.error_noise_m2 = np.ones(count), np.zeros((count, 3))
+        self.error_level_m2 = np.zeros((count, 3))
         self.verdict = np.zeros(count, np.int8)
         self.repairs = 0.0
         self.displacement_variance_m2 = np.full((timeline.output.max() + 1, len(DISPLACEMENT_LAGS_S)), np.nan)
@@ -247,13 +233,14 @@ class _Run:
             if source is not None:
                 self._levers[kind] = source.lever_arm_m
         self._densities = process_noise(measurements)
-        self._lock_out = np.full((8, 3), _NEVER)
+        self._lock_out = np.full((8, 4), _NEVER)
         for kind, limits in _LOCK_OUT.items():
-            self._lock_out[kind] = limits
+            self._lock_out[kind] = (*limits, 0.0)
+        self.carried = measurements.imu is not None and bool(measurements.odometries())
         if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
             self._lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
         if measurements.imu is None and measurements.visual is None:  # wheels that dig in must not overrule GNSS
-            self._lock_out[kernel.GNSS_POSITION, 1:] = 1.0
+            self._lock_out[kernel.GNSS_POSITION, 1:3] = 1.0
         # Without GNSS nothing tells how long a metre of odometry is; an accelerometer has a scale and an alignment of its own.
         self.unseen_scale_std = 0.0
         # From positions alone forward and reverse look the same: yaw is the course, and may be anything.
@@ -269,59 +256,112 @@ class _Run:
         self.scale_stds = scale_stds(measurements)
         self.last: _Memory
 
-    def refused_share(self, kind: int) -> float:
-        """Share of the measurements of a kind that the gate refused."""
-        verdict = self.verdict[self.timeline.kind == kind]
-        return float(np.mean(verdict == kernel.REFUSED)) if verdict.size else 0.0
+    def doubt_fixes(self, errors: FixErrors | None, suspects: Sequence[Reopening]) -> None:
+        """Make the fixes' own error part of the state: a Gauss-Markov process, as large and as lasting as they are of their kind.
 
-    def filtered(self, initial: InitialState) -> NDArray[np.float64]:
-        """Forward states at the wanted stamps, rows as `error_state_kernel` saves them."""
+        In the seconds before they were found to be off, ``suspects``, it may have grown already.
+        """
+        stamp_ns = self.timeline.stamp_ns[self.timeline.kind == kernel.GNSS_POSITION]
+        if errors is None or stamp_ns.size == 0:
+            return
+        fix = np.searchsorted(stamp_ns, self.timeline.stamp_ns, "right").clip(1, stamp_ns.size) - 1
+        lasting_m2 = np.maximum(errors.lasting_m2, _LEAST_ERROR_M**2)
+        for off in suspects:
+            before = (stamp_ns > off.start_ns - _GROWS_NS) & (stamp_ns < off.start_ns)
+            lasting_m2[before] = np.maximum(lasting_m2[before], max(off.size, kernel.OFF_M) ** 2)
+        lasting_m2 = lasting_m2[fix]
+        # What comes with another kind of fix comes when time passes next.
+        passes = np.maximum.accumulate(np.where(self.timeline.dt_s > 0, np.arange(fix.size), 0))
+        lasting_m2 = lasting_m2[passes]
+        before = np.concatenate((lasting_m2[:1], lasting_m2[:-1]))
+        shrunk = np.sqrt(np.minimum(1.0, lasting_m2[:, 0] / before[:, 0]))
+        self.kept_error = np.exp(-self.timeline.dt_s / errors.lasts_s[fix]) * shrunk
+        self.error_noise_m2 = np.maximum(lasting_m2 - self.kept_error[:, None] ** 2 * before, 0.0)
+        self.error_level_m2 = lasting_m2
+        self.start_error_m2 = lasting_m2[0]
+        if self.carried:
+            self._lock_out[kernel.GNSS_POSITION] = _DOUBTED
+
+    def fixes_contradict(self) -> bool:
+        """Return whether fixes were refused for seconds on end while the other sensors carried the pose: they may err together."""
+        of_gnss = np.flatnonzero(self.timeline.kind == kernel.GNSS_POSITION)
+        if not self.carried or of_gnss.size == 0:
+            return False
+        refused = self.verdict[of_gnss] != kernel.ACCEPTED
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], refused.astype(np.int8), [0]))))
+        first, last = edges[::2], edges[1::2] - 1
+        long_s = (self.timeline.stamp_ns[of_gnss[last]] - self.timeline.stamp_ns[of_gnss[first]]) * 1e-9
+        if ((last - first + 1 >= _DOUBTED[0]) & (long_s >= _DOUBTED[1])).any():
+            return True
+        heard = of_gnss[~refused]
+        normal = self.innovation[heard] / np.sqrt(self.timeline.variance[heard])
+        return bool(kernel.most_drift(normal) > kernel.SURELY * self.gates[kernel.GNSS_POSITION])
+
+    def filtered(self, initial: InitialState, *, keep: bool = False) -> NDArray[np.float64]:
+        """Forward states at the wanted stamps, rows as `error_state_kernel` saves them; ``keep`` what `smooth` wants."""
+        count = self.timeline.stamp_ns.size
         outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
-        memory = _start(initial, self.scale_stds, self.turn_scale_std)
-        self._forward(0, self.timeline.stamp_ns.size, memory, outputs, None)
+        blocks = self._blocks()
+        memory = _start(initial, self.scale_stds, self.turn_scale_std, self.start_error_m2)
+        self._checkpoints, self._kept = [], {}
+        if not keep:
+            self._forward(0, count, memory, outputs, None)
+        for index, (first, last) in enumerate(blocks if keep else ()):
+            self._checkpoints.append(memory.copy())
+            if index >= len(blocks) - _KEPT_BLOCKS:
+                self._kept[index] = self._store(first, last)
+            self._forward(first, last, memory, outputs, self._kept.get(index))
         self.last = memory
         return outputs
 
     def smoothed(self, initial: InitialState) -> NDArray[np.float64]:
         """Smoothed states at the wanted stamps."""
-        count = self.timeline.stamp_ns.size
-        outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
-        edges = [*range(0, count, _BLOCK), count]
-        blocks = list(pairwise(edges))
-        memory = _start(initial, self.scale_stds, self.turn_scale_std)
-        checkpoints: list[_Memory] = []
-        kept: dict[int, _Store] = {}
-        for index, (first, last) in enumerate(blocks):
-            checkpoints.append(memory.copy())
-            if index >= len(blocks) - _KEPT_BLOCKS:
-                kept[index] = self._store(first, last)
-            self._forward(first, last, memory, outputs, kept.get(index))
-        self.last = memory
-        adjoint, information = np.zeros(kernel.N), np.zeros((kernel.N, kernel.N))
-        links = _links(self.lags)
+        outputs = self.filtered(initial, keep=True)
+        self.smooth(outputs)
+        return outputs
+
+    def smooth(self, outputs: NDArray[np.float64]) -> None:
+        """Make the filtered states, as `filtered` has kept them, smoothed ones."""
+        n = self._errors
+        adjoint, information = np.zeros(n), np.zeros((n, n))
+        links = _links(self.lags, n)
+        blocks = self._blocks()
         for index in range(len(blocks) - 1, -1, -1):
             first, last = blocks[index]
-            if index not in kept:
-                kept[index] = self._store(first, last)
-                self._forward(first, last, checkpoints[index], outputs, kept[index])
+            if index not in self._kept:
+                self._kept[index] = self._store(first, last)
+                self._forward(first, last, self._checkpoints[index], outputs, self._kept[index])
             kernel.smooth_block(
                 first,
                 last,
                 self.timeline.output,
-                kept.pop(index),
+                self._kept.pop(index),
                 adjoint,
                 information,
                 outputs,
                 links,
                 self.displacement_variance_m2,
             )
-        return outputs
+
+    def lasting_error_m(self) -> float:
+        """Return how large an error of the fixes that lasts was taken to be, most of the time."""
+        if self.start_error_m2.size == 0:
+            return float(np.sqrt(np.median(self.lasting_m2[:, 0])))
+        return float(np.sqrt(np.median(self.error_level_m2[:, 0])))
+
+    def _blocks(self) -> list[tuple[int, int]]:
+        count = self.timeline.stamp_ns.size
+        return list(pairwise([*range(0, count, _BLOCK), count]))
+
+    @property
+    def _errors(self) -> int:
+        return kernel.N + self.start_error_m2.size
 
     def _store(self, first: int, last: int) -> _Store:
         """Return room for what the smoother wants of some events."""
         events, wanted = last - first, int(np.count_nonzero(self.timeline.output[first:last] >= 0))
-        n = kernel.N
-        return np.empty((events, 12, 9)), np.empty((events, 2, 3, n)), np.empty((events, 24)), np.empty((wanted, n, n))
+        n = self._errors
+        return np.empty((events, 12, 9)), np.empty((events, 2, 3, n)), np.empty((events, 25)), np.empty((wanted, n, n))
 
     def _forward(
         self,
@@ -349,19 +389,24 @@ class _Run:
             self._densities,
             self.gates,
             self._lock_out,
+            self.kept_error,
+            self.error_noise_m2,
+            self.error_level_m2,
             memory.x,
             memory.P,
             memory.refused,
             memory.silent,
+            memory.opened,
             store is not None,
             store or self._store(0, 0),
             self.nis,
+            self.innovation,
             self.verdict,
             outputs,
         )
 
 
-def _links(lags: Sequence[int]) -> tuple[NDArray[Any], ...]:
+def _links(lags: Sequence[int], n: int) -> tuple[NDArray[Any], ...]:
     """Return what the smoother remembers to link each wanted stamp to those ``lags`` rows later, in the kernel's order.
 
     The chain from the event at hand to the next wanted stamp; by node and row (a ring) the chains over the node's lag; by row the columns
@@ -382,24 +427,29 @@ def _links(lags: Sequence[int]) -> tuple[NDArray[Any], ...]:
     index = {lag: k for k, lag in enumerate(nodes)}
     recipe = np.array([[index.get(half, 0) for half in halves] for halves in nodes.values()])
     size = max(nodes) + 1
-    n = kernel.N
     chains = np.zeros((len(nodes), size, n, n))
     wanted = np.array([index[lag] for lag in lags])
     return np.eye(n), chains, np.zeros((size, n, 2)), np.zeros((size, 6)), recipe, np.array(list(nodes)), wanted
 
 
-def _start(initial: InitialState, scale_stds: tuple[float, float], turn_scale_std: float = 0.0) -> _Memory:
+def _start(
+    initial: InitialState,
+    scale_stds: tuple[float, float],
+    turn_scale_std: float = 0.0,
+    fix_error_m2: NDArray[np.float64] = _NO_ERROR,
+) -> _Memory:
     """Return the state at the start; with a scale error of the turn rate to be found in the place of the gyroscope's bias, or without."""
-    x = np.zeros(kernel.NX)
+    n = kernel.N + fix_error_m2.size
+    x = np.zeros(n + 6)
     rotation = matrix_from_quat(initial.quat_xyzw)
     x[0:9] = rotation.ravel()
     bias_std = turn_scale_std or initial.gyro_bias_std_radps
     x[9:12] = 0.0 if turn_scale_std else initial.gyro_bias_radps
     x[15:18] = initial.velocity_enu_mps
     x[18:21] = initial.position_enu_m
-    P = np.zeros((kernel.N, kernel.N))
+    P = np.zeros((n, n))
     P[0:3, 0:3] = rotation.T @ np.diag(np.square([initial.tilt_std_rad] * 2 + [initial.yaw_std_rad])) @ rotation
-    index = np.arange(3, kernel.N)
+    index = np.arange(3, n)
     P[index, index] = np.concatenate(
         (
             np.full(3, bias_std**2),
@@ -407,9 +457,10 @@ def _start(initial: InitialState, scale_stds: tuple[float, float], turn_scale_st
             np.full(3, initial.velocity_std_mps**2),
             initial.position_std_m**2,
             np.square(np.maximum(scale_stds, _FIXED)),
+            fix_error_m2,
         )
     )
-    return _Memory(x, P, np.zeros(8), np.zeros(8))
+    return _Memory(x, P, np.zeros(8), np.zeros(8), np.zeros(6))
 
 
 def _trajectory(
@@ -425,7 +476,7 @@ def _trajectory(
         outputs[:, 23:26] += (scale_std * (outputs[:, 18:21] - outputs[0, 18:21])) ** 2
     if run.covariances:
         for axis in range(3):
-            outputs[:, _WIDTH + 10 * (6 + axis)] += run.lasting_m2[axis]
+            outputs[:, _WIDTH + 10 * (6 + axis)] += run.lasting_m2[:, axis]
     if run.unseen_yaw_std:
         _doubt_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
     bias = outputs[:, 9:12] * (timeline.output_rate_radps if run.turn_scale_std else timeline.output_has_gyro[:, None])
@@ -517,6 +568,25 @@ def _rejections(timeline: EventTimeline, run: _Run) -> Rejections:
     )
 
 
+def _reopenings(timeline: EventTimeline, run: _Run) -> tuple[Reopening, ...]:
+    """Return each reopening of a gate: since when the sensor was refused, and how far it was off."""
+    found = []
+    for event in np.flatnonzero(run.verdict == kernel.REOPENED):
+        same = np.flatnonzero(timeline.kind[:event] == timeline.kind[event])
+        heard = same[run.verdict[same] != kernel.REFUSED]
+        first = same[same > heard[-1]][0] if heard.size and heard[-1] < same[-1] else event
+        size = float(np.linalg.norm(run.innovation[event, : 2 if timeline.kind[event] == kernel.GNSS_POSITION else 1]))
+        role = _ROLES[int(timeline.kind[event])]
+        if any(
+            abs(int(timeline.stamp_ns[first]) - known.start_ns) < _GROWS_NS
+            for known in run.suspects
+            if known.role == role
+        ):
+            continue  # known from the pass before
+        found.append(Reopening(role, int(timeline.stamp_ns[first]), int(timeline.stamp_ns[event]), size))
+    return tuple(sorted((*run.suspects, *found), key=lambda reopening: reopening.start_ns))
+
+
 def _facts(timeline: EventTimeline, run: _Run) -> StretchFacts:
     kinds = {role: timeline.kind == kind for kind, role in _ROLES.items() if (timeline.kind == kind).any()}
     taken = {role: of_kind & (run.verdict == kernel.ACCEPTED) for role, of_kind in kinds.items()}
@@ -529,8 +599,8 @@ def _facts(timeline: EventTimeline, run: _Run) -> StretchFacts:
         reopened={role: int((of_kind & (run.verdict == kernel.REOPENED)).sum()) for role, of_kind in kinds.items()},
         events=int(timeline.stamp_ns.size),
         standing_updates=int((timeline.kind == kernel.STANDING).sum()),
-        gnss_variance_factor=run.gnss_factor,
-        gnss_lasting_error_m=float(np.sqrt(run.lasting_m2[0])),
+        gnss_lasting_error_m=run.lasting_error_m(),
+        reopenings=_reopenings(timeline, run),
         covariance_repairs=int(run.repairs),
         gyro_bias_radps=None if run.turn_scale_std else vector(x[9:12]),
         turn_scale=float(1 + x[11]) if run.turn_scale_std else None,

@@ -49,10 +49,17 @@ from tcpipe.compiled import kernel
 
 N = 17
 NX = 23
+FIXED = 1e-10
+"""A scale of no more variance is held."""
+SAVED = 33
 GRAVITY_MPS2 = 9.80665
-_GAMMA = sqrt(N)
-_WI = 0.5 / N
 _WC0 = 2.0
+_FORGOTTEN_S = 300.0
+_ANEW = 0.1
+OFF_M = 0.5
+"""What fixes that contradict the rest may be off by, at least."""
+_KNOWN_M = 0.1
+_MEAN_OF, SURELY, _WILD = 10, 2.5, 4.0
 
 PREDICT, GNSS_POSITION, WHEEL_VELOCITY, VISUAL_VELOCITY, STANDING, STANDING_RATE, SIDEWAYS, LEVEL = range(8)
 """Kinds of events. SIDEWAYS: y and z of the body velocity are about zero; LEVEL: roll and pitch are small."""
@@ -122,7 +129,7 @@ def _difference(y: Vector, x: Vector, out: Vector) -> None:
     out[0] = f * a
     out[1] = f * b
     out[2] = f * c
-    for i in range(3, N):
+    for i in range(3, out.size):
         out[i] = y[i + 6] - x[i + 6]
 
 
@@ -137,7 +144,7 @@ def _displaced(x: Vector, d: Vector, sign: float, rotate: bool, out: Vector, tur
     else:
         for i in range(9):
             out[i] = x[i]
-    for i in range(3, N):
+    for i in range(3, d.size):
         out[i + 6] = x[i + 6] + sign * d[i]
 
 
@@ -180,25 +187,27 @@ def _propagated(x: Vector, w: Vector, a: Vector, dt: float, mode: int, q: Vector
     for i in range(9, 15):
         out[i] = x[i]
     out[21] = x[21] * (1.0 - dt * q[DECAY])
-    out[22] = x[22]
+    for i in range(22, x.size):
+        out[i] = x[i]
 
 
 @kernel
 def _cholesky(P: Matrix, U: Matrix) -> bool:
     """Upper factor of P = U'U; False where P is not positive definite."""
-    for i in range(N):
-        for j in range(i, N):
+    n = P.shape[0]
+    for i in range(n):
+        for j in range(i, n):
             U[i, j] = P[i, j]
-    for k in range(N):
+    for k in range(n):
         pivot = U[k, k]
         if not pivot > 0.0:
             return False
         scale = 1.0 / sqrt(pivot)
-        for j in range(k, N):
+        for j in range(k, n):
             U[k, j] *= scale
-        for i in range(k + 1, N):
+        for i in range(k + 1, n):
             f = U[k, i]
-            for j in range(i, N):
+            for j in range(i, n):
                 U[i, j] -= f * U[k, j]
     return True
 
@@ -209,13 +218,13 @@ def _factor(P: Matrix, U: Matrix, tally: Vector) -> None:
     lift = 1e-12
     while not _cholesky(P, U):
         tally[0] += 1.0
-        for i in range(N):
+        for i in range(P.shape[0]):
             P[i, i] += lift * abs(P[i, i]) + 1e-3 * lift
         lift *= 10.0
         if lift > 1.0:  # beyond repair, or not a number: forget what is correlated
-            for i in range(N):
+            for i in range(P.shape[0]):
                 variance = P[i, i] if P[i, i] > 1e-6 and P[i, i] < 1e12 else 1e-6
-                for j in range(N):
+                for j in range(P.shape[0]):
                     P[i, j] = 0.0
                     P[j, i] = 0.0
                 P[i, i] = variance
@@ -260,37 +269,39 @@ def predict(
     F, shape (12, 9), becomes what the first 12 errors turn into of those in `_MOVED`; a F of no rows is left alone.
     """
     U, D, d, moved, middle, shifted, centre, turn, tally = work
+    n = P.shape[0]
+    gamma, wi = sqrt(n), 0.5 / n
     _factor(P, U, tally)
     _propagated(x, w, a, dt, mode, q, centre, turn)
     for i in range(0, 9, 3):  # R exp(half the turn)
         for j in range(3):
             middle[i + j] = x[i] * turn[j] + x[i + 1] * turn[3 + j] + x[i + 2] * turn[6 + j]
     mean = D[2]
-    for j in range(N):
+    for j in range(n):
         mean[j] = 0.0
-        for i in range(N):
+        for i in range(n):
             P[i, j] = 0.0
     h = 0.5 * dt
-    for i in range(N):
-        for j in range(N):
-            d[j] = _GAMMA * U[i, j] if j >= i else 0.0
+    for i in range(n):
+        for j in range(n):
+            d[j] = gamma * U[i, j] if j >= i else 0.0
         if i < 6:  # touches R or b_g
             for side in range(2):
                 _displaced(x, d, 1.0 - 2.0 * side, i < 3, shifted, turn)
                 _propagated(shifted, w, a, dt, mode, q, moved, turn)
                 _difference(moved, centre, D[side])
-            for j in range(N):
-                mean[j] += _WI * (D[0, j] + D[1, j])
-            for r in range(N):
-                e = _WI * D[0, r]
-                g = _WI * D[1, r]
-                for j in range(N):
+            for j in range(n):
+                mean[j] += wi * (D[0, j] + D[1, j])
+            for r in range(n):
+                e = wi * D[0, r]
+                g = wi * D[1, r]
+                for j in range(n):
                     P[r, j] += e * D[0, j] + g * D[1, j]
             if F.shape[0] > 0:
                 for c in range(9):
-                    F[i, c] = 0.5 / _GAMMA * (D[0, _MOVED[c]] - D[1, _MOVED[c]])
+                    F[i, c] = 0.5 / gamma * (D[0, _MOVED[c]] - D[1, _MOVED[c]])
         else:
-            for j in range(N):
+            for j in range(n):
                 D[0, j] = d[j]
             if mode == INERTIAL:
                 for k in range(3):
@@ -308,14 +319,14 @@ def predict(
             for k in range(3):
                 D[0, 12 + k] = d[12 + k] + h * (d[9 + k] + D[0, 9 + k])
             D[0, 15] = d[15] * (1.0 - dt * q[DECAY])
-            for r in range(6, N):
-                e = 2.0 * _WI * D[0, r]
-                for j in range(N):
+            for r in range(6, n):
+                e = 2.0 * wi * D[0, r]
+                for j in range(n):
                     P[r, j] += e * D[0, j]
-    for i in range(N):
-        for j in range(N):
+    for i in range(n):
+        for j in range(n):
             P[i, j] += (_WC0 - 1.0) * mean[i] * mean[j]
-        if i >= 3 and not 9 <= i < 12:
+        if i >= 3 and not 9 <= i < 12 and i < N:
             P[i, i] += q[i] * dt
     _stray(P, x, centre, q, q_v, dt, w, mode)
     if F.shape[0] > 0:
@@ -356,11 +367,12 @@ def _transition(x: Vector, middle: Vector, centre: Vector, dt: float, mode: int,
 
 @kernel
 def _observation(U: Matrix, Z: Matrix, H: Matrix) -> None:
-    """Fill H, shape (3, 17): H' = P⁻⁻¹ cov(dx⁻, z) = U⁻¹ M, by the sigma points of `_innovation`."""
+    """Fill H, shape (3, n): H' = P⁻⁻¹ cov(dx⁻, z) = U⁻¹ M, by the sigma points of `_innovation`."""
+    n = U.shape[0]
     for a in range(3):
-        for i in range(N - 1, -1, -1):
-            s = 0.5 / _GAMMA * (Z[i, a] - Z[i + N, a])
-            for j in range(i + 1, N):
+        for i in range(n - 1, -1, -1):
+            s = 0.5 / sqrt(n) * (Z[i, a] - Z[i + n, a])
+            for j in range(i + 1, n):
                 s -= U[i, j] * H[a, j]
             H[a, i] = s / U[i, i]
 
@@ -374,6 +386,8 @@ def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: 
     if kind == GNSS_POSITION:
         for i in range(3):
             out[i] = x[18 + i] + x[3 * i] * lever[0] + x[3 * i + 1] * lever[1] + x[3 * i + 2] * lever[2]
+            if x.size > NX:
+                out[i] += x[NX + i]
     elif kind == STANDING:
         for i in range(3):
             out[i] = x[15 + i]
@@ -414,6 +428,8 @@ def _innovation(
     """
     U, _, d, _, _, shifted, _, turn, tally = work
     y, Z, S, cross, inverse = gain
+    n = P.shape[0]
+    gamma, wi = sqrt(n), 0.5 / n
     _factor(P, U, tally)
     _expected(kind, x, w, lever, bias, y)
     centre0 = y[0]
@@ -421,25 +437,25 @@ def _innovation(
     centre2 = y[2]
     for a in range(3):
         y[a] = 0.0
-        for j in range(N):
+        for j in range(n):
             cross[a, j] = 0.0
-    for i in range(N):
-        for j in range(N):
-            d[j] = _GAMMA * U[i, j] if j >= i else 0.0
+    for i in range(n):
+        for j in range(n):
+            d[j] = gamma * U[i, j] if j >= i else 0.0
         for side in range(2):
             _displaced(x, d, 1.0 - 2.0 * side, i < 3, shifted, turn)
-            _expected(kind, shifted, w, lever, bias, Z[i + side * N])
+            _expected(kind, shifted, w, lever, bias, Z[i + side * n])
         for a in range(3):
-            y[a] += _WI * (Z[i, a] + Z[i + N, a])
-            e = _WI * (Z[i, a] - Z[i + N, a])
-            for j in range(N):
+            y[a] += wi * (Z[i, a] + Z[i + n, a])
+            e = wi * (Z[i, a] - Z[i + n, a])
+            for j in range(n):
                 cross[a, j] += e * d[j]
     centre = (centre0 - y[0], centre1 - y[1], centre2 - y[2])
     for a in range(3):
         for b in range(3):
             s = _WC0 * centre[a] * centre[b]
-            for i in range(2 * N):
-                s += _WI * (Z[i, a] - y[a]) * (Z[i, b] - y[b])
+            for i in range(2 * n):
+                s += wi * (Z[i, a] - y[a]) * (Z[i, b] - y[b])
             S[a, b] = s
         S[a, a] += r[a]
         y[a] = z[a] - y[a]
@@ -492,36 +508,37 @@ def _correct(x: Vector, P: Matrix, work: Any, gain: Any, J: Matrix) -> None:
     """X ⊞ K y and J (P - K S K') J' with what `_innovation` left; K' stays in the first rows of the work's second array."""
     _, D, d, _, _, shifted, _, turn, _ = work
     y, _, _, cross, inverse = gain
-    for j in range(N):
+    n = P.shape[0]
+    for j in range(n):
         d[j] = 0.0
     for a in range(3):
         row = D[a]  # row a of K'
-        for j in range(N):
+        for j in range(n):
             row[j] = inverse[a, 0] * cross[0, j] + inverse[a, 1] * cross[1, j] + inverse[a, 2] * cross[2, j]
             d[j] += row[j] * y[a]
-    for i in range(N):
-        for j in range(N):
+    for i in range(n):
+        for j in range(n):
             P[i, j] -= D[0, i] * cross[0, j] + D[1, i] * cross[1, j] + D[2, i] * cross[2, j]
     _reset(d[0], d[1], d[2], J)
-    for j in range(N):
+    for j in range(n):
         p0 = P[0, j]
         p1 = P[1, j]
         p2 = P[2, j]
         for i in range(3):
             P[i, j] = J[i, 0] * p0 + J[i, 1] * p1 + J[i, 2] * p2
-    for j in range(N):
+    for j in range(n):
         p0 = P[j, 0]
         p1 = P[j, 1]
         p2 = P[j, 2]
         for i in range(3):
             P[j, i] = J[i, 0] * p0 + J[i, 1] * p1 + J[i, 2] * p2
-    for i in range(N):
+    for i in range(n):
         for j in range(i):
             s = 0.5 * (P[i, j] + P[j, i])
             P[i, j] = s
             P[j, i] = s
     _displaced(x, d, 1.0, True, shifted, turn)
-    for i in range(NX):
+    for i in range(x.size):
         x[i] = shifted[i]
 
 
@@ -530,14 +547,14 @@ def _lifted(kind: int, P: Matrix, y: Vector, alone: bool) -> None:  # noqa: FBT0
     """Lift P after a lock-out so that the sensor can be heard again: the state may have jumped, or the sensor's scale."""
     if kind == GNSS_POSITION:
         P[2, 2] += 0.1**2
-        if P[15, 15] > 1e-10:
+        if P[15, 15] > FIXED:
             P[15, 15] += 0.3**2
         for i in range(3):
             P[9 + i, 9 + i] += 0.3**2
             P[12 + i, 12 + i] += y[i] * y[i]
     else:
         scale = 15 if kind == WHEEL_VELOCITY else 16
-        if P[scale, scale] > 1e-10:
+        if P[scale, scale] > FIXED:
             P[scale, scale] += 0.1**2
         if alone:
             for i in range(3):
@@ -545,8 +562,67 @@ def _lifted(kind: int, P: Matrix, y: Vector, alone: bool) -> None:  # noqa: FBT0
 
 
 @kernel
+def _renewed(x: Vector, P: Matrix, variance: Vector) -> None:
+    """Forget the fixes' error: another one has taken its place."""
+    for i in range(N, P.shape[0]):
+        x[6 + i] = 0.0
+        for j in range(P.shape[0]):
+            P[i, j] = 0.0
+            P[j, i] = 0.0
+    for i in range(N, P.shape[0]):
+        P[i, i] = variance[i - N]
+
+
+@kernel
+def _drifts(y: Vector, S: Matrix, gate: float, opened: Vector) -> bool:
+    """Whether innovations lie on one side on average, each of them within the gate as it may be; the mean follows in ``opened[3:]``."""
+    size = 0.0
+    for a in range(3):
+        normal = min(max(y[a] / sqrt(S[a, a]), -_WILD), _WILD)
+        opened[3 + a] += (normal - opened[3 + a]) / _MEAN_OF
+        size += opened[3 + a] * opened[3 + a]
+    return (2 * _MEAN_OF - 1) * size > SURELY * gate
+
+
+@kernel
+def _is_gone(x: Vector, P: Matrix) -> bool:
+    """Whether the fixes' error is known well enough to say that it is none."""
+    gone = True
+    for i in range(N, N + 2):
+        gone = gone and P[i, i] < _KNOWN_M**2 and x[6 + i] * x[6 + i] < P[i, i]
+    return gone
+
+
+@kernel
+def most_drift(normal: Matrix) -> float:
+    """Return the largest that `_drifts` would see in normalised innovations, shape (F, 3)."""
+    mean = np.zeros(3)
+    most = 0.0
+    for row in range(normal.shape[0]):
+        size = 0.0
+        for a in range(3):
+            mean[a] += (min(max(normal[row, a], -_WILD), _WILD) - mean[a]) / _MEAN_OF
+            size += mean[a] * mean[a]
+        if row >= _MEAN_OF:
+            most = max(most, (2 * _MEAN_OF - 1) * size)
+    return most
+
+
+@kernel
+def _faded(x: Vector, P: Matrix, kept: float, noise: Vector, opened: Vector, dt: float) -> None:
+    """Let the fixes' error fade: ``kept`` of it remains, ``noise`` is added; where a gate has reopened it may stay as large as that."""
+    for i in range(N, P.shape[0]):
+        x[6 + i] *= kept
+        for j in range(P.shape[0]):
+            P[i, j] *= kept
+            P[j, i] *= kept
+        P[i, i] += noise[i - N] + opened[i - N] * max(1.0 - kept * kept, 0.0)
+        opened[i - N] *= 1.0 - min(dt / _FORGOTTEN_S, 1.0) if kept > _ANEW else 0.0
+
+
+@kernel
 def _saved(x: Vector, P: Matrix, out: Vector) -> None:
-    """State, then variances of p (3), yaw and forward velocity, then of s_w and s_v, shape (30,).
+    """State, then variances of p (3), yaw and forward velocity, then of s_w and s_v, then the fixes' error, shape (33,).
 
     Where ``out`` is longer by 81, the covariance of (th, v, p) follows.
     """
@@ -571,27 +647,29 @@ def _saved(x: Vector, P: Matrix, out: Vector) -> None:
     out[27] = s
     out[28] = P[15, 15]
     out[29] = P[16, 16]
-    if out.size == 111:
+    for i in range(3):
+        out[30 + i] = x[NX + i] if x.size > NX else 0.0
+    if out.size == SAVED + 81:
         for i in range(9):
             for j in range(9):
-                out[30 + 9 * i + j] = P[i if i < 3 else i + 6, j if j < 3 else j + 6]
+                out[SAVED + 9 * i + j] = P[i if i < 3 else i + 6, j if j < 3 else j + 6]
 
 
 @kernel
-def workspace() -> Any:
-    """Scratch memory of the functions above; the last entry counts repairs of P."""
+def workspace(n: int) -> Any:
+    """Scratch memory of the functions above for n errors; the last entry counts repairs of P."""
     work = (
-        np.zeros((N, N)),
-        np.zeros((3, N)),
-        np.zeros(N),
-        np.zeros(NX),
-        np.zeros(NX),
-        np.zeros(NX),
-        np.zeros(NX),
+        np.zeros((n, n)),
+        np.zeros((3, n)),
+        np.zeros(n),
+        np.zeros(n + 6),
+        np.zeros(n + 6),
+        np.zeros(n + 6),
+        np.zeros(n + 6),
         np.zeros(9),
         np.zeros(1),
     )
-    gain = (np.zeros(3), np.zeros((2 * N, 3)), np.zeros((3, 3)), np.zeros((3, N)), np.zeros((3, 3)))
+    gain = (np.zeros(3), np.zeros((2 * n, 3)), np.zeros((3, 3)), np.zeros((3, n)), np.zeros((3, 3)))
     return work, gain
 
 
@@ -613,13 +691,18 @@ def filter_block(
     densities: Matrix,
     gates: Vector,
     lock_out: Matrix,
+    kept_error: Vector,
+    error_noise: Matrix,
+    error_level: Matrix,
     x: Vector,
     P: Matrix,
     refused: Vector,
     silent: Vector,
+    opened: Vector,
     keep: bool,  # noqa: FBT001
     store: Any,
     nis: Vector,
+    innovation: Matrix,
     verdict: NDArray[np.int8],
     outputs: Matrix,
 ) -> float:
@@ -634,19 +717,27 @@ def filter_block(
     output : row of ``outputs`` that the event fills, or -1.
     levers : lever arm by kind, shape (8, 3). densities : process noise by mode, shape (4, 21), see `predict`.
     gates : threshold of the squared normalised innovation by kind; infinite where there is no gate.
-    lock_out : by kind (8, 3): refusals in a row, and seconds since the last accepted one, after which the gate reopens; the seconds
-        where no other sensor that tells velocity has been accepted for 2 s.
-    x, P, refused, silent : state and gate memory (by kind) at ``first``; they are those after ``last - 1`` at the end.
-    keep, store : with ``keep``, row e - first of the first three becomes F (12, 9), K' and H (2, 3, 17), and (24,): 1 where time passed,
-        what remains of s_w, 1 where something was measured and used, S⁻¹ y, S⁻¹, J; the last gets P of each wanted stamp in turn.
-    nis, verdict, outputs : filled for the events.
+    lock_out : by kind (8, 4): refusals in a row, and seconds since the last accepted one, after which the gate reopens; the seconds
+        where no other sensor that tells velocity has been accepted for 2 s; 1 where the fixes' error is lifted, not the pose.
+    kept_error, error_noise, error_level : what remains of the fixes' error since the event before, the variances added to it [m²],
+        shape (E, 3), and those that it has in the long run, shape (E, 3).
+    x, P, refused, silent, opened : state and memory at ``first``, of 17 errors or, with that of the fixes, of 20; refusals in a row and
+        silence by kind; variance [m²] of what made the gate of fixes reopen, and their mean innovation. They become those after
+        ``last - 1``.
+    keep, store : with ``keep``, row e - first of the first three becomes F (12, 9), K' and H (2, 3, n), and (25,): 1 where time passed,
+        what remains of s_w, 1 where something was measured and used, S⁻¹ y, S⁻¹, J, what remains of the fixes' error; the last gets P of
+        each wanted stamp in turn.
+    nis, innovation, verdict, outputs : filled for the events.
     """
-    work, gain = workspace()
+    work, gain = workspace(P.shape[0])
     store_F, store_KH, store_y, store_P = store
     F = np.zeros((12 if keep else 0, 9))
     J = np.zeros((3, 3))
     wanted = 0
     for e in range(first, last):
+        kept = kept_error[e]
+        if P.shape[0] > N:
+            _faded(x, P, kept, error_noise[e], opened, dt[e])
         if dt[e] > 0.0:
             predict(x, P, densities[mode[e]], q_v[e], dt[e], turn_rate[e], force[e], mode[e], F, work)
             for k in range(silent.size):
@@ -655,18 +746,38 @@ def filter_block(
         hears = False
         if k != PREDICT:
             bias = 1.0 if mode[e] >= GYRO_TURN else -densities[mode[e], SCALED]
+            if k == GNSS_POSITION and opened[0] > 0.0 and _is_gone(x, P):
+                kept = 0.0
+                opened[:] = 0.0
+                _renewed(x, P, error_level[e])
             value = _innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
             hears = True
             verdict[e] = ACCEPTED
-            if not value <= gates[k]:
+            for a in range(3):
+                innovation[e, a] = gain[0][a]
+            off_for_long = False
+            if k == GNSS_POSITION and lock_out[k, 3] > 0.0 and opened[0] == 0.0:
+                off_for_long = _drifts(gain[0], gain[2], gates[k], opened)
+            if off_for_long or not value <= gates[k]:
                 hears = False
                 verdict[e] = REFUSED
                 refused[k] += 1.0
                 alone = True
                 for other in range(GNSS_POSITION, VISUAL_VELOCITY + 1):
                     alone = alone and (other == k or silent[other] > 2.0)
-                if refused[k] >= lock_out[k, 0] and silent[k] >= lock_out[k, 2 if alone else 1]:
-                    _lifted(k, P, gain[0], alone)
+                long = silent[k] >= lock_out[k, 2 if alone else 1] or (k == GNSS_POSITION and opened[0] > 0.0)
+                if refused[k] >= lock_out[k, 0] and long:
+                    if lock_out[k, 3] > 0.0 and P.shape[0] > N:
+                        kept = 0.0  # either the fixes are right again, or they err in another way
+                        _renewed(x, P, error_level[e])
+                        again = _innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
+                        for a in range(3):
+                            opened[a] = max(gain[0][a] ** 2, OFF_M**2) if again > gates[k] else 0.0
+                            opened[3 + a] = 0.0
+                        if again > gates[k]:
+                            _renewed(x, P, np.maximum(opened[:3], error_level[e]))
+                    else:
+                        _lifted(k, P, gain[0], alone)
                     again = _innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
                     softer = max(again / gates[k], 1.0)
                     for a in range(3):
@@ -681,6 +792,7 @@ def filter_block(
             store_y[row, 0] = 1.0 if dt[e] > 0.0 else 0.0
             store_y[row, 1] = 1.0 - dt[e] * densities[mode[e], DECAY]
             store_y[row, 2] = 1.0 if hears else 0.0
+            store_y[row, 24] = kept
             if hears:
                 y, Z, _, _, inverse = gain
                 _observation(work[0], Z, store_KH[row, 1])
@@ -709,30 +821,32 @@ def filter_block(
 @kernel
 def _transposed_times(F: Matrix, scale: float, A: Matrix, out: Matrix) -> None:
     """F' A; ``scale`` is what remains of s_w."""
-    for i in range(N):
+    n = A.shape[0]
+    for i in range(n):
         if 3 <= i < 9 or i >= 12:
             f = scale if i == 15 else 1.0
-            for j in range(N):
+            for j in range(n):
                 out[i, j] = f * A[i, j]
         else:
-            for j in range(N):
+            for j in range(n):
                 out[i, j] = 0.0
     for i in range(12):
         for c in range(9):
             f = F[i, c]
             row = A[_MOVED[c]]
-            for j in range(N):
+            for j in range(n):
                 out[i, j] += f * row[j]
 
 
 @kernel
 def _product(A: Matrix, B: Matrix, out: Matrix) -> None:
-    for i in range(N):
-        for j in range(N):
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(n):
             out[i, j] = 0.0
-        for k in range(N):
+        for k in range(n):
             f = A[i, k]
-            for j in range(N):
+            for j in range(n):
                 out[i, j] += f * B[k, j]
 
 
@@ -743,9 +857,10 @@ def _linked(j: int, xy: Vector, P: Matrix, Ps: Matrix, rest: Matrix, links: Any,
     ``P`` is the filter's covariance, ``Ps`` the smoother's, ``rest`` is I - L P. Products over longer lags are made of shorter ones.
     """
     _, chains, ends, places, recipe, lags, wanted = links
+    n = P.shape[0]
     size = chains.shape[1]
     here = j % size
-    for i in range(N):
+    for i in range(n):
         for b in range(2):
             ends[here, i, b] = rest[i, 12 + b]
     for b in range(2):
@@ -770,10 +885,10 @@ def _linked(j: int, xy: Vector, P: Matrix, Ps: Matrix, rest: Matrix, links: Any,
         for b in range(2):
             for c in range(2):
                 variance += u[b] * u[c] * (places[here, 2 + 2 * b + c] + places[there, 2 + 2 * b + c])
-        for i in range(N):
+        for i in range(n):
             before = u[0] * P[12, i] + u[1] * P[13, i]
             after = 0.0
-            for m in range(N):
+            for m in range(n):
                 after += chains[node, here, i, m] * (u[0] * ends[there, m, 0] + u[1] * ends[there, m, 1])
             variance -= 2.0 * before * after
         variances[j, column] = max(variance, 0.0)
@@ -796,17 +911,18 @@ def smooth_block(
     Parameters
     ----------
     store : of these events, as `filter_block` kept it.
-    adjoint, information : l (17,) and L (17, 17) of the state before event ``last``; become those before ``first``.
+    adjoint, information : l (n,) and L (n, n) of the state before event ``last``; become those before ``first``.
     outputs : holds the filter's states at the wanted stamps; they become the smoothed ones.
     links : what `_linked` remembers of later wanted stamps, see `tcpipe.fusion.error_state`.
     displacement_variances : filled by `_linked`.
     """
-    work, _ = workspace()
+    n = information.shape[0]
+    work, _ = workspace(n)
     _, _, d, x, _, shifted, _, turn, _ = work
     store_F, store_KH, store_y, store_P = store
-    T = np.zeros((N, N))
-    Ps = np.zeros((N, N))
-    B = np.zeros((3, N))
+    T = np.zeros((n, n))
+    Ps = np.zeros((n, n))
+    B = np.zeros((3, n))
     chain = links[0]  # (product of F and I - K H from here to the next wanted stamp)'
     wanted = 0
     for e in range(first, last):
@@ -819,25 +935,27 @@ def smooth_block(
             out = outputs[output[e]]
             for i in range(NX):
                 x[i] = out[i]
-            for i in range(N):
+            for i in range(NX, x.size):
+                x[i] = out[30 + i - NX]
+            for i in range(n):
                 d[i] = 0.0
-                for j in range(N):
+                for j in range(n):
                     d[i] -= P[i, j] * adjoint[j]
             _displaced(x, d, 1.0, True, shifted, turn)
             _product(information, P, T)
             _product(P, T, Ps)
-            for i in range(N):
-                for j in range(N):
+            for i in range(n):
+                for j in range(n):
                     T[i, j] = (1.0 if i == j else 0.0) - T[i, j]
-            for i in range(N):
+            for i in range(n):
                 for j in range(i + 1):
                     s = 0.5 * (P[i, j] - Ps[i, j] + P[j, i] - Ps[j, i])
                     Ps[i, j] = s
                     Ps[j, i] = s
             _saved(shifted, Ps, out)
             links[1][0, output[e] % links[1].shape[1]] = chain
-            for i in range(N):
-                for j in range(N):
+            for i in range(n):
+                for j in range(n):
                     chain[i, j] = 1.0 if i == j else 0.0
             _linked(output[e], shifted[18:20], P, Ps, T, links, displacement_variances)
         if store_y[row, 2] > 0.0:
@@ -845,7 +963,7 @@ def smooth_block(
         if store_y[row, 0] > 0.0:
             F = store_F[row]
             scale = store_y[row, 1]
-            for i in range(N):
+            for i in range(n):
                 d[i] = adjoint[i]
             for i in range(12):
                 s = d[i] if 3 <= i < 9 else 0.0
@@ -854,12 +972,19 @@ def smooth_block(
                 adjoint[i] = s
             adjoint[15] = scale * d[15]
             _transposed_times(F, scale, information, T)
-            for i in range(N):
-                for j in range(N):
+            for i in range(n):
+                for j in range(n):
                     Ps[i, j] = T[j, i]
             _transposed_times(F, scale, Ps, information)
             _transposed_times(F, scale, chain, T)
             chain[:, :] = T
+        kept = store_y[row, 24]
+        for i in range(N, n if kept != 1.0 else N):
+            adjoint[i] *= kept
+            for j in range(n):
+                information[i, j] *= kept
+                information[j, i] *= kept
+                chain[i, j] *= kept
 
 
 @kernel
@@ -868,13 +993,14 @@ def _before_update(
 ) -> None:
     """Take l, L and the chain back over an update; K holds K', y what `filter_block` kept."""
     t = np.empty(3)
-    for j in range(N):  # J' from the left
+    n = information.shape[0]
+    for j in range(n):  # J' from the left
         for A in (information, chain):
             for i in range(3):
                 t[i] = y[15 + i] * A[0, j] + y[18 + i] * A[1, j] + y[21 + i] * A[2, j]
             for i in range(3):
                 A[i, j] = t[i]
-    for j in range(N):  # J from the right
+    for j in range(n):  # J from the right
         for i in range(3):
             t[i] = y[15 + i] * information[j, 0] + y[18 + i] * information[j, 1] + y[21 + i] * information[j, 2]
         for i in range(3):
@@ -885,43 +1011,43 @@ def _before_update(
         adjoint[i] = t[i]
     for a in range(3):
         s = y[3 + a]
-        for i in range(N):
+        for i in range(n):
             s += K[a, i] * adjoint[i]
         B[a, 0] = s
-    for i in range(N):
+    for i in range(n):
         adjoint[i] -= H[0, i] * B[0, 0] + H[1, i] * B[1, 0] + H[2, i] * B[2, 0]
     for a in range(3):  # K' chain
-        for j in range(N):
+        for j in range(n):
             B[a, j] = 0.0
-        for i in range(N):
+        for i in range(n):
             f = K[a, i]
-            for j in range(N):
+            for j in range(n):
                 B[a, j] += f * chain[i, j]
-    for i in range(N):
-        for j in range(N):
+    for i in range(n):
+        for j in range(n):
             chain[i, j] -= H[0, i] * B[0, j] + H[1, i] * B[1, j] + H[2, i] * B[2, j]
     for a in range(3):  # K' L
-        for j in range(N):
+        for j in range(n):
             B[a, j] = 0.0
-        for i in range(N):
+        for i in range(n):
             f = K[a, i]
-            for j in range(N):
+            for j in range(n):
                 B[a, j] += f * information[i, j]
     half = np.empty((3, 3))
     for a in range(3):
         for b in range(3):
             s = y[6 + 3 * a + b]
-            for j in range(N):
+            for j in range(n):
                 s += B[a, j] * K[b, j]
             half[a, b] = 0.5 * s
-    for j in range(N):
+    for j in range(n):
         b0 = B[0, j] - half[0, 0] * H[0, j] - half[0, 1] * H[1, j] - half[0, 2] * H[2, j]
         b1 = B[1, j] - half[1, 0] * H[0, j] - half[1, 1] * H[1, j] - half[1, 2] * H[2, j]
         b2 = B[2, j] - half[2, 0] * H[0, j] - half[2, 1] * H[1, j] - half[2, 2] * H[2, j]
         B[0, j] = b0
         B[1, j] = b1
         B[2, j] = b2
-    for i in range(N):
+    for i in range(n):
         for j in range(i + 1):
             s = H[0, i] * B[0, j] + H[1, i] * B[1, j] + H[2, i] * B[2, j]
             s += B[0, i] * H[0, j] + B[1, i] * H[1, j] + B[2, i] * H[2, j]

@@ -72,12 +72,7 @@ def fuse_warnings(inputs: FusionInputs, facts: FuseFacts) -> tuple[str, ...]:
             for stretch in facts.stretches
             if stretch.heading_from != "course over ground"
         ]
-    found += [
-        f"gnss: many fixes lie beyond their claimed deviation; it is taken {factor**0.5:.0f} times as large: "
-        "check its clock (read.time_offset_s) and its lever arm (read.placement)"
-        for stretch in facts.stretches
-        if (factor := stretch.gnss_variance_factor or 1.0) > 1.0
-    ]
+    found += _reopened(facts)
     common = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
     if common > _COMMON:
         found.append(
@@ -99,6 +94,21 @@ def fuse_warnings(inputs: FusionInputs, facts: FuseFacts) -> tuple[str, ...]:
     if facts.skipped_s:
         found.append(f"{facts.skipped_s:.1f} s between pauses or clock steps hold too little to place a track")
     return tuple(found)
+
+
+def _reopened(facts: FuseFacts) -> list[str]:
+    """Return by sensor how often it left the path of the others for seconds, and where most."""
+    found = []
+    every = [reopening for stretch in facts.stretches for reopening in stretch.reopenings]
+    for role in sorted({reopening.role for reopening in every}):
+        mine = [reopening for reopening in every if reopening.role == role]
+        worst = max(mine, key=lambda reopening: reopening.size)
+        unit = "m" if role == GNSS else "m/s"
+        found.append(
+            f"{role}: {len(mine)} times it contradicted the other sensors for seconds, most by {worst.size:.2f} {unit} from "
+            f"{worst.start_ns} to {worst.end_ns} ns (run.json: reopenings): look there at its clock, its mounting and its surroundings"
+        )
+    return found
 
 
 def rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:

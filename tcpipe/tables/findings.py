@@ -96,6 +96,16 @@ class PowerSign:
 
 
 @dataclass(frozen=True, slots=True)
+class Reopening:
+    """A sensor that its gate had refused since ``start_ns`` was heard again at ``end_ns``: it was off by ``size`` [m] or [m/s]."""
+
+    role: str
+    start_ns: int
+    end_ns: int
+    size: float
+
+
+@dataclass(frozen=True, slots=True)
 class StretchFacts:
     """One stretch that was fused for itself: what the filter counted and settled on, and then where the stretch lies and began.
 
@@ -112,7 +122,9 @@ class StretchFacts:
     events: int | None = field(default=None, metadata=LEFT_OUT)
     standing_updates: int | None = field(default=None, metadata=LEFT_OUT)
     gnss_variance_factor: float | None = field(default=None, metadata=LEFT_OUT)
+    """Until tcpipe 0.3: by how much the fixes' variance was raised, over the whole run."""
     gnss_lasting_error_m: float | None = field(default=None, metadata=LEFT_OUT)
+    reopenings: tuple[Reopening, ...] = field(default=(), metadata=LEFT_OUT)
     gyro_bias_radps: Vector | None = None
     turn_scale: float | None = None
     accelerometer_bias_mps2: Vector | None = field(default=None, metadata=LEFT_OUT)

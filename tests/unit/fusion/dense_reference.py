@@ -37,7 +37,7 @@ def expect(kind, x, w, lever):
     R = x[:9].reshape(3, 3)
     body = R.T @ x[15:18] + np.cross(w - x[9:12], lever)
     return {
-        kernel.GNSS_POSITION: x[18:21] + R @ lever,
+        kernel.GNSS_POSITION: x[18:21] + R @ lever + (x[23:26] if x.size > 23 else 0.0),
         kernel.WHEEL_VELOCITY: body * [1 + x[21], 1, 1],
         kernel.VISUAL_VELOCITY: body * (1 + x[22]),
         kernel.STANDING: x[15:18],
@@ -48,9 +48,10 @@ def expect(kind, x, w, lever):
 
 
 def sigma(P):
-    root = np.sqrt(N) * np.linalg.cholesky(P)
-    mean_weight = np.concatenate(([0.0], np.full(2 * N, 0.5 / N)))
-    return np.vstack((np.zeros(N), root.T, -root.T)), mean_weight, np.concatenate(([2.0], mean_weight[1:]))
+    n = P.shape[0]
+    root = np.sqrt(n) * np.linalg.cholesky(P)
+    mean_weight = np.concatenate(([0.0], np.full(2 * n, 0.5 / n)))
+    return np.vstack((np.zeros(n), root.T, -root.T)), mean_weight, np.concatenate(([2.0], mean_weight[1:]))
 
 
 def predict(x, P, q, velocity_density, dt, w, a, mode):  # noqa: PLR0917
@@ -61,7 +62,8 @@ def predict(x, P, q, velocity_density, dt, w, a, mode):  # noqa: PLR0917
     mean = wm @ D
     return (
         plus(centre, mean),
-        (D - mean).T * wc @ (D - mean) + stray(x, centre, q, velocity_density, w, mode) * dt,
+        (D - mean).T * wc @ (D - mean)
+        + np.pad(stray(x, centre, q, velocity_density, w, mode) * dt, (0, P.shape[0] - N)),
         d.T * wc @ (D - mean),
     )
 
@@ -102,7 +104,7 @@ def update(kind, x, P, z, r, w, lever):  # noqa: PLR0917
 
 def reset(correction):
     """Return what an error becomes in the axes that a correction has turned: d log(exp(-t) exp(t + e)) / d e, by differences."""
-    J, step = np.eye(N), 1e-5
+    J, step = np.eye(correction.size), 1e-5
     centre = Rotation.from_rotvec(correction[:3])
     for k in range(3):
         ahead, behind = (Rotation.from_rotvec(correction[:3] + s * step * np.eye(3)[k]) for s in (1, -1))
@@ -110,8 +112,11 @@ def reset(correction):
     return J
 
 
-def filter_and_smooth(timeline, densities, levers, x, P):
-    """Return filtered and smoothed states and covariances at every event of a timeline without refusals, and the smoother's gains."""
+def filter_and_smooth(timeline, densities, levers, x, P, *, kept, noise):
+    """Return filtered and smoothed states and covariances at every event of a timeline without refusals, and the smoother's gains.
+
+    ``kept`` and ``noise`` are what remains of the fixes' error and what comes to it, where the state holds it.
+    """
     before, after, resets = [], [], []
     for e in range(timeline.stamp_ns.size):
         C = P
@@ -119,6 +124,9 @@ def filter_and_smooth(timeline, densities, levers, x, P):
             mode = timeline.mode[e]
             turn, force = timeline.turn_rate_radps[e], timeline.force_mps2[e]
             x, P, C = predict(x, P, densities[mode], timeline.shake_m2ps3[e], timeline.dt_s[e], turn, force, mode)
+        fade = np.diag(np.where(np.arange(P.shape[0]) < N, 1.0, kept[e]))
+        x = np.concatenate((x[:23], kept[e] * x[23:]))
+        P, C = fade @ P @ fade + np.diag(np.pad(noise[e][: P.shape[0] - N], (N, 0))), C @ fade
         before.append((x, P, C))
         x_before = x
         kind = int(timeline.kind[e])

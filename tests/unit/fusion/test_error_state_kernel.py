@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import dense_reference, drive
 
 from tcpipe.fusion import error_state, error_state_kernel
+from tcpipe.fusion.fix_errors import FixErrors
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import part
 from tcpipe.fusion.standing import standing_intervals
@@ -21,7 +22,7 @@ RATE, FORCE, LEVER = np.array([0.3, -0.2, 0.8]), np.array([0.5, 0.3, 9.7]), np.a
 @pytest.mark.parametrize(("mode", "scaled"), [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)])
 def test_prediction_is_the_unscented_transform(mode, scaled):
     x, covariance, moved = X.copy(), P.copy(), np.zeros((12, 9))
-    work, _ = error_state_kernel.workspace()
+    work, _ = error_state_kernel.workspace(17)
     q = np.concatenate((np.linspace(0.01, 0.02, 19), [scaled, 0.03]))
     error_state_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
     wanted_x, wanted_P, cross = dense_reference.predict(X, P, q, 0.03, 0.4, RATE, FORCE, mode)
@@ -37,7 +38,7 @@ def test_prediction_is_the_unscented_transform(mode, scaled):
 
 @pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 6, 7])
 def test_update_is_the_unscented_transform(kind):
-    work, gain = error_state_kernel.workspace()
+    work, gain = error_state_kernel.workspace(17)
     z, r = np.array([0.2, -0.1, 0.3]), np.array([0.02, 0.03, 0.04])
     if kind in {error_state_kernel.SIDEWAYS, error_state_kernel.LEVEL}:
         z[2] = 0.0
@@ -67,26 +68,33 @@ def _short_run():
     return measurements, standing, initial, output
 
 
-def test_filter_and_smoother_are_those_written_out(monkeypatch):
+@pytest.mark.parametrize("doubted", [False, True])
+def test_filter_and_smoother_are_those_written_out(monkeypatch, doubted):
     measurements, standing, initial, output = _short_run()
     timeline = build_timeline(part(measurements, 0, int(output[-1])), standing, output)
     monkeypatch.setattr(error_state, "_BLOCK", 40)  # several blocks,
     monkeypatch.setattr(error_state, "_KEPT_BLOCKS", 2)  # some of them filtered twice
     run = error_state._Run(timeline, measurements, 0.999, lags=(3, 10))
     run.gates[:] = np.inf
-    memory = error_state._start(initial, (0.12, 0.05))
+    if doubted:
+        shape = measurements.gnss.variance_m2.shape
+        sizes = np.where(np.arange(shape[0]) % 8 < 4, 0.3, 0.1)[:, None] * [1.0, 1.2, 1.5]  # fixes of two kinds
+        run.doubt_fixes(FixErrors(measurements.gnss.variance_m2, sizes**2, np.full(shape[0], 2.0)), ())
+        assert np.unique(run.kept_error.round(2)).size > 2
+    memory = error_state._start(initial, (0.12, 0.05), 0.0, run.start_error_m2)
     after, smoothed, gains = dense_reference.filter_and_smooth(
-        timeline, run._densities, run._levers, memory.x, memory.P
+        timeline, run._densities, run._levers, memory.x, memory.P, kept=run.kept_error, noise=run.error_noise_m2
     )
     events = np.flatnonzero(timeline.output >= 0)
     filtered, got = run.filtered(initial), run.smoothed(initial)
-    assert np.allclose(filtered[:, :23], [after[e][0] for e in events], atol=1e-9)
+    assert np.allclose(filtered[:, :23], [after[e][0][:23] for e in events], atol=1e-9)
     for outputs, wanted in ((filtered, after), (got, smoothed)):
         variances = np.array([np.diag(wanted[e][1]) for e in events])
         assert np.allclose(outputs[:, 23:26], variances[:, 12:15], rtol=1e-6)
         assert np.allclose(outputs[:, 28:30], variances[:, 15:17], rtol=1e-6)
     # The reference goes back along the manifold, the kernel along its tangents.
-    apart = [dense_reference.minus(x, smoothed[e][0]) for x, e in zip(got[:, :23], events, strict=True)]
+    states = np.column_stack((got[:, :23], got[:, 30:33])) if doubted else got[:, :23]
+    apart = [dense_reference.minus(x, smoothed[e][0]) for x, e in zip(states, events, strict=True)]
     assert np.abs(apart / np.sqrt(variances)).max() < 0.01
     assert run.repairs == 0
     for column, lag in enumerate(run.lags):
@@ -100,7 +108,7 @@ def test_filter_and_smoother_are_those_written_out(monkeypatch):
 
 
 def test_deviations_of_yaw_and_forward_velocity_are_those_of_a_cloud():
-    out = np.zeros(30)
+    out = np.zeros(error_state_kernel.SAVED)
     small = P * 1e-4
     error_state_kernel._saved(X, small, out)
     cloud = np.random.default_rng(6).multivariate_normal(np.zeros(17), small, 20_000)
@@ -112,7 +120,7 @@ def test_deviations_of_yaw_and_forward_velocity_are_those_of_a_cloud():
 
 
 def test_a_covariance_that_is_none_is_repaired_and_counted():
-    work, _ = error_state_kernel.workspace()
+    work, _ = error_state_kernel.workspace(17)
     broken = P.copy()
     broken[3, 3] = -1e-12
     error_state_kernel.predict(X.copy(), broken, np.zeros(21), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
