@@ -8,7 +8,17 @@ import pytest
 
 PAGE = Path(__file__).parents[3] / "docs" / "explanation" / "fusion.md"
 ROWS = re.findall(r"^\| `([\w.]+)\.(\w+)` \| ([-+.e\d]+) \|", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)
-WHOLLY = ("process", "initial", "course", "fix_errors", "standing", "preparation", "stretches", "checks.audit", "checks.mounting")
+WHOLLY = (
+    "process",
+    "initial",
+    "course",
+    "fix_errors",
+    "standing",
+    "preparation",
+    "stretches",
+    "checks.audit",
+    "checks.mounting",
+)
 """Modules of which every number is listed."""
 UNLISTED = {"_MAX_GAP_NS", "_GRAVITY_BAND_MPS2"}  # the recipe's default beside the recipe; a band, told in words
 UNLISTED |= {"WHEEL_SCALE_STD", "VISUAL_SCALE_STD"}  # listed where they are made
