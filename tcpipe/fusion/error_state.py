@@ -71,6 +71,8 @@ _LOCK_OUT = {
 _DOUBTED = (5.0, 2.0, 2.0, 1.0)
 _GROWS_NS = 3_000_000_000
 _PASSES = 3
+_ODOMETRY_HOLDS_M, _LASTS_S = 0.1, 30.0
+_CARRIED_M = 0.5
 """Refusals in a row, and seconds since the last accepted measurement, after which a gate reopens; the seconds where no other sensor
 of velocity is heard. `_DOUBTED`: the same of fixes whose error is part of the state; the 1 says that it is lifted, and not the pose."""
 
@@ -137,7 +139,12 @@ def _counted(measurements: Measurements, errors: FixErrors | None, *, doubted: b
     """Return the measurements with the variance of fixes that counts from one to the next: the claim, where nothing else holds the rest."""
     if errors is None or measurements.gnss is None:
         return measurements
-    variance = errors.white_m2 if doubted else np.maximum(errors.white_m2, measurements.gnss.variance_m2)
+    gnss = measurements.gnss
+    variance = errors.white_m2 if doubted else np.maximum(errors.white_m2, gnss.variance_m2)
+    if errors.of_metres:  # odometry knows better for half a minute: so often they count
+        together = max(1.0, _LASTS_S * 1e9 / median_period_ns(gnss.stamp_ns))
+        lasting_m2 = np.median(errors.lasting_m2[:, 0])
+        variance = np.maximum(variance, errors.lasting_m2) * min(together, lasting_m2 / _ODOMETRY_HOLDS_M**2)
     return replace(measurements, gnss=replace(measurements.gnss, variance_m2=variance))
 
 
@@ -236,7 +243,8 @@ class _Run:
         self._lock_out = np.full((8, 4), _NEVER)
         for kind, limits in _LOCK_OUT.items():
             self._lock_out[kind] = (*limits, 0.0)
-        self.carried = measurements.imu is not None and bool(measurements.odometries())
+        gnss, carriers = measurements.gnss, measurements.imu is not None and bool(measurements.odometries())
+        self.carried = carriers and gnss is not None and float(np.median(gnss.variance_m2[:, 0])) < _CARRIED_M**2
         if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
             self._lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
         if measurements.imu is None and measurements.visual is None:  # wheels that dig in must not overrule GNSS

@@ -616,8 +616,8 @@ def _faded(x: Vector, P: Matrix, kept: float, noise: Vector, opened: Vector, dt:
         for j in range(P.shape[0]):
             P[i, j] *= kept
             P[j, i] *= kept
-        P[i, i] += noise[i - N] + opened[i - N] * max(1.0 - kept * kept, 0.0)
         opened[i - N] *= 1.0 - min(dt / _FORGOTTEN_S, 1.0) if kept > _ANEW else 0.0
+        P[i, i] += noise[i - N] + opened[i - N] * max(1.0 - kept * kept, 0.0)
 
 
 @kernel
@@ -772,9 +772,9 @@ def filter_block(
                         _renewed(x, P, error_level[e])
                         again = _innovation(k, x, P, z[e], r[e], turn_rate_now[e], levers[k], bias, work, gain)
                         for a in range(3):
-                            opened[a] = max(gain[0][a] ** 2, OFF_M**2) if again > gates[k] else 0.0
+                            opened[a] = max(gain[0][a] ** 2, OFF_M**2) if again > SURELY * gates[k] else 0.0
                             opened[3 + a] = 0.0
-                        if again > gates[k]:
+                        if again > SURELY * gates[k]:
                             _renewed(x, P, np.maximum(opened[:3], error_level[e]))
                     else:
                         _lifted(k, P, gain[0], alone)

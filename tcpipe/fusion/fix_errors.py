@@ -45,8 +45,13 @@ class FixErrors:
 
     @property
     def matters(self) -> bool:
-        """Whether the part that lasts is larger anywhere than what odometry holds over seconds."""
-        return bool((self.lasting_m2[:, :2] > _LARGE_M**2).any())
+        """Whether the part that lasts is larger anywhere than what odometry holds over seconds, and is not one of metres throughout."""
+        return bool((self.lasting_m2[:, :2] > _LARGE_M**2).any()) and not self.of_metres
+
+    @property
+    def of_metres(self) -> bool:
+        """Whether an error of half a metre or more lasts most of the time."""
+        return float(np.median(self.lasting_m2[:, 0])) > _FLOAT_M**2
 
 
 def find_fix_errors(measurements: Measurements) -> FixErrors | None:

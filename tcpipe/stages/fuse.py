@@ -11,7 +11,8 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
 from tcpipe.stages.fuse_agreeing import fuse_agreeing
 from tcpipe.stages.fuse_audit import audit_findings
-from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, rejections_table
+from tcpipe.stages.fuse_columns import rejections_table
+from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.stages.fuse_mounting_findings import mounting_findings
 from tcpipe.stages.fuse_sanity import sane_inputs

@@ -1,8 +1,9 @@
-"""The track's columns beside the pose: what the wheels, the command and the power say at its stamps."""
+"""The track's columns beside the pose: what wheels, command and power say at its stamps; and the table of refusals."""
 
 from __future__ import annotations
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities
@@ -11,10 +12,11 @@ from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.power.rails import power_at
+from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.power_rails import rails_of
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.levels import Streams
+from tcpipe.tables.levels import REJECTIONS, Streams
 
 Arrays = dict[str, NDArray[np.float64]]
 
@@ -68,3 +70,21 @@ def power_columns(streams: Streams, epoch: int, at_ns: NDArray[np.int64], *, max
     """Return voltage, current and power at each stamp; NaN in power gaps and without power."""
     values = power_at(rails_of(streams, epoch), at_ns, max_gap_ns=max_gap_ns)
     return dict(zip(("voltage_volt", "current_amp", "power_watt"), values, strict=True))
+
+
+def rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:
+    """Return every refused measurement in order of time: by the gate, and those without a usable value."""
+    parts = [trajectory.rejections for trajectory in found]
+    invalid = [(role, np.concatenate(stamps)) for role, stamps in sorted(inputs.invalid_ns.items())]
+    size = sum(stamps.size for _, stamps in invalid)
+    unknown = np.full(size, np.nan)
+    columns = {
+        "stamp_ns": [p.stamp_ns for p in parts] + [stamps for _, stamps in invalid],
+        "role": [p.role for p in parts] + [np.full(stamps.size, role) for role, stamps in invalid],
+        "reason": [p.reason for p in parts] + [np.full(size, "invalid")],
+        "normalized_innovation_squared": [p.normalized_innovation_squared for p in parts] + [unknown],
+        "threshold": [p.threshold for p in parts] + [unknown],
+    }
+    joined = {name: np.concatenate(values) for name, values in columns.items()}
+    order = np.lexsort((joined["role"], joined["stamp_ns"]))
+    return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})

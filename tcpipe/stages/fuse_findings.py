@@ -1,4 +1,4 @@
-"""What fusing noticed: facts for the manifest, warnings for people, and the table of refused measurements."""
+"""What fusing noticed: facts for the manifest and warnings for people."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-import pyarrow as pa
 
 from tcpipe.fusion.measurements import GNSS, IMU, InitialState
 from tcpipe.fusion.stretches import Stretch
@@ -14,7 +13,6 @@ from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.tables.findings import FuseFacts, StretchFacts
-from tcpipe.tables.levels import REJECTIONS
 
 _MANY_REFUSED = 0.2
 _COMMON = 0.02
@@ -109,21 +107,3 @@ def _reopened(facts: FuseFacts) -> list[str]:
             f"{worst.start_ns} to {worst.end_ns} ns (run.json: reopenings): look there at its clock, its mounting and its surroundings"
         )
     return found
-
-
-def rejections_table(inputs: FusionInputs, found: list[Trajectory]) -> pa.Table:
-    """Return every refused measurement in order of time: by the gate, and those without a usable value."""
-    parts = [trajectory.rejections for trajectory in found]
-    invalid = [(role, np.concatenate(stamps)) for role, stamps in sorted(inputs.invalid_ns.items())]
-    size = sum(stamps.size for _, stamps in invalid)
-    unknown = np.full(size, np.nan)
-    columns = {
-        "stamp_ns": [p.stamp_ns for p in parts] + [stamps for _, stamps in invalid],
-        "role": [p.role for p in parts] + [np.full(stamps.size, role) for role, stamps in invalid],
-        "reason": [p.reason for p in parts] + [np.full(size, "invalid")],
-        "normalized_innovation_squared": [p.normalized_innovation_squared for p in parts] + [unknown],
-        "threshold": [p.threshold for p in parts] + [unknown],
-    }
-    joined = {name: np.concatenate(values) for name, values in columns.items()}
-    order = np.lexsort((joined["role"], joined["stamp_ns"]))
-    return REJECTIONS.table(**{name: values[order] for name, values in joined.items()})

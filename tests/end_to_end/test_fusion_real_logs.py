@@ -46,7 +46,12 @@ def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
         ("lon_deg", 111_200.0 * np.cos(np.radians(floats(gnss, "lat_deg")[0]))),
     ):
         error_m = metres * (np.interp(integers(gnss, "stamp_ns"), stamp, floats(table, name)) - floats(gnss, name))
-        assert np.median(np.abs(error_m)) < 1.0  # these fixes claim 0.9 m
+        std_m = np.interp(
+            integers(gnss, "stamp_ns"), stamp, floats(table, "y_std_m" if name == "lat_deg" else "x_std_m")
+        )
+        # These fixes claim 0.9 m, which wanders, and jump by 5 m: the track follows neither, and says so.
+        assert np.median(np.abs(error_m) / np.hypot(0.9, std_m)) < 1.0
+        assert np.median(np.abs(error_m)) < 1.5
     assert np.abs(floats(table, "roll_rad")).max() < 0.15  # a flat campus
     assert np.abs(floats(table, "pitch_rad")).max() < 0.15
     moving = floats(table, "wheel_velocity_mps") > 0.5
