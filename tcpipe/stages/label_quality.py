@@ -7,6 +7,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.cost.quality import low_power_rate, near, slipping, voltage_outside
+from tcpipe.fusion.measurements import GNSS
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.pieces import piece_of_rows
 from tcpipe.power.rails import Rail
@@ -62,13 +63,15 @@ def motion_flags(
 
 
 def _disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
-    """Return the segments of one epoch that touch a time in which a sensor disagrees with the track, undecided."""
+    """Return the segments of one epoch that touch a time in which a sensor disagrees with the track undecided, or fixes were off it."""
     start_ns, end_ns, epoch = integers(cut, "start_ns"), integers(cut, "end_ns"), integers(cut, "epoch")
+    facts = info.findings.facts
+    times = [(e.epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone]
+    for stretch in facts.fuse.stretches if facts.fuse else ():
+        times += [(stretch.epoch, r.start_ns, r.end_ns) for r in stretch.reopenings if r.role == GNSS]
     disputed = np.zeros(cut.num_rows, dtype=np.bool_)
-    audit = info.findings.facts.audit
-    for each in audit.disagreements if audit else ():
-        if not each.alone:
-            disputed |= (epoch == each.epoch) & (start_ns <= each.end_ns) & (end_ns >= each.start_ns)
+    for of_epoch, first_ns, last_ns in times:
+        disputed |= (epoch == of_epoch) & (start_ns <= last_ns) & (end_ns >= first_ns)
     return disputed
 
 

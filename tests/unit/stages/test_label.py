@@ -13,7 +13,15 @@ from tcpipe.stages.label import label_segments
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import AuditFacts, Disagreement, Findings, RunFacts
+from tcpipe.tables.findings import (
+    AuditFacts,
+    Disagreement,
+    Findings,
+    FuseFacts,
+    Reopening,
+    RunFacts,
+    StretchFacts,
+)
 from tcpipe.tables.levels import Sensor, Streams
 
 T = np.arange(0, 60, 0.05)
@@ -201,6 +209,21 @@ def test_segments_that_touch_a_time_in_which_sensors_disagree_undecided_are_flag
     )
     assert flagged(labelled, Quality.SENSORS_DISAGREE).tolist() == touched.tolist()
     assert 8 <= touched.sum() <= 10
+
+
+def test_segments_in_which_the_gate_of_the_fixes_reopened_are_flagged():
+    def refused(role, begin_s, end_s):
+        return Reopening(role, int(ZERO + begin_s * 1e9), int(ZERO + end_s * 1e9), 0.5)
+
+    track = straight_track(SPEED)
+    stretch = StretchFacts({}, {}, {}, 0, reopenings=(refused("gnss", 20, 30), refused("wheel_odometry", 40, 50)))
+    facts = replace(track.info.findings.facts, fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, (stretch,)))
+    told = replace(track, info=replace(track.info, findings=Findings((), facts)))
+    labelled = label(told, power_streams({"drive": record()}))
+    touched = (integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
+        integers(labelled.table, "end_ns") >= ZERO + 20e9
+    )
+    assert flagged(labelled, Quality.SENSORS_DISAGREE).tolist() == touched.tolist()
 
 
 def test_not_at_the_limit_where_slower_than_full_speed_was_kept():
