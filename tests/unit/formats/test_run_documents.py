@@ -13,8 +13,10 @@ from tcpipe.formats.seals import SEAL, write_sealed
 from tcpipe.store import Store
 
 KEPT = Path(__file__).parents[2] / "data" / "store-1.0.tar.xz"
-SINCE = {"weight_over_efficiency_newton", "rolling_resistance", "gyro_bias_radps", "turn_scale"}
-"""Keys that are always there since, null where they were left out."""
+SINCE = dict.fromkeys(("weight_over_efficiency_newton", "rolling_resistance", "gyro_bias_radps", "turn_scale")) | {
+    "blamed": True
+}
+"""Keys that are always there since, and what they hold where they were left out."""
 
 
 @pytest.fixture
@@ -24,11 +26,11 @@ def kept(tmp_path):
     return tmp_path / "store"
 
 
-def without(value, names):
-    """The value without keys of these names that are null."""
+def without(value, since):
+    """The value without keys of these names that hold what they do where they were left out."""
     if isinstance(value, dict):
-        return {key: without(of, names) for key, of in value.items() if of is not None or key not in names}
-    return [without(of, names) for of in value] if isinstance(value, list) else value
+        return {key: without(of, since) for key, of in value.items() if key not in since or of != since[key]}
+    return [without(of, since) for of in value] if isinstance(value, list) else value
 
 
 @pytest.mark.parametrize(("pattern", "cls"), [("runs/*/run.json", RunJson), ("runs/*/*/manifest.json", Manifest)])
