@@ -18,6 +18,7 @@ _ROUNDS = 3
 _SURE = 4.0  # standard deviations
 _SURE_OF_ARM = 4.0
 _LEAST_TILT_RAD = np.radians(1.0)
+_MOST_TILT_RAD = np.radians(30.0)  # an IMU that is turned further is told by gravity, before anything is fused
 _LEAST_ARM_M = 0.1
 _SETTLED_M = 0.02
 _SETTLED_RAD = np.radians(0.2)
@@ -56,7 +57,8 @@ def _tilted(inputs: FusionInputs, fused: Fused) -> Tilt | None:
         return None
     known = np.zeros(2) if inputs.imu_tilt is None else inputs.imu_tilt.rad
     least = np.where(known != 0.0, _SETTLED_RAD, np.maximum(_LEAST_TILT_RAD, _SURE * tilt.std_rad))
-    turned = np.where(np.abs(tilt.rad) > least, tilt.rad, 0.0)
+    told = (np.abs(tilt.rad) > least) & (np.abs(tilt.rad + known) < _MOST_TILT_RAD)
+    turned = np.where(told, tilt.rad, 0.0)
     return replace(tilt, rad=turned) if turned.any() else None
 
 

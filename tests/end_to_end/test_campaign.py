@@ -46,6 +46,16 @@ def test_no_label_is_sure_and_wrong(name, clean):
     assert "start" not in found.inside or 1.0 - found.inside["start"][2].value <= 0.15
 
 
+def test_a_straight_drive_is_a_clean_log():
+    """Where nothing turns, no mounting and no antenna is contradicted."""
+    cell = Cell("all", 10.0, FAULTS["straight ahead"])
+    result = campaign.made(cell, FIRST_SEED, length_m=40.0)
+    found = figures_of(cell, [result], [result])
+    assert found.doubted <= 0.02
+    assert all(found.inside[name][2].value > 0.9 for name in ("T", "v", "E", "start"))
+    assert not result.outcome.said
+
+
 @pytest.mark.parametrize("name", ["5 s", "never moves", "GNSS covariance NaN"])
 def test_odd_logs_end_in_words(name):
     fault = FAULTS[name]

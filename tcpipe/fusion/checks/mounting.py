@@ -49,6 +49,9 @@ _MOVES_MPS = 0.3
 _BLOCK_S = 10.0
 _CLIMB_S = 4.0
 _LEAST_TILT_STD_RAD = 0.004
+_STATED_TILT_STD_RAD = 0.0175
+_LEAST_TURNING_RADPS = 0.02
+"""Root mean square: what turns less is led by the gyroscope's own drift, which is alike for minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -260,7 +263,10 @@ def _climb_mps(gnss: Positions, stamp_ns: NDArray[np.int64]) -> tuple[Floats, ND
 
 
 def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
-    """Return roll and pitch of the IMU by all stretches, with deviations from how blocks of ten seconds scatter; None if nothing tells."""
+    """Return roll and pitch of the IMU by all stretches, with deviations from how blocks of ten seconds scatter; None if nothing tells.
+
+    A roll that no turn shows stays at what is known beforehand: none.
+    """
     evidence = [each for each in told if each is not None]
     if not evidence:
         return None
@@ -269,7 +275,9 @@ def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
     )
     if turning.sum() <= 0.0 or moving.sum() <= 0.0:
         return None
-    angles = np.array([_ratio(beside, turning), _ratio(-felt, moving)])
+    turns = turning.sum() > _LEAST_TURNING_RADPS**2 * moving.sum()
+    roll = _ratio(beside, turning) if turns else (0.0, _STATED_TILT_STD_RAD)
+    angles = np.array([roll, _ratio(-felt, moving)])
     return Tilt(angles[:, 0], angles[:, 1])
 
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from tcpipe.fusion.checks.mounting import (
     ARM_STD_M,
     Tilt,
+    TiltEvidence,
     antenna_doubt,
     arm_evidence,
     levelled,
@@ -164,3 +165,14 @@ def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
     tilt = Tilt(np.zeros(2), np.array([0.02, 0.01]))
     doubt = antenna_doubt(unknown_arm(), tilt, (0.0, 0.0, 0.9))
     assert np.diag(doubt) == pytest.approx([0.25 + 0.009**2, 0.25 + 0.018**2, 0.25])
+
+
+def test_a_roll_that_no_turn_shows_stays_nothing():
+    """Over ten minutes straight ahead the gyroscope's own drift, alike about both axes, would be a roll of 190°, and sure."""
+    rows, slow = np.full(60, 200.0), 0.003
+    drift = TiltEvidence(rows * slow**2, rows * slow * 0.01, rows, np.zeros(60))
+    tilt = solve_tilt([drift])
+    assert tilt.rad[0] == 0.0
+    assert np.degrees(tilt.std_rad[0]) == pytest.approx(1.0, rel=0.01)
+    turning = TiltEvidence(rows * 0.1**2, rows * 0.1**2 * np.radians(5.0), rows, np.zeros(60))
+    assert np.degrees(solve_tilt([turning]).rad[0]) == pytest.approx(5.0)
