@@ -44,14 +44,15 @@ _FEWEST = 20
 _FEWEST_WINDOWS = 3
 """Errors of the fixes last: how far windows disagree is not told by fewer."""
 _WILD = 5.0
+_TELLS_M2PS2 = 1e3
+_LEAST_TURN_RAD = 1.0
+_TURNS_RADPS = 0.1
 _TURNING_POINT_STD_M = {WHEELS: 0.03, VISUAL: 0.01}
 _MOVES_MPS = 0.3
 _BLOCK_S = 10.0
 _CLIMB_S = 4.0
 _LEAST_TILT_STD_RAD = 0.004
 _STATED_TILT_STD_RAD = 0.0175
-_LEAST_TURNING_RADPS = 0.02
-"""Root mean square: what turns less is led by the gyroscope's own drift, which is alike for minutes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +118,7 @@ def arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
     told = []
     for begin in np.arange(0.0, row_s[-1], _WINDOW_S):
         rows = (fix_s >= begin) & (fix_s < begin + _WINDOW_S)
-        if rows.sum() >= _FEWEST:
+        if rows.sum() >= _FEWEST and _turned_rad(axes[rows]) > _LEAST_TURN_RAD:
             told.append(_window(place[rows], drawn[rows], axes[rows], float(np.median(claim[rows]))))
     if not told:
         return None
@@ -126,6 +127,11 @@ def arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
         np.stack([vector for _, vector in told]),
         _TURNING_POINT_STD_M[role],
     )
+
+
+def _turned_rad(axes: Floats) -> float:
+    """Return between which yaws the robot turned."""
+    return float(np.ptp(np.unwrap(np.arctan2(axes[:, 1, 0], axes[:, 0, 0]))))
 
 
 def _drawn(found: Trajectory, source: BodyVelocities) -> Floats:
@@ -137,6 +143,8 @@ def _drawn(found: Trajectory, source: BodyVelocities) -> Floats:
     said = interval_means(seconds(source.stamp_ns, zero), point, row_s[:-1], row_s[1:])
     turn = (found.angular_velocity_radps[1:] + found.angular_velocity_radps[:-1]) / 2.0
     body = said - np.cross(turn, source.lever_arm_m)
+    telling = source.variance_m2ps2 < _TELLS_M2PS2
+    body[:, telling.mean(0) < 0.5] = 0.0  # along an axis that it does not measure a robot slides little
     steps = np.einsum("kij,kj->ki", (rotation[1:] + rotation[:-1]) / 2.0, body)[:, :2] * step_s[:, None]
     return np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
 
@@ -237,6 +245,7 @@ def tilt_evidence(found: Trajectory, m: Measurements) -> TiltEvidence | None:
     rise = np.sign(ahead) * climb / np.maximum(speed, _MOVES_MPS)
     beyond = np.where(moving, (felt - quicker) / _GRAVITY_MPS2 - rise, 0.0)
     rate = rate - np.median(rate, axis=0)
+    rate[np.abs(rate[:, 1]) < _TURNS_RADPS] = 0.0
     block = max(1, round(_BLOCK_S * 1e9 / median_period_ns(found.stamp_ns)))
     first = np.arange(0, row_s.size - 1, block)
     sums = (rate[:, 1] ** 2, rate[:, 0] * rate[:, 1], moving.astype(np.float64), beyond)
@@ -273,20 +282,21 @@ def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
     turning, beside, moving, felt = (
         np.concatenate([getattr(e, name) for e in evidence]) for name in TiltEvidence.__slots__
     )
-    if turning.sum() <= 0.0 or moving.sum() <= 0.0:
-        return None
-    turns = turning.sum() > _LEAST_TURNING_RADPS**2 * moving.sum()
-    roll = _ratio(beside, turning) if turns else (0.0, _STATED_TILT_STD_RAD)
-    angles = np.array([roll, _ratio(-felt, moving)])
+    angles = np.array([_ratio(beside, turning), _ratio(-felt, moving)])
     return Tilt(angles[:, 0], angles[:, 1])
 
 
 def _ratio(above: Floats, below: Floats) -> tuple[float, float]:
-    """Return the ratio of two sums over blocks, and its deviation by the scatter of the blocks."""
+    """Return the ratio of two sums over blocks, and its deviation by the scatter of the blocks.
+
+    Where fewer than three blocks tell it, what is stated stays.
+    """
+    blocks = int(np.count_nonzero(below))
+    if blocks < _FEWEST_WINDOWS:
+        return 0.0, _STATED_TILT_STD_RAD
     value = float(above.sum() / below.sum())
-    blocks = len(above)
-    std = float(np.sqrt(np.sum((above - value * below) ** 2) * blocks / max(blocks - 1, 1))) / float(below.sum())
-    return value, float(np.hypot(std, _LEAST_TILT_STD_RAD)) if blocks > 1 else float("inf")
+    std = float(np.sqrt(np.sum((above - value * below) ** 2) * blocks / (blocks - 1))) / float(below.sum())
+    return value, float(np.hypot(std, _LEAST_TILT_STD_RAD))
 
 
 def levelled(imu: InertialMeasurements, tilt_rad: Floats) -> InertialMeasurements:
