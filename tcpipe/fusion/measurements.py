@@ -20,6 +20,10 @@ GNSS, IMU, WHEELS, VISUAL = "gnss", "imu", "wheel_odometry", "visual_odometry"
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
 
 
+_UNMEASURED_M2PS2 = 1e3
+"""A variance from which on an axis is not measured (ruling)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Positions:
     """GNSS: positions of an antenna.
@@ -61,6 +65,12 @@ class BodyVelocities:
     yaw_rate_var: NDArray[np.float64]
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
     turn_rate_radps: NDArray[np.float64] | None = None
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Along which axes most rows tell a velocity, shape (3,)."""
+        told: NDArray[np.bool_] = (self.variance_m2ps2 < _UNMEASURED_M2PS2).mean(0) > 0.5
+        return told
 
 
 @dataclass(frozen=True, slots=True)

@@ -230,7 +230,7 @@ def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64])
         noise = m.imu.gyro_std_radps * np.sqrt(median_period_ns(m.imu.stamp_ns) * 1e-9)
         yield _turn(IMU, _sums(rate, windows), _sums(turned[:, 2:], windows), noise, turn_std)
     for role, source in m.odometries().items():
-        axes = slice(0, 1 if role == WHEELS else 2)
+        axes = slice(0, 2 if source.measured[1] else 1)
         point = way + np.cross(turned, source.lever_arm_m)
         said = means(source.stamp_ns, source.velocity_mps[:, axes]) * step_s
         if role == WHEELS:  # that turn while the robot stands: it is stuck, and they are right

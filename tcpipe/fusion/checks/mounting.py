@@ -44,7 +44,6 @@ _FEWEST = 20
 _FEWEST_WINDOWS = 3
 """Errors of the fixes last: how far windows disagree is not told by fewer."""
 _WILD = 5.0
-_TELLS_M2PS2 = 1e3
 _LEAST_TURN_RAD = 1.0
 _TURNS_RADPS = 0.1
 _TURNING_POINT_STD_M = {WHEELS: 0.03, VISUAL: 0.01}
@@ -143,8 +142,7 @@ def _drawn(found: Trajectory, source: BodyVelocities) -> Floats:
     said = interval_means(seconds(source.stamp_ns, zero), point, row_s[:-1], row_s[1:])
     turn = (found.angular_velocity_radps[1:] + found.angular_velocity_radps[:-1]) / 2.0
     body = said - np.cross(turn, source.lever_arm_m)
-    telling = source.variance_m2ps2 < _TELLS_M2PS2
-    body[:, telling.mean(0) < 0.5] = 0.0  # along an axis that it does not measure a robot slides little
+    body[:, ~source.measured] = 0.0  # along an axis that it does not measure a robot slides little
     steps = np.einsum("kij,kj->ki", (rotation[1:] + rotation[:-1]) / 2.0, body)[:, :2] * step_s[:, None]
     return np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
 
