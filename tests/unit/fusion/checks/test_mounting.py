@@ -173,12 +173,14 @@ def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
     assert np.diag(doubt) == pytest.approx([0.25 + 0.009**2, 0.25 + 0.018**2, 0.25])
 
 
-def test_a_roll_that_no_turn_shows_stays_nothing():
-    """Over ten minutes straight ahead the gyroscope's own drift, alike about both axes, would be a roll of 190°, and sure."""
-    rows, slow = np.full(60, 200.0), 0.003
-    drift = TiltEvidence(rows * slow**2, rows * slow * 0.01, rows, np.zeros(60))
-    tilt = solve_tilt([drift])
+def test_a_roll_that_no_turn_shows_stays_nothing(track, sensors):
+    """Straight ahead the gyroscope's own drift, alike about both axes, would be a roll, and sure."""
+    at_s = (sensors.imu.stamp_ns - sensors.imu.stamp_ns[0]) * 1e-9
+    drift = np.outer(np.sin(at_s / 60.0), [0.0, 0.03, 0.01])
+    straight = replace(sensors.imu, angular_velocity_radps=drift)
+    tilt = solve_tilt([tilt_evidence(track, replace(sensors, imu=straight))])
     assert tilt.rad[0] == 0.0
     assert np.degrees(tilt.std_rad[0]) == pytest.approx(1.0, rel=0.01)
+    rows = np.full(60, 200.0)
     turning = TiltEvidence(rows * 0.1**2, rows * 0.1**2 * np.radians(5.0), rows, np.zeros(60))
     assert np.degrees(solve_tilt([turning]).rad[0]) == pytest.approx(5.0)
