@@ -163,11 +163,15 @@ def alone_in_most(tallies: Iterable[Tally]) -> tuple[str, ...]:
 
 
 def undecided_in_most(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
-    """Return what sensors contradict in most of the way, where no third tells who is right.
+    """Return what sensors contradict in most of the way, where no third tells throughout who is right.
 
     A position that is off while ways and turns agree is known to be off by how much, and stands in the deviations.
     """
-    return tuple((t.sensor, t.what) for t in _summed(tallies) if t.what != "position" and _most(t.undecided, t.moving))
+    return tuple(
+        (t.sensor, t.what)
+        for t in _summed(tallies)
+        if t.what != "position" and _most(t.undecided + t.alone, t.moving) and not _most(t.alone, t.moving)
+    )
 
 
 def consistent(tallies: Iterable[Tally]) -> bool:
