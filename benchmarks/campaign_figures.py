@@ -15,7 +15,12 @@ from campaign_map import NAME, MapResult
 from tcpipe.tables.bits import Quality
 
 OF_THE_DRIVE = (
-    Quality.CURVED | Quality.MEAN_POWER_DIFFERS | Quality.NOT_AT_LIMIT | Quality.NO_COMMAND | Quality.LOW_POWER_RATE
+    Quality.CURVED
+    | Quality.MEAN_POWER_DIFFERS
+    | Quality.NOT_AT_LIMIT
+    | Quality.NO_COMMAND
+    | Quality.LOW_POWER_RATE
+    | Quality.PHYSICS_OUTLIER  # ground unlike the rest of the run's
 )
 """Bits that describe what was driven and recorded; all others doubt a label, and those are what is judged here."""
 LABELS = ("T", "v", "w", "E")
