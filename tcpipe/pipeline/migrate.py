@@ -31,7 +31,12 @@ def _to_1_2(document: Document) -> Document:
     return {**document, "data_model_version": "1.2"}
 
 
-_STEPS: Mapping[str, Callable[[Document], Document]] = {"1.0": _to_1_1, "1.1": _to_1_2}
+def _to_1_3(document: Document) -> Document:
+    """Return a document of 1.2 as one of 1.3: columns are added, and a column that is absent is read as null."""
+    return {**document, "data_model_version": "1.3"}
+
+
+_STEPS: Mapping[str, Callable[[Document], Document]] = {"1.0": _to_1_1, "1.1": _to_1_2, "1.2": _to_1_3}
 """By version that is left."""
 
 

@@ -77,7 +77,7 @@ def _segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.T
     for name, source in (("fused", "forward"), ("commanded", "commanded")):
         signal = floats(rows, f"{source}_velocity_mps")
         columns[f"{name}_velocity_mps"] = mean_between(path.stamp_ns, signal, cut.start_ns, cut.end_ns)
-    std_m = np.maximum(floats(rows, "x_std_m"), floats(rows, "y_std_m"))
+    std_m = np.hypot(floats(rows, "x_std_m"), floats(rows, "y_std_m"))  # DRMS: holds whatever way the error points
     ends_m = [interpolate(path.stamp_ns, std_m, at_ns) for at_ns in (cut.start_ns, cut.end_ns)]
     return SEGMENTS.table(**columns, position_std_m=np.maximum(*ends_m))
 

@@ -42,7 +42,7 @@ class Quality(IntFlag):
     HIGH_SLIP = 1 << 2
     """Wheel speed and ground speed differ by more than 20 %."""
     WEAK_GNSS = 1 << 3
-    """Horizontal position standard deviation above `label.flag_position_std_m` at either end."""
+    """Deviation of the horizontal position (DRMS, `position_std_m`) above `label.flag_position_std_m` at either end."""
     CURVED = 1 << 4
     """Arc over chord above 1.01."""
     MEAN_POWER_DIFFERS = 1 << 5

@@ -30,13 +30,13 @@ from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
 
-DATA_MODEL_VERSION = "1.2"
+DATA_MODEL_VERSION = "1.3"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
 
-READ_VERSIONS = ("1.0", "1.1", DATA_MODEL_VERSION)
+READ_VERSIONS = ("1.0", "1.1", "1.2", DATA_MODEL_VERSION)
 """Versions that are read as they are; `tcpipe migrate` brings the older ones to the last."""
 
-TABLES_VERSION = "1.2"
+TABLES_VERSION = "1.3"
 """Version in which a table last changed."""
 
 _METADATA_KEY = b"tcpipe"
@@ -308,7 +308,7 @@ _SEGMENT_COLUMNS = (
     Column(
         "fused_velocity_mps", _F64, "m/s", "time-mean of the fused forward body velocity (the paper's v*)", "base_link"
     ),
-    Column("position_std_m", _F64, "m", "largest horizontal position standard deviation of both ends", "enu"),
+    Column("position_std_m", _F64, "m", "deviation of the horizontal position, DRMS: root of the sum of both axes' variances; that of the less certain end", "enu"),
     Column(
         "commanded_velocity_mps",
         _F64,
