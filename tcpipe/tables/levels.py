@@ -308,7 +308,13 @@ _SEGMENT_COLUMNS = (
     Column(
         "fused_velocity_mps", _F64, "m/s", "time-mean of the fused forward body velocity (the paper's v*)", "base_link"
     ),
-    Column("position_std_m", _F64, "m", "deviation of the horizontal position, DRMS: root of the sum of both axes' variances; that of the less certain end", "enu"),
+    Column(
+        "position_std_m",
+        _F64,
+        "m",
+        "DRMS of the horizontal position (root of the sum of both variances), less certain end",
+        "enu",
+    ),
     Column(
         "commanded_velocity_mps",
         _F64,
