@@ -2,20 +2,25 @@
 
 Compilation takes seconds, once; the listener reports it through the logger ``tcpipe`` so that nobody thinks the program hangs.
 A read-only installation without a home directory has no place for numba's cache: a temporary directory is used then.
+Numba takes a cached kernel for fresh as long as the kernel's own file is the same, whatever has changed in other modules that it calls:
+here it is fresh only if what the file imports is the same, too.
 """
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import os
 import stat
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from numbers import Number
 from typing import Any
 
 import numba
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
 
 logger = logging.getLogger("tcpipe")
 
@@ -43,10 +48,41 @@ def kernel(function: Callable[..., Any]) -> Any:
     """Compile ``function`` with numba on first call: no Python objects, no GIL, IEEE arithmetic, cached on disk."""
     options = {"cache": True, "nogil": True, "error_model": "numpy"}
     try:
-        return numba.njit(**options)(function)
+        compiled = numba.njit(**options)(function)
     except RuntimeError:  # numba finds no place to write its cache
         numba.config.CACHE_DIR = _cache_directory()
-        return numba.njit(**options)(function)
+        compiled = numba.njit(**options)(function)
+    if isinstance(compiled, Dispatcher):  # it is none where NUMBA_DISABLE_JIT is set
+        index = _index_of(compiled)
+        index._source_stamp = _stamp(index._source_stamp, function)  # noqa: SLF001  numba has no public way to say what else there is
+    return compiled
+
+
+def _stamp(source: bytes, function: Callable[..., Any]) -> str:
+    """Return what a cached kernel must have been made of to be used: its file, and all that its module imports and numba compiles in.
+
+    That are numbers and text, kernels (whose own stamp holds what they are made of) and the fields of named tuples. What the module
+    defines itself is in its file; so it need not be told apart here.
+    """
+    made_of = [repr(source)]
+    for name, value in sorted(function.__globals__.items()):
+        if isinstance(value, Dispatcher):
+            made_of.append(f"{name} {_index_of(value)._source_stamp}")  # noqa: SLF001
+        elif not name.startswith("__") and _is_plain(value):
+            made_of.append(f"{name} {value!r}")
+        else:
+            made_of.extend(f"{name} {field}" for field in getattr(value, "_fields", ()))
+    return hashlib.sha256("\n".join(made_of).encode()).hexdigest()
+
+
+def _index_of(compiled: Any) -> Any:
+    """Return the index of what numba has cached of a kernel."""
+    return compiled._cache._cache_file  # noqa: SLF001
+
+
+def _is_plain(value: object) -> bool:
+    """Whether a value is a number, a text or a tuple of such: what numba compiles in as it is, and what ``repr`` tells wholly."""
+    return all(map(_is_plain, value)) if isinstance(value, tuple) else isinstance(value, Number | str)
 
 
 def _cache_directory() -> str:

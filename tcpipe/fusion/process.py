@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import in_gap, median_period_ns, seconds, slopes, white_noise
 
@@ -89,7 +89,7 @@ def scale_stds(measurements: Measurements) -> tuple[float, float]:
 
 
 def process_noise(measurements: Measurements) -> NDArray[np.float64]:
-    """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.error_state_kernel.predict` takes it.
+    """Return the process noise by mode, shape (4, 20), as `tcpipe.fusion.prediction_kernel.predict` takes it.
 
     Somewhat more than the IMU's white noise stands for its scale and alignment errors. Biases and scales wander: their densities are
     what such sensors do in a second. Slip comes and goes, so the wheels' scale returns to one; where only the wheels and the camera

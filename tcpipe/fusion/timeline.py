@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements
 from tcpipe.fusion.process import UNSEEN_TURN_RADPS, glides, shake_density, turn_sources

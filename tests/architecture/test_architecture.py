@@ -158,6 +158,11 @@ def test_stages_are_thin():
     assert not {name: length for name, length in lengths.items() if length > 120}
 
 
+def test_no_file_is_longer_than_one_can_read():
+    lengths = {path.relative_to(ROOT).as_posix(): len(path.read_text().splitlines()) for path in MODULES}
+    assert not {name: length for name, length in lengths.items() if length > 600}
+
+
 def test_nothing_below_the_pipeline_reads_the_wall_clock_or_global_randomness():
     found = [
         f"{path}:{line} {name}"

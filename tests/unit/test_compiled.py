@@ -1,5 +1,6 @@
-"""Compiling kernels where numba finds no place for its cache."""
+"""Compiling kernels: where numba finds no place for its cache, and what makes a cached one stale."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -24,6 +25,58 @@ def double(x):
     return 2.0 * x
 print(compiled.kernel(double)(21.0), numba.config.CACHE_DIR)
 """
+
+CALLED = {
+    "numbers_": "STEP, SCALE = 1.0, (1.0, 2.0)\n",
+    "inner": "from tcpipe.compiled import kernel\n\n@kernel\ndef more(x):\n    return x + 1.0\n",
+    "fields": "from typing import NamedTuple\n\nclass Pair(NamedTuple):\n    a: float\n    b: float\n",
+    "outer": """
+from fields import Pair
+from inner import more
+from numbers_ import SCALE, STEP
+from tcpipe.compiled import kernel
+
+@kernel
+def between(x):
+    return more(x) * STEP
+
+@kernel
+def outermost(x, pair):
+    return between(x) * SCALE[1] + pair.a
+""",
+}
+
+
+@pytest.fixture
+def run_again(tmp_path, monkeypatch):
+    """Change a module, import all of them anew and return what the kernel computes and how often it came from the cache."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    for name, text in CALLED.items():
+        (tmp_path / f"{name}.py").write_text(text)
+
+    def run(module="outer", old="", new=""):
+        path = tmp_path / f"{module}.py"
+        assert old in path.read_text()
+        path.write_text(path.read_text().replace(old, new))
+        for name in CALLED:
+            sys.modules.pop(name, None)
+        outer = importlib.import_module("outer")
+        found = outer.outermost(2.0, outer.Pair(10.0, 20.0))
+        return found, sum(outer.outermost.stats.cache_hits.values())
+
+    yield run
+    for name in CALLED:
+        sys.modules.pop(name, None)
+
+
+def test_a_cached_kernel_is_used_until_something_that_it_is_made_of_changes_in_whatever_module(run_again):
+    assert run_again() == (16.0, 0)  # (2 + 1) 1 2 + 10
+    assert run_again() == (16.0, 1)
+    assert run_again("inner", "1.0", "2.0") == (18.0, 0)  # two kernels away
+    assert run_again("numbers_", "STEP, SCALE = 1.0", "STEP, SCALE = 3.0") == (34.0, 0)
+    assert run_again("fields", "a: float\n    b", "b: float\n    a") == (44.0, 0)
+    assert run_again() == (44.0, 1)
 
 
 @pytest.fixture

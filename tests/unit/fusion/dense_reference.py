@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion import state_kernel as kernel
 
 N = 17
 

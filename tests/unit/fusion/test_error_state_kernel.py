@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from unit.fusion import dense_reference, drive
 
-from tcpipe.fusion import error_state, error_state_kernel
+from tcpipe.fusion import error_state_pass, prediction_kernel, state_kernel, update_kernel
 from tcpipe.fusion.fix_errors import FixErrors
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import part
@@ -22,9 +22,9 @@ RATE, FORCE, LEVER = np.array([0.3, -0.2, 0.8]), np.array([0.5, 0.3, 9.7]), np.a
 @pytest.mark.parametrize(("mode", "scaled"), [(0, 0), (1, 0), (1, 1), (2, 0), (3, 0)])
 def test_prediction_is_the_unscented_transform(mode, scaled):
     x, covariance, moved = X.copy(), P.copy(), np.zeros((12, 9))
-    work, _ = error_state_kernel.workspace(17)
+    work, _ = state_kernel.workspace(17)
     q = np.concatenate((np.linspace(0.01, 0.02, 19), [scaled, 0.03]))
-    error_state_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
+    prediction_kernel.predict(x, covariance, q, 0.03, 0.4, RATE, FORCE, mode, moved, work)
     wanted_x, wanted_P, cross = dense_reference.predict(X, P, q, 0.03, 0.4, RATE, FORCE, mode)
     assert np.allclose(x, wanted_x, atol=1e-13)
     assert np.allclose(covariance, wanted_P, atol=1e-13)
@@ -38,17 +38,17 @@ def test_prediction_is_the_unscented_transform(mode, scaled):
 
 @pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 6, 7])
 def test_update_is_the_unscented_transform(kind):
-    work, gain = error_state_kernel.workspace(17)
+    work, gain = state_kernel.workspace(17)
     z, r = np.array([0.2, -0.1, 0.3]), np.array([0.02, 0.03, 0.04])
-    if kind in {error_state_kernel.SIDEWAYS, error_state_kernel.LEVEL}:
+    if kind in {state_kernel.SIDEWAYS, state_kernel.LEVEL}:
         z[2] = 0.0
     x, covariance = X.copy(), P.copy()
-    nis = error_state_kernel._innovation(kind, x, covariance, z, r, RATE, LEVER, 1.0, work, gain)
-    error_state_kernel._correct(x, covariance, work, gain, np.zeros((3, 3)))
+    nis = update_kernel.innovation_of(kind, x, covariance, z, r, RATE, LEVER, 1.0, work, gain)
+    update_kernel.correct(x, covariance, work, gain, np.zeros((3, 3)))
     wanted = dense_reference.update(kind, X, P, z, r, RATE, LEVER)
     assert np.allclose(x, wanted[0], atol=1e-13)
     assert np.allclose(covariance, wanted[1], atol=1e-9)
-    if kind == error_state_kernel.WHEEL_VELOCITY:  # only the wheels' own velocity is judged, not the constraint with it
+    if kind == state_kernel.WHEEL_VELOCITY:  # only the wheels' own velocity is judged, not the constraint with it
         d, wm, wc = dense_reference.sigma(P)
         forward = np.array([dense_reference.expect(kind, dense_reference.plus(X, e), RATE, LEVER)[0] for e in d])
         wanted_nis = (z[0] - wm @ forward) ** 2 / (wc @ (forward - wm @ forward) ** 2 + r[0])
@@ -72,16 +72,16 @@ def _short_run():
 def test_filter_and_smoother_are_those_written_out(monkeypatch, doubted):
     measurements, standing, initial, output = _short_run()
     timeline = build_timeline(part(measurements, 0, int(output[-1])), standing, output)
-    monkeypatch.setattr(error_state, "_BLOCK", 40)  # several blocks,
-    monkeypatch.setattr(error_state, "_KEPT_BLOCKS", 2)  # some of them filtered twice
-    run = error_state._Run(timeline, measurements, 0.999, lags=(3, 10))
+    monkeypatch.setattr(error_state_pass, "_BLOCK", 40)  # several blocks,
+    monkeypatch.setattr(error_state_pass, "_KEPT_BLOCKS", 2)  # some of them filtered twice
+    run = error_state_pass.FilterPass(timeline, measurements, 0.999, lags=(3, 10))
     run.gates[:] = np.inf
     if doubted:
         shape = measurements.gnss.variance_m2.shape
         sizes = np.where(np.arange(shape[0]) % 8 < 4, 0.3, 0.1)[:, None] * [1.0, 1.2, 1.5]  # fixes of two kinds
         run.doubt_fixes(FixErrors(measurements.gnss.variance_m2, sizes**2, np.full(shape[0], 2.0)), ())
         assert np.unique(run.kept_error.round(2)).size > 2
-    memory = error_state._start(initial, (0.12, 0.05), 0.0, run.start_error_m2)
+    memory = error_state_pass._start(initial, (0.12, 0.05), 0.0, run.start_error_m2)
     after, smoothed, gains = dense_reference.filter_and_smooth(
         timeline, run._densities, run._levers, memory.x, memory.P, kept=run.kept_error, noise=run.error_noise_m2
     )
@@ -108,9 +108,9 @@ def test_filter_and_smoother_are_those_written_out(monkeypatch, doubted):
 
 
 def test_deviations_of_yaw_and_forward_velocity_are_those_of_a_cloud():
-    out = np.zeros(error_state_kernel.SAVED)
+    out = np.zeros(state_kernel.SAVED)
     small = P * 1e-4
-    error_state_kernel._saved(X, small, out)
+    state_kernel.saved(X, small, out)
     cloud = np.random.default_rng(6).multivariate_normal(np.zeros(17), small, 20_000)
     states = np.array([dense_reference.plus(X, d) for d in cloud])
     yaw = np.arctan2(states[:, 3], states[:, 0])
@@ -120,10 +120,10 @@ def test_deviations_of_yaw_and_forward_velocity_are_those_of_a_cloud():
 
 
 def test_a_covariance_that_is_none_is_repaired_and_counted():
-    work, _ = error_state_kernel.workspace(17)
+    work, _ = state_kernel.workspace(17)
     broken = P.copy()
     broken[3, 3] = -1e-12
-    error_state_kernel.predict(X.copy(), broken, np.zeros(21), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
+    prediction_kernel.predict(X.copy(), broken, np.zeros(21), 0.0, 0.1, RATE, FORCE, 3, np.zeros((12, 9)), work)
     assert work[8][0] > 0
     assert np.isfinite(broken).all()
     assert np.linalg.eigvalsh(broken).min() > 0

@@ -8,7 +8,7 @@ import pytest
 from unit.fusion import drive
 from unit.fusion.test_error_state import fuse, truth
 
-from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.preparation import inertial
 from tcpipe.fusion.process import process_noise, shake_density, turn_scale_std
 from tcpipe.fusion.signals import slopes, white_noise

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from unit.fusion import drive
 
-from tcpipe.fusion import error_state_kernel as kernel
+from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.measurements import InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.timeline import build_timeline
 

@@ -1,0 +1,350 @@
+"""One pass of the error-state filter over a stretch, and the smoother's way back over it, in blocks of bounded memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion import state_kernel as kernel
+from tcpipe.fusion.error_state_kernel import OFF_M, SURELY, filter_block, most_drift
+from tcpipe.fusion.fix_errors import FixErrors
+from tcpipe.fusion.gates import chi_square_gate
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.process import glides, process_noise, scale_stds, turn_scale_std
+from tcpipe.fusion.signals import median_period_ns
+from tcpipe.fusion.smoother_kernel import smooth_block
+from tcpipe.fusion.timeline import EventTimeline
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
+from tcpipe.geometry.rotation import matrix_from_quat
+from tcpipe.tables.findings import Reopening
+
+WIDTH = kernel.SAVED
+"""Numbers in a row of outputs, as `state_kernel.saved` fills it; 81 more with covariances."""
+_BLOCK = 2048
+_KEPT_BLOCKS = 12
+"""Blocks whose forward pass is kept at once: about 2.2 kB an event, 55 MB."""
+
+_Store = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
+
+ROLES = {kernel.GNSS_POSITION: GNSS, kernel.WHEEL_VELOCITY: WHEELS, kernel.VISUAL_VELOCITY: VISUAL}
+DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
+DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2}
+_LEAST_ERROR_M = 1e-4
+_NO_ERROR = np.empty(0)
+_ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
+_NEVER = 1e18
+_FIXED = 1e-6
+GROWS_NS = 3_000_000_000
+_CARRIED_M = 0.5
+_LOCK_OUT = {
+    kernel.GNSS_POSITION: (5.0, 15.0, 5.0),
+    kernel.WHEEL_VELOCITY: (5.0, 5.0, 0.3),
+    kernel.VISUAL_VELOCITY: (5.0, 5.0, 0.3),
+}
+_DOUBTED = (5.0, 2.0, 2.0, 1.0)
+"""Refusals in a row, and seconds since the last accepted measurement, after which a gate reopens; the seconds where no other sensor
+of velocity is heard. `_DOUBTED`: the same of fixes whose error is part of the state; the 1 says that it is lifted, and not the pose."""
+
+
+@dataclass(slots=True)
+class _Memory:
+    """What the filter carries from event to event."""
+
+    x: NDArray[np.float64]
+    P: NDArray[np.float64]
+    refused: NDArray[np.float64]
+    silent: NDArray[np.float64]
+    opened: NDArray[np.float64]
+
+    def copy(self) -> _Memory:
+        return _Memory(self.x.copy(), self.P.copy(), self.refused.copy(), self.silent.copy(), self.opened.copy())
+
+
+class FilterPass:
+    """One timeline with its constants and what the gates said.
+
+    Parameters
+    ----------
+    timeline, measurements : the events, and what they are made of.
+    gate_probability : a measurement less likely than 1 minus this is refused.
+    lags : [rows of the wanted stamps], over which displacements are judged, see `lags_of`.
+    covariances : keep the covariance of every wanted state as well.
+    """
+
+    def __init__(
+        self,
+        timeline: EventTimeline,
+        measurements: Measurements,
+        gate_probability: float,
+        *,
+        lags: Sequence[int],
+        covariances: bool = False,
+    ) -> None:
+        self.lags = lags
+        self.covariances = covariances
+        self._width = WIDTH + 81 if covariances else WIDTH
+        self.timeline = timeline
+        self.lasting_m2 = np.zeros((1, 3))
+        count = timeline.stamp_ns.size
+        self.nis = np.full(count, np.nan)
+        self.innovation = np.full((count, 3), np.nan)
+        self.suspects: tuple[Reopening, ...] = ()
+        self.start_error_m2 = np.empty(0)  # of the fixes, where the state holds it
+        self.kept_error, self.error_noise_m2 = np.ones(count), np.zeros((count, 3))
+        self.error_level_m2 = np.zeros((count, 3))
+        self.verdict = np.zeros(count, np.int8)
+        self.repairs = 0.0
+        self.displacement_variance_m2 = np.full((timeline.output.max() + 1, len(DISPLACEMENT_LAGS_S)), np.nan)
+        self.gates = np.full(8, np.inf)
+        for kind in (*ROLES, kernel.STANDING, kernel.STANDING_RATE):
+            self.gates[kind] = chi_square_gate(DOF[kind], gate_probability)
+        self._levers = np.zeros((8, 3))
+        for kind, source in (
+            (kernel.GNSS_POSITION, measurements.gnss),
+            (kernel.WHEEL_VELOCITY, measurements.wheels),
+            (kernel.SIDEWAYS, measurements.wheels),
+            (kernel.VISUAL_VELOCITY, measurements.visual),
+        ):
+            if source is not None:
+                self._levers[kind] = source.lever_arm_m
+        self._densities = process_noise(measurements)
+        self._lock_out = np.full((8, 4), _NEVER)
+        for kind, limits in _LOCK_OUT.items():
+            self._lock_out[kind] = (*limits, 0.0)
+        gnss, carriers = measurements.gnss, measurements.imu is not None and bool(measurements.odometries())
+        self.carried = carriers and gnss is not None and float(np.median(gnss.variance_m2[:, 0])) < _CARRIED_M**2
+        if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
+            self._lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
+        if measurements.imu is None and measurements.visual is None:  # wheels that dig in must not overrule GNSS
+            self._lock_out[kernel.GNSS_POSITION, 1:3] = 1.0
+        # Without GNSS nothing tells how long a metre of odometry is; an accelerometer has a scale and an alignment of its own.
+        self.unseen_scale_std = 0.0
+        # From positions alone forward and reverse look the same: yaw is the course, and may be anything.
+        self.unseen_yaw_std = 0.0
+        self.antenna_m = self._levers[kernel.GNSS_POSITION].copy()
+        self.unplaced = measurements.gnss is None
+        self.along_course = glides(measurements)
+        if self.along_course:
+            self._levers[:] = 0.0
+        if measurements.imu is None and not measurements.odometries():
+            self.unseen_yaw_std = _ANY_YAW_STD_RAD
+        self.turn_scale_std = turn_scale_std(measurements)
+        self.scale_stds = scale_stds(measurements)
+        self.last: _Memory
+
+    def doubt_fixes(self, errors: FixErrors | None, suspects: Sequence[Reopening]) -> None:
+        """Make the fixes' own error part of the state: a Gauss-Markov process, as large and as lasting as they are of their kind.
+
+        In the seconds before they were found to be off, ``suspects``, it may have grown already.
+        """
+        stamp_ns = self.timeline.stamp_ns[self.timeline.kind == kernel.GNSS_POSITION]
+        if errors is None or stamp_ns.size == 0:
+            return
+        fix = np.searchsorted(stamp_ns, self.timeline.stamp_ns, "right").clip(1, stamp_ns.size) - 1
+        lasting_m2 = np.maximum(errors.lasting_m2, _LEAST_ERROR_M**2)
+        for off in suspects:
+            before = (stamp_ns > off.start_ns - GROWS_NS) & (stamp_ns < off.start_ns)
+            lasting_m2[before] = np.maximum(lasting_m2[before], max(off.size, OFF_M) ** 2)
+        lasting_m2 = lasting_m2[fix]
+        # What comes with another kind of fix comes when time passes next.
+        passes = np.maximum.accumulate(np.where(self.timeline.dt_s > 0, np.arange(fix.size), 0))
+        lasting_m2 = lasting_m2[passes]
+        before = np.concatenate((lasting_m2[:1], lasting_m2[:-1]))
+        shrunk = np.sqrt(np.minimum(1.0, lasting_m2[:, 0] / before[:, 0]))
+        self.kept_error = np.exp(-self.timeline.dt_s / errors.lasts_s[fix]) * shrunk
+        self.error_noise_m2 = np.maximum(lasting_m2 - self.kept_error[:, None] ** 2 * before, 0.0)
+        self.error_level_m2 = lasting_m2
+        self.start_error_m2 = lasting_m2[0]
+        if self.carried:
+            self._lock_out[kernel.GNSS_POSITION] = _DOUBTED
+
+    def fixes_contradict(self) -> bool:
+        """Return whether fixes were refused for seconds on end while the other sensors carried the pose: they may err together."""
+        of_gnss = np.flatnonzero(self.timeline.kind == kernel.GNSS_POSITION)
+        if not self.carried or of_gnss.size == 0:
+            return False
+        refused = self.verdict[of_gnss] != kernel.ACCEPTED
+        edges = np.flatnonzero(np.diff(np.concatenate(([0], refused.astype(np.int8), [0]))))
+        first, last = edges[::2], edges[1::2] - 1
+        long_s = (self.timeline.stamp_ns[of_gnss[last]] - self.timeline.stamp_ns[of_gnss[first]]) * 1e-9
+        if ((last - first + 1 >= _DOUBTED[0]) & (long_s >= _DOUBTED[1])).any():
+            return True
+        heard = of_gnss[~refused]
+        normal = self.innovation[heard] / np.sqrt(self.timeline.variance[heard])
+        return bool(most_drift(normal) > SURELY * self.gates[kernel.GNSS_POSITION])
+
+    def filtered(self, initial: InitialState, *, keep: bool = False) -> NDArray[np.float64]:
+        """Forward states at the wanted stamps, rows as `state_kernel.saved` fills them; ``keep`` what `smooth` wants."""
+        count = self.timeline.stamp_ns.size
+        outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
+        blocks = self._blocks()
+        memory = _start(initial, self.scale_stds, self.turn_scale_std, self.start_error_m2)
+        self._checkpoints, self._kept = [], {}
+        if not keep:
+            self._forward(0, count, memory, outputs, None)
+        for index, (first, last) in enumerate(blocks if keep else ()):
+            self._checkpoints.append(memory.copy())
+            if index >= len(blocks) - _KEPT_BLOCKS:
+                self._kept[index] = self._store(first, last)
+            self._forward(first, last, memory, outputs, self._kept.get(index))
+        self.last = memory
+        return outputs
+
+    def smoothed(self, initial: InitialState) -> NDArray[np.float64]:
+        """Smoothed states at the wanted stamps."""
+        outputs = self.filtered(initial, keep=True)
+        self.smooth(outputs)
+        return outputs
+
+    def smooth(self, outputs: NDArray[np.float64]) -> None:
+        """Make the filtered states, as `filtered` has kept them, smoothed ones."""
+        n = self._errors
+        adjoint, information = np.zeros(n), np.zeros((n, n))
+        links = _links(self.lags, n)
+        blocks = self._blocks()
+        for index in range(len(blocks) - 1, -1, -1):
+            first, last = blocks[index]
+            if index not in self._kept:
+                self._kept[index] = self._store(first, last)
+                self._forward(first, last, self._checkpoints[index], outputs, self._kept[index])
+            smooth_block(
+                first,
+                last,
+                self.timeline.output,
+                self._kept.pop(index),
+                adjoint,
+                information,
+                outputs,
+                links,
+                self.displacement_variance_m2,
+            )
+
+    def lasting_error_m(self) -> float:
+        """Return how large an error of the fixes that lasts was taken to be, most of the time."""
+        if self.start_error_m2.size == 0:
+            return float(np.sqrt(np.median(self.lasting_m2[:, 0])))
+        return float(np.sqrt(np.median(self.error_level_m2[:, 0])))
+
+    def _blocks(self) -> list[tuple[int, int]]:
+        count = self.timeline.stamp_ns.size
+        return list(pairwise([*range(0, count, _BLOCK), count]))
+
+    @property
+    def _errors(self) -> int:
+        return kernel.N + self.start_error_m2.size
+
+    def _store(self, first: int, last: int) -> _Store:
+        """Return room for what the smoother wants of some events."""
+        events, wanted = last - first, int(np.count_nonzero(self.timeline.output[first:last] >= 0))
+        n = self._errors
+        return np.empty((events, 12, 9)), np.empty((events, 2, 3, n)), np.empty((events, 25)), np.empty((wanted, n, n))
+
+    def _forward(
+        self,
+        first: int,
+        last: int,
+        memory: _Memory,
+        outputs: NDArray[np.float64],
+        store: _Store | None,
+    ) -> None:
+        t = self.timeline
+        self.repairs += filter_block(
+            first,
+            last,
+            t.dt_s,
+            t.kind,
+            t.mode,
+            t.shake_m2ps3,
+            t.value,
+            t.variance,
+            t.turn_rate_radps,
+            t.force_mps2,
+            t.turn_rate_now_radps,
+            t.output,
+            self._levers,
+            self._densities,
+            self.gates,
+            self._lock_out,
+            self.kept_error,
+            self.error_noise_m2,
+            self.error_level_m2,
+            memory.x,
+            memory.P,
+            memory.refused,
+            memory.silent,
+            memory.opened,
+            store is not None,
+            store or self._store(0, 0),
+            self.nis,
+            self.innovation,
+            self.verdict,
+            outputs,
+        )
+
+
+def _links(lags: Sequence[int], n: int) -> tuple[NDArray[Any], ...]:
+    """Return what the smoother remembers to link each wanted stamp to those ``lags`` rows later, in the kernel's order.
+
+    The chain from the event at hand to the next wanted stamp; by node and row (a ring) the chains over the node's lag; by row the columns
+    of I - L P that belong to the position, and east, north with their smoothed covariance; by node the two nodes whose product it is;
+    the nodes' lags; the nodes wanted. The first node is one row; a longer one is made of its halves.
+    """
+    nodes: dict[int, tuple[int, int]] = {}
+
+    def add(lag: int) -> None:
+        if lag not in nodes:
+            halves = (lag - lag // 2, lag // 2)
+            for half in halves if lag > 1 else ():
+                add(half)
+            nodes[lag] = halves
+
+    for lag in (1, *lags):
+        add(lag)
+    index = {lag: k for k, lag in enumerate(nodes)}
+    recipe = np.array([[index.get(half, 0) for half in halves] for halves in nodes.values()])
+    size = max(nodes) + 1
+    chains = np.zeros((len(nodes), size, n, n))
+    wanted = np.array([index[lag] for lag in lags])
+    return np.eye(n), chains, np.zeros((size, n, 2)), np.zeros((size, 6)), recipe, np.array(list(nodes)), wanted
+
+
+def _start(
+    initial: InitialState,
+    scale_stds: tuple[float, float],
+    turn_scale_std: float = 0.0,
+    fix_error_m2: NDArray[np.float64] = _NO_ERROR,
+) -> _Memory:
+    """Return the state at the start; with a scale error of the turn rate to be found in the place of the gyroscope's bias, or without."""
+    n = kernel.N + fix_error_m2.size
+    x = np.zeros(n + 6)
+    rotation = matrix_from_quat(initial.quat_xyzw)
+    x[0:9] = rotation.ravel()
+    bias_std = turn_scale_std or initial.gyro_bias_std_radps
+    x[9:12] = 0.0 if turn_scale_std else initial.gyro_bias_radps
+    x[15:18] = initial.velocity_enu_mps
+    x[18:21] = initial.position_enu_m
+    P = np.zeros((n, n))
+    P[0:3, 0:3] = rotation.T @ np.diag(np.square([initial.tilt_std_rad] * 2 + [initial.yaw_std_rad])) @ rotation
+    index = np.arange(3, n)
+    P[index, index] = np.concatenate(
+        (
+            np.full(3, bias_std**2),
+            np.full(3, 0.15**2),
+            np.full(3, initial.velocity_std_mps**2),
+            initial.position_std_m**2,
+            np.square(np.maximum(scale_stds, _FIXED)),
+            fix_error_m2,
+        )
+    )
+    return _Memory(x, P, np.zeros(8), np.zeros(8), np.zeros(6))
+
+
+def lags_of(output_ns: NDArray[np.int64]) -> list[int]:
+    """Rows that each of `DISPLACEMENT_LAGS_S` spans."""
+    period_s = median_period_ns(output_ns) * 1e-9 if output_ns.size > 1 else 1.0
+    return [max(1, round(lag_s / period_s)) for lag_s in DISPLACEMENT_LAGS_S]

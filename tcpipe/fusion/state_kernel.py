@@ -1,0 +1,214 @@
+r"""State, errors and factors of the error-state unscented filter, and the layout of its events and noise.
+
+The state lives on a manifold, its error in a vector space of 17 dimensions (Solà 2017, section 4; Hertzberg et al. 2013)::
+
+    x  = (R, b_g, b_a, v, p, s_w, s_v)      R = enu_from_base_link in SO(3), v and p in ENU, biases in base_link axes
+    dx = (th, db_g, db_a, dv, dp, ds_w, ds_v)
+    x ⊞ dx = (R exp(th), b_g + db_g, …)     y ⊟ x = (log(Rx' Ry), …)
+
+Sigma points x ⊞ ±√n L_i with α = 1, κ = 0, β = 2, so that the centre has weight 0 in the mean and 2 in the covariance and no weight is
+negative (Wan & van der Merwe 2000). Errors of columns that do not touch R or b_g move linearly; their sigma points are summed in closed
+form, which is the same number. Every update draws fresh sigma points.
+
+Layout: ``x`` is flat, length 23: R row-major 0:9, b_g 9:12, b_a 12:15, v 15:18, p 18:21, s_w 21, s_v 22. ``dx``: th 0:3, b_g 3:6, b_a 6:9,
+v 9:12, p 12:15, s_w 15, s_v 16. Cholesky factors are upper, P = U'U, so that their rows are sigma points and every inner loop
+runs along memory.
+
+References: E. A. Wan, R. van der Merwe, "The unscented Kalman filter for nonlinear estimation", AS-SPCC 2000; J. Solà, "Quaternion
+kinematics for the error-state Kalman filter", arXiv 1711.02508, 2017; C. Hertzberg et al., "Integrating generic sensor fusion algorithms
+with sound state representations through encapsulation of manifolds", Information Fusion 14 (1), 2013.
+"""
+
+from __future__ import annotations
+
+from math import atan2, cos, sin, sqrt
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.compiled import kernel
+
+N = 17
+NX = 23
+SAVED = 33
+GRAVITY_MPS2 = 9.80665
+CENTRE_WEIGHT = 2.0
+
+PREDICT, GNSS_POSITION, WHEEL_VELOCITY, VISUAL_VELOCITY, STANDING, STANDING_RATE, SIDEWAYS, LEVEL = range(8)
+"""Kinds of events. SIDEWAYS: y and z of the body velocity are about zero; LEVEL: roll and pitch are small."""
+
+FLAT_TURN, VISUAL_TURN, GYRO_TURN, INERTIAL = range(4)
+"""Process modes: what tells how the robot turns. All but INERTIAL keep the body velocity."""
+
+MOVED = (0, 1, 2, 9, 10, 11, 12, 13, 14)
+"""Errors that others move into: th, v, p. All others stay what they are, but s_w, which may decay."""
+
+SLIDING, DECAY, TURNING, SCALED, GROUND = 9, *range(N, N + 4)
+"""Places in a row of process noise beside the densities, see `predict`."""
+
+NOT_A_MEASUREMENT, ACCEPTED, REFUSED, REOPENED = range(4)
+"""Verdicts of the gate."""
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+
+
+@kernel
+def rotation_exp(x: float, y: float, z: float, out: Vector) -> None:
+    """Rotation matrix (flat) of a rotation vector. Solà eq. 77."""
+    t2 = x * x + y * y + z * z
+    if t2 < 1e-8:
+        a = 1.0 - t2 / 6.0
+        b = 0.5 - t2 / 24.0
+    else:
+        t = sqrt(t2)
+        a = sin(t) / t
+        b = (1.0 - cos(t)) / t2
+    out[0] = 1.0 - b * (y * y + z * z)
+    out[4] = 1.0 - b * (x * x + z * z)
+    out[8] = 1.0 - b * (x * x + y * y)
+    out[1] = b * x * y - a * z
+    out[3] = b * x * y + a * z
+    out[2] = b * x * z + a * y
+    out[6] = b * x * z - a * y
+    out[5] = b * y * z - a * x
+    out[7] = b * y * z + a * x
+
+
+@kernel
+def difference(y: Vector, x: Vector, out: Vector) -> None:
+    """Error y ⊟ x."""
+    a = 0.0
+    b = 0.0
+    c = 0.0
+    trace = -1.0
+    for k in range(3):  # antisymmetric part and trace of Rx' Ry
+        x0 = x[3 * k]
+        x1 = x[3 * k + 1]
+        x2 = x[3 * k + 2]
+        y0 = y[3 * k]
+        y1 = y[3 * k + 1]
+        y2 = y[3 * k + 2]
+        a += x2 * y1 - x1 * y2
+        b += x0 * y2 - x2 * y0
+        c += x1 * y0 - x0 * y1
+        trace += x0 * y0 + x1 * y1 + x2 * y2
+    sine2 = 0.25 * (a * a + b * b + c * c)
+    if sine2 < 1e-8 and trace > 0.0:
+        f = 0.5 * (1.0 + sine2 / 6.0)
+    else:
+        sine = max(sqrt(sine2), 1e-12)
+        f = 0.5 * atan2(sine, 0.5 * trace) / sine
+    out[0] = f * a
+    out[1] = f * b
+    out[2] = f * c
+    for i in range(3, out.size):
+        out[i] = y[i + 6] - x[i + 6]
+
+
+@kernel
+def displaced(x: Vector, d: Vector, sign: float, rotate: bool, out: Vector, turn: Vector) -> None:  # noqa: FBT001
+    """State x ⊞ sign d; ``rotate`` is False where d has no rotation."""
+    if rotate:
+        rotation_exp(sign * d[0], sign * d[1], sign * d[2], turn)
+        for i in range(0, 9, 3):
+            for j in range(3):
+                out[i + j] = x[i] * turn[j] + x[i + 1] * turn[3 + j] + x[i + 2] * turn[6 + j]
+    else:
+        for i in range(9):
+            out[i] = x[i]
+    for i in range(3, d.size):
+        out[i + 6] = x[i + 6] + sign * d[i]
+
+
+@kernel
+def _cholesky(P: Matrix, U: Matrix) -> bool:
+    """Upper factor of P = U'U; False where P is not positive definite."""
+    n = P.shape[0]
+    for i in range(n):
+        for j in range(i, n):
+            U[i, j] = P[i, j]
+    for k in range(n):
+        pivot = U[k, k]
+        if not pivot > 0.0:
+            return False
+        scale = 1.0 / sqrt(pivot)
+        for j in range(k, n):
+            U[k, j] *= scale
+        for i in range(k + 1, n):
+            f = U[k, i]
+            for j in range(i, n):
+                U[i, j] -= f * U[k, j]
+    return True
+
+
+@kernel
+def factor(P: Matrix, U: Matrix, tally: Vector) -> None:
+    """`_cholesky`, with P lifted a little where rounding has spoiled it; how often is counted."""
+    lift = 1e-12
+    while not _cholesky(P, U):
+        tally[0] += 1.0
+        for i in range(P.shape[0]):
+            P[i, i] += lift * abs(P[i, i]) + 1e-3 * lift
+        lift *= 10.0
+        if lift > 1.0:  # beyond repair, or not a number: forget what is correlated
+            for i in range(P.shape[0]):
+                variance = P[i, i] if P[i, i] > 1e-6 and P[i, i] < 1e12 else 1e-6
+                for j in range(P.shape[0]):
+                    P[i, j] = 0.0
+                    P[j, i] = 0.0
+                P[i, i] = variance
+
+
+@kernel
+def saved(x: Vector, P: Matrix, out: Vector) -> None:
+    """State, then variances of p (3), yaw and forward velocity, then of s_w and s_v, then the fixes' error, shape (33,).
+
+    Where ``out`` is longer by 81, the covariance of (th, v, p) follows.
+    """
+    for i in range(NX):
+        out[i] = x[i]
+    for i in range(3):
+        out[23 + i] = P[12 + i, 12 + i]
+    level2 = max(x[0] * x[0] + x[3] * x[3], 1e-6)
+    # Yaw = atan2(R10, R00): d yaw = (R21 th_y + R22 th_z) / (R00² + R10²).
+    jy = x[7] / level2
+    jz = x[8] / level2
+    out[26] = jy * jy * P[1, 1] + 2.0 * jy * jz * P[1, 2] + jz * jz * P[2, 2]
+    # Forward velocity u = e_x' R' v: du = e_x' R' dv + u_y th_z - u_z th_y.
+    uy = x[1] * x[15] + x[4] * x[16] + x[7] * x[17]
+    uz = x[2] * x[15] + x[5] * x[16] + x[8] * x[17]
+    index = (1, 2, 9, 10, 11)
+    slope = (-uz, uy, x[0], x[3], x[6])
+    s = 0.0
+    for i in range(5):
+        for j in range(5):
+            s += slope[i] * slope[j] * P[index[i], index[j]]
+    out[27] = s
+    out[28] = P[15, 15]
+    out[29] = P[16, 16]
+    for i in range(3):
+        out[30 + i] = x[NX + i] if x.size > NX else 0.0
+    if out.size == SAVED + 81:
+        for i in range(9):
+            for j in range(9):
+                out[SAVED + 9 * i + j] = P[i if i < 3 else i + 6, j if j < 3 else j + 6]
+
+
+@kernel
+def workspace(n: int) -> Any:
+    """Scratch memory of the functions above for n errors; the last entry counts repairs of P."""
+    work = (
+        np.zeros((n, n)),
+        np.zeros((3, n)),
+        np.zeros(n),
+        np.zeros(n + 6),
+        np.zeros(n + 6),
+        np.zeros(n + 6),
+        np.zeros(n + 6),
+        np.zeros(9),
+        np.zeros(1),
+    )
+    gain = (np.zeros(3), np.zeros((2 * n, 3)), np.zeros((3, 3)), np.zeros((3, n)), np.zeros((3, 3)))
+    return work, gain
