@@ -124,9 +124,9 @@ def mutants_of(room: str) -> list[Mutant]:
     return found
 
 
-def chosen(draw: int, seed: int, *, thorough: bool) -> list[Mutant]:
-    """Return the changes to try: as many as are drawn of all rooms, and every comparison and number of some."""
-    every = [mutant for room in ROOMS for mutant in mutants_of(room)]
+def chosen(rooms: list[str], draw: int, seed: int, *, thorough: bool) -> list[Mutant]:
+    """Return the changes to try: as many as are drawn of these rooms, and every comparison and number of those in `THOROUGH`."""
+    every = [mutant for room in rooms for mutant in mutants_of(room)]
     drawn = random.Random(seed).sample(every, min(draw, len(every)))
     boundaries = [mutant for mutant in every if mutant.room in THOROUGH and mutant.is_boundary]
     return list(dict.fromkeys(drawn + boundaries if thorough else drawn))
@@ -191,8 +191,8 @@ def warm_up(tests: tuple[str, ...]) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS), help="try only those of these")
-    parser.add_argument("--draw", type=int, default=400, help="how many are drawn of all rooms")
+    parser.add_argument("--rooms", nargs="+", choices=ROOMS, default=list(ROOMS), help="which rooms to change")
+    parser.add_argument("--draw", type=int, default=400, help="how many are drawn of these rooms")
     parser.add_argument("--seed", type=int, default=11, help="of the draw")
     parser.add_argument("--only-drawn", action="store_true", help="leave out what is tried anyway")
     given = parser.parse_args()
@@ -201,8 +201,7 @@ def main() -> None:
     os.nice(19 - os.nice(0))
     sys.path.insert(0, str(ROOT))
     began = time.monotonic()
-    every = chosen(given.draw, given.seed, thorough=not given.only_drawn)
-    mutants = [mutant for mutant in every if mutant.room in given.rooms]
+    mutants = chosen(given.rooms, given.draw, given.seed, thorough=not given.only_drawn)
     lived = 0
     for room in given.rooms:
         mine, tests = [mutant for mutant in mutants if mutant.room == room], ROOMS[room][1]
