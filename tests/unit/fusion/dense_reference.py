@@ -7,6 +7,12 @@ from tcpipe.fusion import state_kernel as kernel
 
 N = 17
 
+RNG = np.random.default_rng(5)
+X = np.concatenate((Rotation.from_euler("ZYX", [1.0, 0.2, -0.3]).as_matrix().ravel(), 0.1 * RNG.normal(size=14)))
+ROOT = RNG.normal(size=(17, 17))
+P = 0.01 * ROOT @ ROOT.T + 0.01 * np.eye(17)
+RATE, FORCE, LEVER = np.array([0.3, -0.2, 0.8]), np.array([0.5, 0.3, 9.7]), np.array([0.3, 0.1, 0.5])
+
 
 def plus(x, d):
     y = x.copy()
