@@ -10,6 +10,7 @@ from tcpipe.cli.options import (
     INPUT_DIRECTORY,
     OUTPUT_DIRECTORY,
     FloatRange,
+    LonLat,
     json_option,
     map_option,
     quiet_option,
@@ -30,11 +31,25 @@ from tcpipe.cli.options import (
     metavar="METRES",
     help="Side of a cell.",
 )
+@click.option(
+    "--origin",
+    "origin_deg",
+    type=LonLat(),
+    help="Where the Nav2 maps' frame begins, as navsat_transform's datum (default: where the map's CRS does).",
+)
 @store_option
 @json_option
 @quiet_option
 def cost_map(
-    model: str, out: str, *, map_name: str | None, step_m: float, store: str, as_json: bool, quiet: bool
+    model: str,
+    out: str,
+    *,
+    map_name: str | None,
+    step_m: float,
+    origin_deg: tuple[float, float] | None,
+    store: str,
+    as_json: bool,
+    quiet: bool,
 ) -> None:
     """Predict power, velocity, time and energy a metre along 16 courses in every cell of a map.
 
@@ -48,7 +63,8 @@ def cost_map(
 
     with progress("cost-map", 1, quiet=quiet) as shown:
         source = chosen_map(store, map_name)
-        result = make_cost_map(load_model(model), source, Path(out), step_m=step_m, step=shown.count)
+        found = load_model(model)
+        result = make_cost_map(found, source, Path(out), step_m=step_m, origin_deg=origin_deg, step=shown.count)
     if as_json:
         print_json(result)
     else:

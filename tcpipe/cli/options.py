@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from math import isfinite
+from math import isfinite, nan
 from typing import Any
 
 import click
@@ -37,6 +37,22 @@ class FloatRange(click.FloatRange):
         """Return the number."""
         found = super().convert(value, param, ctx)
         return found if isfinite(found) else self.fail(f"{value!r} is not a finite number.", param, ctx)
+
+
+class LonLat(click.ParamType[tuple[float, float]]):
+    """A place: longitude and latitude in degrees (WGS84), with a comma between."""
+
+    name = "LON,LAT"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Return both numbers."""
+        try:
+            lon, lat = (float(part) for part in value.split(","))
+        except ValueError:
+            lon = lat = nan
+        if not (isfinite(lon) and isfinite(lat)):
+            self.fail(f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", param, ctx)
+        return lon, lat
 
 
 SEED = click.IntRange(0, 2**32 - 1)

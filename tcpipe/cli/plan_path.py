@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-from math import isfinite, nan
 from pathlib import Path
 from typing import Literal
 
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_FILE, FloatRange, json_option, quiet_option, store_option
-
-
-def _lonlat(context: click.Context, parameter: click.Parameter, value: str) -> tuple[float, float]:
-    """Turn ``LON,LAT`` into two numbers; anything else is a usage error."""
-    try:
-        lon, lat = (float(part) for part in value.split(","))
-    except ValueError:
-        lon = lat = nan
-    if not (isfinite(lon) and isfinite(lat)):
-        raise click.BadParameter(f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", ctx=context, param=parameter)
-    return lon, lat
+from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_FILE, FloatRange, LonLat, json_option, quiet_option, store_option
 
 
 @click.command("plan-path", short_help="The path of least energy, time or distance")
 @click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
-@click.option(
-    "--from", "start", required=True, metavar="LON,LAT", callback=_lonlat, help="Where it begins (WGS84, degrees)."
-)
-@click.option("--to", "goal", required=True, metavar="LON,LAT", callback=_lonlat, help="Where it ends.")
+@click.option("--from", "start", required=True, type=LonLat(), help="Where it begins (WGS84, degrees).")
+@click.option("--to", "goal", required=True, type=LonLat(), help="Where it ends.")
 @click.option(
     "--objective",
     default="energy",

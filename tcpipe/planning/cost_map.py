@@ -34,6 +34,7 @@ from tcpipe.formats.seals import Checksum, broken_checksums, file_checksums, rea
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
+from tcpipe.planning.path_cost import projection_of
 from tcpipe.planning.reasons import Reason
 from tcpipe.planning.verdicts import verdicts_of
 from tcpipe.tables.bits import name_of
@@ -94,6 +95,8 @@ class CostMapCard:
     """Of cells and courses."""
     barred_by: tuple[str, ...]
     checksums: Mapping[str, Checksum]
+    origin_deg: tuple[float, float] | None = None
+    """Longitude and latitude where the frame of the Nav2 maps begins; None where it is the CRS's own."""
     kind: str = KIND
     version: str = VERSION
 
@@ -134,6 +137,7 @@ def make_cost_map(
     out: Path,
     *,
     step_m: float,
+    origin_deg: tuple[float, float] | None = None,
     step: Callable[[int, int], None] = lambda _, __: None,
 ) -> CostMapResult:
     """Write the cost map of a whole map to ``out``, whole or not at all; an interrupted call goes on where it was.
@@ -146,6 +150,8 @@ def make_cost_map(
         Its directory: new, empty, or a cost map, which is replaced unless it is made from the same.
     step_m
         Side of a cell in the map's plane [m].
+    origin_deg
+        Longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own without.
     step
         Is told how many blocks of how many are done.
 
@@ -154,23 +160,27 @@ def make_cost_map(
     ModelError, MapError
         The map cannot give what the model wants, is smaller than a cell, or cannot be read.
     UsageError, StoreError
-        ``out`` is something else, or cannot be written.
+        ``out`` is something else, or cannot be written; the origin is far from the map.
 
     """
     check_model(model, source)
     clear_beside(out)
-    grid, key = grid_over(source, step_m), cost_map_key(model, source, step_m)
+    grid, key, origin_m = grid_over(source, step_m), cost_map_key(model, source, step_m), _origin_m(source, origin_deg)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
         raise UsageError(f"{out}: exists and is no cost map; give another directory")
     with _claimed(out) as place:
         found = read_cost_map_card(out)  # another process may have been first
         if found is not None and found.key == key and not any(broken_checksums(out, found.checksums)):
-            rmtree(place)
-            return CostMapResult(out, "unchanged", found)
-        spool = _spool(place, key, grid)
-        _fill(model, source, spool, step)
+            if found.origin_deg == origin_deg:
+                rmtree(place)
+                return CostMapResult(out, "unchanged", found)
+            costs = open_cost_map(out, found)
+        else:
+            spool = _spool(place, key, grid)
+            _fill(model, source, spool, step)
+            costs = spool.costs
         with atomic_directory(out) as directory:
-            card = _card(model, source, key, directory, spool.costs)
+            card = replace(_card(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
             write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(out, "done", card)
@@ -284,9 +294,30 @@ def _fill(model: CostModel, source: MapFile, spool: _Spool, step: Callable[[int,
         step(number, len(todo))
 
 
-def _card(model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid) -> CostMapCard:
+_FARTHEST_ORIGIN_M = 100_000.0
+"""From the map. A frame that begins further away has its longitude and latitude exchanged, or is of another site."""
+
+
+def _origin_m(source: MapFile, origin_deg: tuple[float, float] | None) -> tuple[float, float]:
+    """Return a place in the plane of the map's CRS, (0, 0) without one; `UsageError` where it is not near the map."""
+    if origin_deg is None:
+        return 0.0, 0.0
+    x_m, y_m = projection_of(source).forward(np.array([origin_deg]))[0].tolist()
+    x_min, y_min, x_max, y_max = source.grid.bounds_m
+    off_m = np.hypot(x_m - np.clip(x_m, x_min, x_max), y_m - np.clip(y_m, y_min, y_max))
+    if not off_m <= _FARTHEST_ORIGIN_M:
+        raise UsageError(
+            f"--origin {origin_deg[0]:g},{origin_deg[1]:g}: lies {off_m / 1000.0:.0f} km from map {source.name}, wanted at most "
+            f"{_FARTHEST_ORIGIN_M / 1000.0:.0f}; give LON,LAT (longitude first) of where the robot's map frame begins"
+        )
+    return x_m, y_m
+
+
+def _card(
+    model: CostModel, source: MapFile, key: str, directory: Path, costs: CostGrid, *, origin_m: tuple[float, float]
+) -> CostMapCard:
     """Write all files but the card; return it."""
-    scales = _write(directory, costs)
+    scales = _write(directory, costs, origin_m)
     cells, shares = _shares(costs)
     return CostMapCard(
         key=key,
@@ -306,7 +337,7 @@ def _card(model: CostModel, source: MapFile, key: str, directory: Path, costs: C
     )
 
 
-def _write(directory: Path, costs: CostGrid) -> dict[str, Nav2Scale]:
+def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> dict[str, Nav2Scale]:
     """Write all files but the card; return the scales of the Nav2 maps."""
     grid = costs.grid
     layout: dict[str, Any] = {"rows": grid.rows, "cols": grid.cols, "crs": grid.crs}
@@ -326,7 +357,7 @@ def _write(directory: Path, costs: CostGrid) -> dict[str, Nav2Scale]:
         bands=height,
         **layout,
     )
-    return {name: _write_nav2(directory / f"{name}.yaml", costs, name) for name in ("duration", "energy")}
+    return {name: _write_nav2(directory / f"{name}.yaml", costs, name, origin_m) for name in ("duration", "energy")}
 
 
 def _values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:
@@ -376,7 +407,7 @@ def _row_strips(costs: CostGrid) -> Iterator[tuple[int, int]]:
     yield from ((first, min(first + _ROWS_TOGETHER, rows)) for first in range(0, rows, _ROWS_TOGETHER))
 
 
-def _write_nav2(path: Path, costs: CostGrid, name: str) -> Nav2Scale:
+def _write_nav2(path: Path, costs: CostGrid, name: str, origin_m: tuple[float, float]) -> Nav2Scale:
     """Write the mean over the trusted courses from 0 to `HIGHEST`; return what these two stand for."""
     means = []
     for first, last in _row_strips(costs):
@@ -389,7 +420,7 @@ def _write_nav2(path: Path, costs: CostGrid, name: str) -> Nav2Scale:
     cost = np.where(known, np.rint(HIGHEST * np.clip(share, 0.0, 1.0)), LETHAL).astype(np.uint8)
     unit = _QUANTITIES[name]
     meaning = f"{name} a metre, mean over the courses: 0 is {low:.6g} {unit}, {HIGHEST} is {high:.6g} {unit}, {LETHAL} is not crossed"
-    write_nav2_map(path, cost, costs.grid, meaning=meaning)
+    write_nav2_map(path, cost, costs.grid, origin_m=origin_m, meaning=meaning)
     return Nav2Scale(low, high)
 
 

@@ -24,7 +24,9 @@ _OCCUPIED = 0.995
 """Between the darkest grey of `HIGHEST` and black."""
 
 
-def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, meaning: str) -> None:
+def write_nav2_map(
+    path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, origin_m: tuple[float, float], meaning: str
+) -> None:
     """Write ``path`` (.yaml) and the picture beside it.
 
     Parameters
@@ -34,7 +36,9 @@ def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, meanin
     cost
         From 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first.
     grid
-        Where the cells lie; the map's frame is the plane of its CRS.
+        Where the cells lie; the frame's axes are those of its CRS.
+    origin_m
+        x and y in that CRS where the frame's own are zero.
     meaning
         One line that says what a cost is.
     """
@@ -45,11 +49,11 @@ def write_nav2_map(path: Path, cost: NDArray[np.uint8], grid: MapGrid, *, meanin
     x_min, y_min, _, _ = grid.bounds_m
     lines = (
         f"# {meaning}",
-        f"# origin: x and y of {grid.crs if len(grid.crs) < 40 else 'the map CRS'} [m]",
+        f"# frame: x and y of {grid.crs if len(grid.crs) < 40 else 'the map CRS'} [m] less {origin_m[0]!r}, {origin_m[1]!r}",
         f"image: {picture.name}",
         "mode: scale",
         f"resolution: {grid.pitch_m!r}",
-        f"origin: [{x_min!r}, {y_min!r}, 0.0]",
+        f"origin: [{x_min - origin_m[0]!r}, {y_min - origin_m[1]!r}, 0.0]",
         "negate: 0",
         f"occupied_thresh: {_OCCUPIED}",
         "free_thresh: 0.0",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import matplotlib.image
 import numpy as np
+import pyproj
 import pytest
 import rasterio
 from map_worlds import ArrayMap
@@ -204,3 +205,20 @@ def test_what_cannot_be_mapped_is_one_line(tmp_path: Path):
     del source.arrays["terrain"]
     with pytest.raises(ModelError, match="has no terrain"):
         make_cost_map(MODEL, source, tmp_path / "c", step_m=1.0)
+
+
+def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew(made, tmp_path):
+    source, _ = made
+    out = tmp_path / "cost-map"
+    plain = make_cost_map(MODEL, source, out, step_m=2.0)
+    datum = (500_003.0, 5_199_990.0)
+    lonlat = pyproj.Transformer.from_crs("EPSG:32633", "EPSG:4326", always_xy=True).transform(*datum)
+    never_asked = _Asked(patches=[], most=0)
+    moved = make_cost_map(never_asked, source, out, step_m=2.0, origin_deg=lonlat)
+    assert (plain.status, moved.status) == ("done", "done")
+    about = YAML(typ="safe").load((out / "energy.yaml").read_text())
+    assert about["origin"] == pytest.approx([-3.0, -14.0, 0.0], abs=1e-3)
+    assert moved.card.checksums["energy.tif"] == plain.card.checksums["energy.tif"]
+    assert make_cost_map(MODEL, source, out, step_m=2.0, origin_deg=lonlat).status == "unchanged"
+    with pytest.raises(UsageError, match=r"km from map .*; give LON,LAT \(longitude first\)"):
+        make_cost_map(MODEL, source, out, step_m=2.0, origin_deg=lonlat[::-1])

@@ -22,10 +22,10 @@ def _ros1(share):
 def test_costs_are_read_as_written_and_only_lethal_is_lethal(tmp_path, reader, tolerance):
     cost = np.append(np.arange(HIGHEST + 1), [LETHAL, LETHAL]).astype(np.uint8).reshape(2, 51)
     grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 2.0, 2, 51)
-    write_nav2_map(tmp_path / "map.yaml", cost, grid, meaning="a cost")
+    write_nav2_map(tmp_path / "map.yaml", cost, grid, origin_m=(499_900.0, 5_199_000.0), meaning="a cost")
     about = YAML(typ="safe").load((tmp_path / "map.yaml").read_text())
     assert (about["mode"], about["negate"], about["resolution"]) == ("scale", 0, 2.0)
-    assert about["origin"] == [500_000.0, 5_200_000.0 - 4.0, 0.0]
+    assert about["origin"] == [100.0, 1_000.0 - 4.0, 0.0]
     head, pixels = (tmp_path / about["image"]).read_bytes().split(b"\n255\n", 1)
     assert head == b"P5\n51 2"
     occupied = 1.0 - np.frombuffer(pixels, np.uint8).reshape(2, 51) / 255.0
