@@ -82,7 +82,9 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
     return LABELLED_SEGMENTS.table(**given, **rest)
 
 
-def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None, track=None, warnings=()):
+def add_run(
+    store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None, track=None, warnings=(), tags=None
+):
     """Put a run with these segments, and this gated track, into the store, as ingestion would."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
@@ -101,7 +103,7 @@ def add_run(store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, se
         ingest_key=ingest_key(recipe),
         recipe=recipe.ingest,
         robot=robot,
-        tags={},
+        tags=tags or {},
         counts=Counts(table.num_rows),
         ledger_m=ledger_m,
         warnings=warnings,

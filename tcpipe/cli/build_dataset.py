@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Literal
 
 import click
@@ -17,6 +18,13 @@ from tcpipe.cli.options import (
     store_option,
     tag_values,
 )
+
+
+def _holdout(context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+    """Let pass what draws test; anything else is a usage error."""
+    if value is not None and re.fullmatch(r"block|sample|run|tag:.+", value) is None:
+        raise click.BadParameter(f"{value!r}: wanted block, sample, run, or tag:NAME", ctx=context, param=parameter)
+    return value
 
 
 @click.command("build-dataset", short_help="Segments and map to a dataset")
@@ -50,7 +58,17 @@ from tcpipe.cli.options import (
 )
 @click.option("--format", "file_format", default="zarr", show_default=True, type=click.Choice(["zarr", "parquet"]))
 @click.option(
-    "--holdout", type=click.Choice(["block", "sample", "run"]), help="How test is drawn (default: the recipe's)."
+    "--holdout",
+    metavar="HOW",
+    callback=_holdout,
+    help="How test is drawn: block, sample, run, or tag:NAME, which holds out values of a tag (default: the recipe's).",
+)
+@click.option(
+    "--covariates",
+    multiple=True,
+    type=INPUT_FILE,
+    metavar="FILE",
+    help="Table (CSV or Parquet) whose columns are joined to the samples by time, as weather or soil; repeat it for several.",
 )
 @click.option("--seed", type=SEED, help="Seed of split and row order (default: the recipe's).")
 @click.option(
@@ -78,7 +96,8 @@ def build_dataset(
     recipe: str | None,
     jobs: int,
     file_format: Literal["zarr", "parquet"],
-    holdout: Literal["block", "sample", "run"] | None,
+    holdout: str | None,
+    covariates: tuple[str, ...],
     seed: int | None,
     keep_split: str | None,
     min_runs: int | None,
@@ -111,6 +130,7 @@ def build_dataset(
             holdout=holdout,
             seed=seed,
             keep_split=keep_split,
+            covariates=covariates,
             min_runs=min_runs,
         )
         for problem in result.problems:

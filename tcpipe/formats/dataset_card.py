@@ -63,6 +63,7 @@ class SplitRules:
     """By kind: train_test, unseen, exclude."""
     audit: tuple[HeldOut, ...]
     kept: KeptSplit | None = None
+    holdout_tag: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,6 +83,19 @@ class RunSource:
     warnings: tuple[str, ...] = ()
     energy_budget: EnergyBudget | None = None
     samples: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Covariate:
+    """A table that was joined to the samples by time: its file, what its rows span (UTC), and by column the samples without a value."""
+
+    name: str
+    checksum: Checksum
+    rows: int
+    time_column: str
+    first: str
+    last: str
+    samples_without: Mapping[str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -242,6 +256,9 @@ class DatasetCard:
     """How many samples carry a quality flag; None in cards of before data model 1.2."""
     findings: tuple[RunFinding, ...] = ()
     """What ingest found of the runs, by cause."""
+    covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
+    added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
+    """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""

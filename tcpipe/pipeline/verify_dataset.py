@@ -70,10 +70,13 @@ def _samples(directory: Path, card: DatasetCard) -> Iterator[Finding]:
     samples, where = read_samples(directory), directory / SAMPLES
     yield "samples", samples.num_rows
     try:
-        SAMPLES_SCHEMA.check(samples)
+        SAMPLES_SCHEMA.check(
+            samples.drop_columns([name for name in card.added_columns if name in samples.column_names])
+        )
     except TcpipeError as error:
         yield from (f"{where}: {problem}" for problem in error.problems)
         return
+    yield from (f"{where}: has no column {name}" for name in card.added_columns if name not in samples.column_names)
     yield from (f"{where}: {problem}" for problem in _wrong_joins(samples, card))
     for key, value in measured(samples.select(CARD_COLUMNS), has_terrain="terrain" in card.layers).items():
         told = getattr(card, key)

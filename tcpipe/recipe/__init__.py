@@ -1,6 +1,7 @@
 """The recipe: every key that rules the pipeline, with default, bounds and reason; checked when it is made, in TOML and in Python alike."""
 
 from tcpipe.recipe.sections import (
+    CovariateConfig,
     DatasetConfig,
     FuseConfig,
     GateConfig,
@@ -16,6 +17,7 @@ from tcpipe.recipe.sections import (
 )
 
 __all__ = [
+    "CovariateConfig",
     "DatasetConfig",
     "FuseConfig",
     "GateConfig",

@@ -233,8 +233,10 @@ class SplitConfig:
 
     __pydantic_config__ = _STRICT
 
-    holdout: Literal["block", "sample", "run"] = "block"
-    """block keeps spatial neighbours together, sample is the paper's random draw, run keeps whole runs together."""
+    holdout: Literal["block", "sample", "run", "tag"] = "block"
+    """block keeps spatial neighbours together, sample is the paper's random draw, run keeps whole runs, tag runs of one tag's value."""
+    holdout_tag: str = ""
+    """With the holdout tag: which tag, for example season."""
     test_fraction: Annotated[float, Ge(0), Lt(1)] = 0.2
     """Share of test among the samples inside the region."""
     block_m: Annotated[float, Ge(0.1), Le(1e6)] = 10.0
@@ -242,12 +244,29 @@ class SplitConfig:
     buffer_m: Annotated[float, Ge(0), Le(1e6)] | None = None
     """A footprint nearer than this to a region's border goes to no split; none takes sqrt(2) times the chord [m]."""
     folds: Annotated[int, Ge(2), Le(100)] = 5
-    """Folds of spatial cross-validation among train and test: whole blocks, or whole runs with the holdout run."""
+    """Folds of spatial cross-validation among train and test: whole blocks, or whole runs (or tags) with the holdout run (or tag)."""
     seed: Annotated[int, Ge(0), Le(2**32 - 1)] = 0
     """Seed of the split and of the row order."""
 
     def __post_init__(self) -> None:
         settle(self, "split")
+
+
+@dataclass(frozen=True, slots=True)
+class CovariateConfig:
+    """How tables of weather, soil or snow are joined to the samples by time (`tcpipe build-dataset --covariates`)."""
+
+    __pydantic_config__ = _STRICT
+
+    time_column: str | None = None
+    """Column of the stamps; none takes the only one called time, stamp, timestamp, date or datetime, with or without a unit."""
+    time_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+    """Unit of stamps that are numbers, since 1970: auto takes the name's ending, else the one by which they are of this century."""
+    max_age_s: Annotated[float, Ge(1e-3), Le(1e9)] = 7200.0
+    """A sample takes the last row before its start; one that is older than this is not taken [s]."""
+
+    def __post_init__(self) -> None:
+        settle(self, "covariates")
 
 
 @dataclass(frozen=True, slots=True)
@@ -299,6 +318,7 @@ class Recipe:
     label: LabelConfig = field(default_factory=LabelConfig)
     sample: SampleConfig = field(default_factory=SampleConfig)
     split: SplitConfig = field(default_factory=SplitConfig)
+    covariates: CovariateConfig = field(default_factory=CovariateConfig)
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
     """Robots of your own by name; one that is called as one of tcpipe's takes its place."""

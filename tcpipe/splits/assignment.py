@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from tcpipe.splits.holdouts import (
     UNDECIDED,
-    Groups,
     Holdout,
     blocks,
     draw_folds,
@@ -56,6 +55,7 @@ def assign_splits(
     folds: int,
     seed: int,
     kept: Assignment | None = None,
+    tagged: tuple[Ints, Sequence[str]] | None = None,
 ) -> Assignment:
     """Return train, test, unseen, buffer or excluded for every sample, and the fold of those that train or test.
 
@@ -70,7 +70,7 @@ def assign_splits(
     regions
         In the same plane; without regions every sample is inside.
     holdout
-        ``sample`` draws ceil(test_fraction · n) samples, of each run those of lowest rank; ``block`` and ``run`` keep groups whole.
+        ``sample`` draws ceil(test_fraction · n) samples, of each run those of lowest rank; the others keep groups whole.
     test_fraction
         Share of test among the inside samples, after every drop and buffer.
     block_m
@@ -78,12 +78,14 @@ def assign_splits(
     buffer_m
         A footprint nearer than this to a region's border is in no split [m].
     folds
-        Number of folds; blocks (runs, with the holdout ``run``) stay whole in them.
+        Number of folds; blocks (runs, tags, with the holdout ``run``, ``tag``) stay whole in them.
     seed
         Seed of the ranks.
     kept
         What an earlier dataset decided, "" and `NO_FOLD` where it knew nothing: none of its samples moves, but for those that a region
         excludes now.
+    tagged
+        With the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
 
     """
     n = len(ranks)
@@ -93,7 +95,12 @@ def assign_splits(
     split[old != ""] = old[old != ""]
     inside = np.flatnonzero(np.isin(split, ("train", "test")))
     known = np.select([old[inside] == "test", old[inside] == "train"], [1, 0], UNDECIDED)
-    groups = _groups(run[inside], run_names, corners_xy_m[inside], by_run=holdout == "run", block_m=block_m)
+    whole = {"run": (run, run_names), "tag": tagged}.get(holdout)
+    groups = (
+        blocks(corners_xy_m[inside].mean(axis=1), block_m=block_m)
+        if whole is None
+        else runs_as_groups(whole[0][inside], whole[1])
+    )
     if holdout == "sample":
         test = draw_samples(ranks[inside], run[inside], test_fraction=test_fraction, kept=known)
     else:
@@ -105,9 +112,3 @@ def assign_splits(
     dealt = draw_folds(groups, run[inside], folds=folds, seed=seed, kept=groups.decided(old_fold))
     fold[inside] = np.where(old_fold == NO_FOLD, dealt[groups.member], old_fold)
     return Assignment(split, fold)
-
-
-def _groups(run: Ints, run_names: Sequence[str], corners_xy_m: Floats, *, by_run: bool, block_m: float) -> Groups:
-    if by_run:
-        return runs_as_groups(run, run_names)
-    return blocks(corners_xy_m.mean(axis=1), block_m=block_m)

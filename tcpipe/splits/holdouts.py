@@ -20,7 +20,7 @@ from tcpipe.splits.ranking import ranked_order
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]
-Holdout = Literal["block", "sample", "run"]
+Holdout = Literal["block", "sample", "run", "tag"]
 
 UNDECIDED = -1
 """A group of which nothing is known yet."""

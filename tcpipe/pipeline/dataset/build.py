@@ -11,7 +11,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from tcpipe.cost.budget import in_words
-from tcpipe.errors import DatasetError, UsageError, plain_lines
+from tcpipe.errors import DatasetError, RecipeError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding, Shard
@@ -37,6 +37,7 @@ from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.zarr_arrays import Compression
+from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, DRIVE_NEXT, measure_balance
 from tcpipe.pipeline.dataset.card import (
     CARD_COLUMNS,
@@ -55,12 +56,10 @@ from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import maps_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut, audit_lines
-from tcpipe.splits.holdouts import Holdout
 from tcpipe.splits.regions import Regions
 from tcpipe.store import open_store
 from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION
-from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 
 logger = logging.getLogger("tcpipe")
 
@@ -117,9 +116,10 @@ def build_dataset(
     recipe: Recipe | str | Path | None = None,
     jobs: int = 1,
     file_format: FileFormat = "zarr",
-    holdout: Holdout | None = None,
+    holdout: str | None = None,
     seed: int | None = None,
     keep_split: str | Path | None = None,
+    covariates: str | Path | Sequence[str | Path] = (),
     min_runs: int | None = None,
 ) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
@@ -148,9 +148,11 @@ def build_dataset(
     file_format
         ``zarr`` or ``parquet``.
     holdout, seed
-        Instead of the recipe's.
+        Instead of the recipe's; ``block``, ``sample``, ``run``, or ``tag:NAME``, which keeps runs of one value of the tag together.
     keep_split
         An earlier dataset, which may be ``out`` itself: its samples keep their split and fold, only new ones are drawn.
+    covariates
+        Tables (CSV or Parquet) whose columns are joined to the samples by time, as the recipe's section ``covariates`` says.
     min_runs
         Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
 
@@ -167,6 +169,7 @@ def build_dataset(
     regions = None if split is None else read_regions(Path(split))
     region = None if split is None else Path(split).read_bytes()
     robot = robot or ruling.robot
+    tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
     earlier = None if keep_split is None else earlier_splits(Path(keep_split))
     inputs = choose_inputs(
         opened,
@@ -177,6 +180,7 @@ def build_dataset(
         region=region,
         file_format=file_format,
         earlier=earlier,
+        covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
     )
     problems, warnings = _left_out(inputs, known, robot=robot, tags=tags or {}, min_runs=min_runs)
     inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
@@ -219,15 +223,21 @@ def _result(place: Path, status: str, card: DatasetCard, problems: Sequence[str]
     )
 
 
-def _ruling(recipe: Recipe | str | Path | None, *, holdout: Holdout | None, seed: int | None) -> Recipe:
+def _ruling(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
     """Return the recipe with the command's own choices in it."""
     if not isinstance(recipe, Recipe):
         recipe = load_recipe(find_recipe(None if recipe is None else Path(recipe), Path.cwd()))
+    kind, _, tag = (holdout or recipe.split.holdout).partition(":")
     rules = replace(
         recipe.split,
-        holdout=recipe.split.holdout if holdout is None else holdout,
+        holdout=kind,  # type: ignore[arg-type]  # the recipe checks it
+        holdout_tag=recipe.split.holdout_tag if holdout is None else tag,
         seed=recipe.split.seed if seed is None else seed,
     )
+    if rules.holdout == "tag" and not rules.holdout_tag:
+        raise RecipeError(
+            'recipe: split.holdout is "tag"; wanted split.holdout_tag too, for example "season" (--holdout tag:season)'
+        )
     return replace(recipe, split=rules)
 
 
@@ -268,7 +278,7 @@ def _build(
     waiting.mkdir()
     content = gather_content(waiting, inputs, recipe, regions, earlier, jobs=jobs)
     logger.info("writing %d samples", len(content.samples))
-    with parquet_rows(directory / SAMPLES, SAMPLES_SCHEMA.arrow()) as write:
+    with parquet_rows(directory / SAMPLES, content.samples.schema) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):
             write(piece)
     shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
@@ -287,7 +297,7 @@ def _build(
     files = file_checksums(directory)
     spool = content.spool
     patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
-    write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches))
+    write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches, samples=content.samples.schema))
     card = dataset_card(
         read_samples(directory, CARD_COLUMNS),
         recipe,
@@ -317,7 +327,12 @@ def _write_patches(
 
 
 def _croissant(
-    files: Mapping[str, Checksum], recipe: Recipe, inputs: str, patches: Mapping[str, tuple[int, str]] | None
+    files: Mapping[str, Checksum],
+    recipe: Recipe,
+    inputs: str,
+    patches: Mapping[str, tuple[int, str]] | None,
+    *,
+    samples: pa.Schema,
 ) -> str:
     about = recipe.dataset
     return croissant(
@@ -327,7 +342,7 @@ def _croissant(
         creator=about.creator,
         files=files,
         samples_file=SAMPLES,
-        samples=SAMPLES_SCHEMA.arrow(),
+        samples=samples,
         version=f"{DATA_MODEL_VERSION}.0+{inputs[:12]}",
         shards=None if patches is None else f"{SHARDS}/*.parquet",
         layers=patches,

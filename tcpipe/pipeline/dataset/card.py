@@ -109,6 +109,8 @@ def dataset_card(
         problems=inputs.problems,
         warnings=content.warnings,
         findings=findings_of_runs(runs),
+        covariates=content.covariates,
+        added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
         checksums=checksums,
     )

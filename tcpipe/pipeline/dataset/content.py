@@ -10,11 +10,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.dataset_card import MapRegistration, Removal
+from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.robot_files import profiles_of
+from tcpipe.pipeline.dataset.added_columns import added_columns, narrow_patches, tag_of_each
 from tcpipe.pipeline.dataset.findings import findings_in_words, findings_of_runs
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
@@ -50,21 +53,29 @@ class SampleTable:
     map_names: tuple[str, ...]
     class_names: NDArray[np.str_]
     patch: NDArray[np.int64]
+    added: pa.Table
+    """Columns beyond SAMPLES, in the segments' order."""
+
+    @property
+    def schema(self) -> pa.Schema:
+        """The samples' columns."""
+        return pa.schema([*SAMPLES.arrow(), *self.added.schema])
 
     def __len__(self) -> int:
         """Return the number of samples."""
         return len(self.patch)
 
     def take(self, rows: NDArray[np.int64]) -> pa.Table:
-        """Return rows of the samples table (schema SAMPLES)."""
+        """Return rows of the samples table (schema SAMPLES, and the added columns behind it)."""
         at = self.patch[rows]
-        segments = self.segments.take(pa.array(self.sampled.kept[at]))
+        rows_of_segments = pa.array(self.sampled.kept[at])
+        segments = self.segments.take(rows_of_segments)
         columns: dict[str, Any] = {name: values[at] for name, values in self.sampled.patches.columns().items()}
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
         if not self.has_terrain:
             of_terrain = (column for column in SAMPLES.columns if column.name.startswith("terrain"))
             columns |= {column.name: pa.nulls(len(at), column.dtype) for column in of_terrain}
-        return SAMPLES.table(
+        table = SAMPLES.table(
             sample_id=segments.column("segment_id"),
             split=self.assigned.split[at].tolist(),
             fold=pa.array(self.assigned.fold[at], pa.int8(), mask=self.assigned.fold[at] == NO_FOLD),
@@ -72,6 +83,9 @@ class SampleTable:
             **{name: segments.column(name) for name in segments.column_names if name in SAMPLES.names()},
             **columns,
         )
+        for field in self.added.schema:
+            table = table.append_column(field, self.added.column(field.name).take(rows_of_segments))
+        return table
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
         """Yield the table in pieces of so many rows; at least one, which may be empty."""
@@ -110,6 +124,7 @@ class Content:
     ledger_m: Mapping[str, float]
     registrations: Sequence[tuple[MapRegistration, ...]]
     """How each map lies against each run's track."""
+    covariates: tuple[Covariate, ...]
     removal: Removal
     """What of each class and slope is in samples."""
     warnings: tuple[str, ...]
@@ -139,7 +154,8 @@ def gather_content(
         raise DatasetError(
             _nothing_sampled(pool.segments, lost_m, sources), *_why_uncertain(pool.segments, lost_m, inputs, recipe)
         )
-    drawn = draw_splits(pool.segments, sampled, sources[0].grid, regions, recipe, earlier=earlier)
+    tags = _tags(pool.segments, inputs, recipe)
+    drawn = draw_splits(pool.segments, sampled, sources[0].grid, regions, recipe, earlier=earlier, tags=tags)
     split = drawn.assigned.split
     arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
     unused_m = {
@@ -152,6 +168,12 @@ def gather_content(
     removal, uneven = removed_by_ground(inputs.runs, pool.segments, in_use, sources, recipe)
     kept = np.flatnonzero(split != EXCLUDED)
     order = kept[np.argsort(ranks[sampled.kept[kept]], kind="stable")]
+    covariates, rows = inputs.covariates, sampled.kept[order]
+    added = added_columns(
+        pool.segments, rows, inputs.sources, covariates, recipe.covariates, layers=tuple(spool.layers)
+    )
+    robots = [run.robot for run in inputs.sources]
+    narrow = narrow_patches(robots, profiles_of(recipe).robots, patch_m=recipe.sample.patch_m)
     return Content(
         samples=SampleTable(
             pool.segments,
@@ -162,15 +184,25 @@ def gather_content(
             inputs.map_names,
             sources[0].classes.names(),
             order,
+            added.table,
         ),
         spool=spool,
         sources=sources,
         drawn=drawn,
         ledger_m=move_out(pool.ledger_m, {**lost_m, **unused_m}),
         registrations=[found for found, _ in registered],
+        covariates=added.covariates,
         removal=removal,
-        warnings=(*inputs.warnings, *pool.warnings, *off, *sampled.warnings, *uneven),
+        warnings=(*inputs.warnings, *pool.warnings, *off, *sampled.warnings, *narrow, *uneven, *added.warnings),
     )
+
+
+def _tags(segments: pa.Table, inputs: Inputs, recipe: Recipe) -> dict[str, str] | None:
+    """Return the value of the holdout's tag by run, None where another holdout rules."""
+    if recipe.split.holdout != "tag":
+        return None
+    run_ids: list[str] = pc.unique(segments.column("run_id")).to_pylist()
+    return dict(zip(run_ids, tag_of_each(run_ids, inputs.sources, recipe.split.holdout_tag), strict=True))
 
 
 def _ranks(segments: pa.Table, *, seed: int) -> NDArray[np.uint64]:

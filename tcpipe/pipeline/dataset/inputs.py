@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
+from tcpipe.formats.covariates import CovariateTable
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import (
     FileFormat,
@@ -48,6 +49,7 @@ class Inputs:
     digest: str
     chosen: Chosen
     warnings: tuple[str, ...]
+    covariates: tuple[CovariateTable, ...] = ()
     problems: tuple[str, ...] = ()
     """What is wrong with the choice of runs."""
 
@@ -62,6 +64,7 @@ def choose_inputs(
     file_format: FileFormat,
     tags: Mapping[str, str] | None = None,
     earlier: pa.Table | None = None,
+    covariates: tuple[CovariateTable, ...] = (),
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
     names = choose_maps(store, map_names)
@@ -79,11 +82,12 @@ def choose_inputs(
             "maps": list(zip(names, map_sha256, strict=True)),
             "region": None if region is None else region.decode("utf-8", "replace"),
             "format": file_format,
+            **({"covariates": [(of.name, of.checksum) for of in covariates]} if covariates else {}),
             **({} if earlier is None else {"kept_split": _table_digest(earlier)}),
         }
     )
     warnings = (*chosen.warnings, *once.warnings)
-    return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings)
+    return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings, covariates)
 
 
 def _map_digest(name: str, path: Path) -> str:

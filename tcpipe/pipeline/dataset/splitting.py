@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,6 +49,7 @@ def draw_splits(
     recipe: Recipe,
     *,
     earlier: pa.Table | None = None,
+    tags: Mapping[str, str] | None = None,
 ) -> Drawn:
     """Assign every patch to a split by its whole footprint, and audit the result.
 
@@ -65,6 +67,8 @@ def draw_splits(
         Its sections ``split`` and ``segment`` rule.
     earlier
         ``sample_id``, ``split`` and ``fold`` of a dataset whose samples keep their split.
+    tags
+        With the holdout ``tag``: its value by run.
 
     Raises
     ------
@@ -92,6 +96,7 @@ def draw_splits(
         folds=rules.folds,
         seed=rules.seed,
         kept=kept,
+        tagged=None if tags is None else _by_value(run, [tags[name] for name in run_names]),
     )
     split = assigned.split
     if regions is not None and not np.isin(split, ("train", "test")).any():
@@ -115,6 +120,12 @@ def _runs(segments: pa.Table, starts_ns: NDArray[np.int64]) -> tuple[NDArray[np.
     number = np.empty(len(names), np.int64)
     number[order] = np.arange(len(names))
     return number[codes], [names[code] for code in order]
+
+
+def _by_value(run: NDArray[np.int64], values: list[str]) -> tuple[NDArray[np.int64], list[str]]:
+    """Return the number of each sample's value, (N,), and the values by number; run i has ``values[i]``."""
+    names = list(dict.fromkeys(values))
+    return np.array([names.index(value) for value in values], np.int64)[run], names
 
 
 def _kept(ids: pa.ChunkedArray, earlier: pa.Table) -> Assignment:
@@ -189,7 +200,9 @@ def empty_splits(card: DatasetCard) -> tuple[str, ...]:
     if not counts["train"]:
         found.append("no sample trains: too few lie inside the region; draw it larger")
     if not counts["test"] and rules.test_fraction > 0:
-        one = {"run": "one run", "block": "one block"}.get(rules.holdout, "too few samples")
+        one = {"run": "one run", "block": "one block", "tag": f"of one {rules.holdout_tag}"}.get(
+            rules.holdout, "too few samples"
+        )
         found.append(
             f"no sample tests: all inside samples are {one}; try --holdout sample, or a smaller split.block_m, "
             "or want none with split.test_fraction = 0"

@@ -18,11 +18,15 @@ OTHER = {
     "sample.min_valid_fraction": 0.5,
     "sample.max_position_std_m": 0.05,
     "split.holdout": "sample",
+    "split.holdout_tag": "season",
     "split.test_fraction": 0.4,
     "split.block_m": 4.0,
     "split.buffer_m": 0.5,
     "split.folds": 3,
     "split.seed": 1,
+    "covariates.time_column": "when",
+    "covariates.time_unit": "ms",
+    "covariates.max_age_s": 60.0,
     "dataset.name": "another",
     "dataset.description": "another",
     "dataset.licence": "CC0-1.0",
@@ -50,7 +54,9 @@ def tree(directory):
 
 
 def test_every_key_of_a_dataset_is_tried():
-    assert set(OTHER) == {key for key in keys() if key == "robot" or key.startswith(("sample.", "split.", "dataset."))}
+    assert set(OTHER) == {
+        key for key in keys() if key == "robot" or key.startswith(("sample.", "split.", "covariates.", "dataset."))
+    }
 
 
 @pytest.mark.parametrize("key", OTHER)

@@ -1,0 +1,217 @@
+"""Tables of what the ground and the weather were like: CSV or Parquet, joined to samples by time, each taking the last row before it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import polars as pl
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import DatasetError
+from tcpipe.formats.seals import Checksum, file_checksum
+
+TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
+
+_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1}
+_TIME_NAMES = ("time", "stamp", "timestamp", "datetime", "date", "date_time", "time_utc", "utc")
+_YEARS_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 to 2100
+_NO_VALUE = ["", "NA", "N/A", "n/a", "NaN", "nan", "null", "NULL", "None"]
+_STAMP, _FOUND, _ROW = "tcpipe stamp", "tcpipe found", "tcpipe row"
+_MOSTLY = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class CovariateTable:
+    """A table of covariates, by rising and different stamps.
+
+    Attributes
+    ----------
+    name : the file's name.
+    time_column : which of its columns tells the time.
+    rows : values by column, numbers as float64 and all else as text, behind the stamps [ns].
+    warnings : what was left out or doubtful.
+    """
+
+    name: str
+    checksum: Checksum
+    time_column: str
+    rows: pl.DataFrame
+    warnings: tuple[str, ...]
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """First and last stamp [ns]."""
+        return int(self.rows[_STAMP][0]), int(self.rows[_STAMP][-1])
+
+    def join(self, stamp_ns: NDArray[np.int64], *, max_age_s: float) -> tuple[pa.Table, NDArray[np.bool_]]:
+        """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
+
+        Parameters
+        ----------
+        stamp_ns : times of the samples [ns, UTC], in any order, shape (N,).
+        max_age_s : a row older than that is not taken [s].
+
+        Returns
+        -------
+        pyarrow.Table
+            N rows; columns are called as the file, without its ending, and the column. Null where no row reaches, or it has no value.
+        ndarray
+            Shape (N,).
+        """
+        wanted = pl.DataFrame({_STAMP: stamp_ns}).with_row_index(_ROW).sort(_STAMP)
+        there = self.rows.with_columns(pl.col(_STAMP).alias(_FOUND))
+        joined = wanted.join_asof(there, on=_STAMP, strategy="backward", tolerance=round(max_age_s * 1e9)).sort(_ROW)
+        prefix, columns = Path(self.name).stem, [name for name in self.rows.columns if name != _STAMP]
+        found = {
+            f"{prefix}_{name}": joined[name]
+            .to_arrow()
+            .cast(pa.float64() if joined[name].dtype.is_float() else pa.string())
+            for name in columns
+        }
+        fields = [
+            pa.field(
+                name,
+                values.type,
+                metadata={"unit": "", "doc": f"{column} of {self.name}, the last row before the sample"},
+            )
+            for column, (name, values) in zip(columns, found.items(), strict=True)
+        ]
+        return pa.table(list(found.values()), schema=pa.schema(fields)), joined[_FOUND].is_not_null().to_numpy()
+
+
+def read_covariates(path: Path, *, time_column: str | None = None, time_unit: TimeUnit = "auto") -> CovariateTable:
+    """Read a table of covariates.
+
+    Parameters
+    ----------
+    path : CSV or Parquet, by its ending.
+    time_column : None takes the only one that is called so.
+    time_unit : of stamps that are numbers; text is ISO 8601, and UTC where it names no zone.
+
+    Raises
+    ------
+    DatasetError
+        It cannot be read, tells no time, or two of its rows are of one time and differ.
+    """
+    try:
+        lazy = pl.scan_parquet(path) if path.suffix.lower() == ".parquet" else _scan_csv(path)
+        table = lazy.collect()
+    except (pl.exceptions.PolarsError, OSError, ValueError) as error:
+        raise DatasetError(
+            f"{path}: not a readable table ({str(error).splitlines()[0]}); wanted CSV or Parquet"
+        ) from None
+    column = _time_column(path, table, time_column)
+    stamps = _stamps_ns(path, table[column], time_unit)
+    known = stamps.is_not_null()
+    values, warnings = _values(path, table.drop(column))
+    rows = (
+        pl.DataFrame([stamps.alias(_STAMP), *values])
+        .filter(known)
+        .unique(maintain_order=True)
+        .sort(_STAMP, maintain_order=True)
+    )
+    if lost := int((~known).sum()):
+        warnings.append(f"{path.name}: {lost} rows without a {column} are left out")
+    if rows.is_empty() or rows.width == 1:
+        raise DatasetError(
+            f"{path}: {rows.height} rows of {rows.width - 1} columns beside {column}; wanted one of each at least"
+        )
+    if twice := _first_repeated(rows[_STAMP]):
+        raise DatasetError(
+            f"{path}: rows of {in_utc(twice)} differ from one another; wanted one row a stamp: one station, one depth a file"
+        )
+    return CovariateTable(path.name, file_checksum(path), column, rows, tuple(warnings))
+
+
+def in_utc(stamp_ns: int) -> str:
+    """Return a stamp as ISO 8601 to the second."""
+    return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+def _scan_csv(path: Path) -> pl.LazyFrame:
+    return pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE)
+
+
+def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
+    there = ", ".join(table.columns)
+    if wanted is not None:
+        if wanted not in table.columns:
+            raise DatasetError(f"{path}: no column {wanted!r} ([covariates] time_column); there are {there}")
+        return wanted
+    endings = ("", *(f"_{unit}" for unit in _NS))
+    found = [name for name in table.columns if name.lower() in {f"{of}{end}" for of in _TIME_NAMES for end in endings}]
+    if len(found) != 1:
+        said = (
+            f"{len(found)} columns tell the time ({', '.join(found)})"
+            if found
+            else "no column is called as one of time"
+        )
+        raise DatasetError(f"{path}: {said}; name it in the recipe: [covariates] time_column; there are {there}")
+    return found[0]
+
+
+def _stamps_ns(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
+    """Return stamps [ns since 1970, UTC], null where there is none."""
+    if column.dtype.is_temporal() and column.dtype not in {pl.Time, pl.Duration}:
+        return column.cast(pl.Datetime("ns", getattr(column.dtype, "time_zone", None))).cast(pl.Int64)
+    if column.dtype.is_numeric():
+        per = _NS[_unit_of(path, column, unit)]
+        return column * per if column.dtype.is_integer() else (column.fill_nan(None) * per).round().cast(pl.Int64)
+    if column.dtype != pl.String:
+        raise DatasetError(f"{path}: {column.name} is {column.dtype}; wanted stamps: numbers, or text in ISO 8601")
+    return pl.Series([_iso_ns(path, column.name, text) for text in column], dtype=pl.Int64)
+
+
+def _iso_ns(path: Path, name: str, text: str | None) -> int | None:
+    if text is None:
+        return None
+    try:
+        told = datetime.fromisoformat(text.strip())
+    except ValueError:
+        raise DatasetError(f"{path}: {name} is {text!r}; wanted ISO 8601, as 2025-10-14T11:41:00Z") from None
+    since = (told if told.tzinfo else told.replace(tzinfo=UTC)) - datetime(1970, 1, 1, tzinfo=UTC)
+    return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
+
+
+def _unit_of(path: Path, column: pl.Series, unit: TimeUnit) -> str:
+    """Return the unit that rules: the one asked for, that of the name, or the only one by which all stamps lie in this century."""
+    if unit != "auto":
+        return unit
+    ending = column.name.lower().rsplit("_", 1)[-1]
+    if ending in _NS:
+        return ending
+    low, high = float(column.min() or 0), float(column.max() or 0)  # type: ignore[arg-type]
+    fits = [name for name, per in _NS.items() if _YEARS_NS[0] <= low * per and high * per <= _YEARS_NS[1]]
+    if len(fits) != 1:
+        raise DatasetError(
+            f"{path}: {column.name} from {low:g} to {high:g} is in no unit a time of this century; say which: [covariates] time_unit"
+        )
+    return fits[0]
+
+
+def _values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[str]]:
+    """Return numbers as float64 without NaN, all else as text; and a line for columns of numbers that a few words make text."""
+    made, warnings = list[pl.Series](), list[str]()
+    for column in table:
+        if column.dtype.is_numeric():
+            values = column.cast(pl.Float64)
+            made.append(values.set(~values.is_finite(), None))
+            continue
+        text = column.cast(pl.String)
+        odd = text.filter(text.cast(pl.Float64, strict=False).is_null() & text.is_not_null())
+        if 0 < len(odd) < _MOSTLY * text.count():
+            warnings.append(
+                f"{path.name}: {column.name} is text, since {odd[0]!r} is no number ({len(odd)} of {text.count()} values)"
+            )
+        made.append(text)
+    return made, warnings
+
+
+def _first_repeated(stamps: pl.Series) -> int | None:
+    twice = stamps.filter(stamps.is_duplicated())
+    return int(twice[0]) if len(twice) else None

@@ -1,0 +1,167 @@
+"""Columns of the samples beyond their schema: the tags of their runs, and covariates joined by time."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tcpipe.errors import DatasetError
+from tcpipe.formats.covariates import CovariateTable, in_utc, read_covariates
+from tcpipe.formats.dataset_card import Covariate, RunSource
+from tcpipe.recipe import CovariateConfig
+from tcpipe.robots.profiles import Robot
+from tcpipe.tables.columns import integers
+from tcpipe.tables.levels import SAMPLES
+
+TAG = "tag_"
+"""What the column of a tag is called before the tag's name."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
+
+
+@dataclass(frozen=True, slots=True)
+class Added:
+    """Columns beside those of SAMPLES, a row a segment, and what the card says of them."""
+
+    table: pa.Table
+    covariates: tuple[Covariate, ...]
+    warnings: tuple[str, ...]
+
+
+def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple[CovariateTable, ...]:
+    """Return the tables of the files; `DatasetError` where one cannot be used or two have one name."""
+    names = [path.stem for path in paths]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise DatasetError(
+            f"--covariates: {twice[0]} is given twice; columns are called by the file's name: give each its own"
+        )
+    return tuple(read_covariates(path, time_column=config.time_column, time_unit=config.time_unit) for path in paths)
+
+
+def added_columns(
+    segments: pa.Table,
+    kept: NDArray[np.int64],
+    runs: Sequence[RunSource],
+    tables: Sequence[CovariateTable],
+    config: CovariateConfig,
+    *,
+    layers: Sequence[str],
+) -> Added:
+    """Return the added columns of all segments.
+
+    Parameters
+    ----------
+    segments : with ``run_id`` and ``start_ns``, M rows; a covariate is that of a segment's start.
+    kept : rows that are samples, (N,): what is counted.
+    runs : for their tags.
+    tables, config : covariates, and how they are joined.
+    layers : names of the patches' layers, which no column may have.
+
+    Raises
+    ------
+    DatasetError
+        Two columns would have one name.
+    """
+    table, warnings = _tags(segments.column("run_id"), runs)
+    told = list[Covariate]()
+    for covariates in tables:
+        found, reached = covariates.join(integers(segments, "start_ns"), max_age_s=config.max_age_s)
+        without = {name: int(found.column(name).take(pa.array(kept)).null_count) for name in found.column_names}
+        first, last = covariates.span_ns
+        told.append(
+            Covariate(
+                covariates.name,
+                covariates.checksum,
+                covariates.rows.height,
+                covariates.time_column,
+                in_utc(first),
+                in_utc(last),
+                without,
+            )
+        )
+        warnings += (*covariates.warnings, *_unreached(told[-1], segments, kept[~reached[kept]], len(kept), config))
+        for field in found.schema:
+            table = table.append_column(field, found.column(field.name))
+    names = [*SAMPLES.names(), *layers, *table.column_names]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise DatasetError(
+            f"columns {', '.join(twice)} would be there twice; rename the file of covariates, or its columns"
+        )
+    return Added(table, tuple(told), tuple(warnings))
+
+
+def _unreached(
+    told: Covariate, segments: pa.Table, rows: NDArray[np.int64], samples: int, config: CovariateConfig
+) -> list[str]:
+    """Return a line about the samples that no row reaches, and one about the columns that lack values beyond that."""
+    said = []
+    if rows.size:
+        runs = sorted(pc.unique(segments.column("run_id").take(pa.array(rows))).to_pylist())
+        more = f" and {len(runs) - 3} more" if len(runs) > 3 else ""
+        said.append(
+            f"{told.name}: no row reaches {rows.size} of {samples} samples (run {', '.join(runs[:3])}{more}): its rows are of "
+            f"{told.first} to {told.last}, and none is taken that is older than {config.max_age_s:g} s ([covariates] max_age_s)"
+        )
+    holes = [f"{name} {count - rows.size}" for name, count in told.samples_without.items() if count > rows.size]
+    if holes:
+        said.append(f"{told.name}: samples whose row has no value: {', '.join(holes)}")
+    return said
+
+
+def _tags(run_ids: pa.ChunkedArray, runs: Sequence[RunSource]) -> tuple[pa.Table, list[str]]:
+    """Return a column a tag: numbers where every run that carries it has one, else text; null for runs without it."""
+    tags = {run.run_id: run.tags or {} for run in runs}
+    place = pc.index_in(run_ids, value_set=pa.array(list(tags), pa.string()))
+    columns, fields, warnings = list[pa.Array](), list[pa.Field](), list[str]()
+    for key in sorted({key for of in tags.values() for key in of}):
+        told = [of.get(key) for of in tags.values()]
+        words = sorted({text for text in told if text is not None and not _NUMBER.fullmatch(text.strip())})
+        if words and len(words) < len({text for text in told if text is not None}):
+            warnings.append(f"tag {key}: {words[0]!r} is no number, others are; its column {TAG}{key} is text")
+        values = (
+            pa.array(told, pa.string())
+            if words
+            else pa.array([None if text is None else float(text) for text in told], pa.float64())
+        )
+        columns.append(values.take(place))
+        fields.append(pa.field(f"{TAG}{key}", values.type, metadata={"unit": "", "doc": f"tag {key} of the run"}))
+    if not fields:
+        return pa.table({"run_id": run_ids}).select([]), warnings
+    return pa.table(columns, schema=pa.schema(fields)), warnings
+
+
+def tag_of_each(run_ids: Sequence[str], runs: Sequence[RunSource], key: str) -> list[str]:
+    """Return a tag's value for each run of a list; `DatasetError` that names the runs without it."""
+    tags = {run.run_id: (run.tags or {}).get(key) for run in runs}
+    missing = [run_id for run_id in run_ids if tags[run_id] is None]
+    if missing:
+        raise DatasetError(
+            f"holdout by tag {key}: {len(missing)} of {len(run_ids)} runs do not carry it ({', '.join(missing[:3])}); "
+            f"ingest their logs again with --tag {key}=VALUE"
+        )
+    return [str(tags[run_id]) for run_id in run_ids]
+
+
+def narrow_patches(robots: Sequence[str], known: Mapping[str, Robot], *, patch_m: float) -> list[str]:
+    """Return a line for each robot that is wider than a patch, or of which no width is known."""
+    said = []
+    for robot in sorted(set(robots)):
+        width_m = known[robot].width_m if robot in known else None
+        if width_m is None:
+            said.append(
+                f"robot {robot}: its width is not known, so nobody can say whether patches of {patch_m:g} m hold its wheels; "
+                f"tell it: [robots.{robot}] width_m"
+            )
+        elif width_m > patch_m:
+            said.append(
+                f"robot {robot}: is {width_m:g} m wide, patches {patch_m:g} m: its wheels run outside of them; "
+                f"take wider ones: [sample] patch_m (segments stay as long as they are)"
+            )
+    return said
