@@ -44,9 +44,9 @@ class CovariateTable:
     warnings: tuple[str, ...]
 
     @property
-    def span_ns(self) -> tuple[int, int]:
-        """First and last stamp [ns]."""
-        return int(self.rows[_STAMP][0]), int(self.rows[_STAMP][-1])
+    def span(self) -> tuple[str, str]:
+        """First and last stamp, ISO 8601."""
+        return _in_utc(self.rows[_STAMP][0]), _in_utc(self.rows[_STAMP][-1])
 
     def join(self, stamp_ns: NDArray[np.int64], *, max_age_s: float) -> tuple[pa.Table, NDArray[np.bool_]]:
         """Return the last row at or before each stamp that is not older than the limit; and which stamps a row reaches.
@@ -123,12 +123,12 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
         )
     if twice := _first_repeated(rows[_STAMP]):
         raise DatasetError(
-            f"{path}: rows of {in_utc(twice)} differ from one another; wanted one row a stamp: one station, one depth a file"
+            f"{path}: rows of {_in_utc(twice)} differ from one another; wanted one row a stamp: one station, one depth a file"
         )
     return CovariateTable(path.name, file_checksum(path), column, rows, tuple(warnings))
 
 
-def in_utc(stamp_ns: int) -> str:
+def _in_utc(stamp_ns: int) -> str:
     """Return a stamp as ISO 8601 to the second."""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 

@@ -6,6 +6,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -13,12 +14,14 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
-from tcpipe.formats.covariates import CovariateTable, in_utc, read_covariates
 from tcpipe.formats.dataset_card import Covariate, RunSource
 from tcpipe.recipe import CovariateConfig
 from tcpipe.robots.profiles import Robot
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import SAMPLES
+
+if TYPE_CHECKING:
+    from tcpipe.formats.covariates import CovariateTable
 
 TAG = "tag_"
 """What the column of a tag is called before the tag's name."""
@@ -37,6 +40,10 @@ class Added:
 
 def read_all_covariates(paths: Sequence[Path], config: CovariateConfig) -> tuple[CovariateTable, ...]:
     """Return the tables of the files; `DatasetError` where one cannot be used or two have one name."""
+    if not paths:
+        return ()
+    from tcpipe.formats.covariates import read_covariates  # noqa: PLC0415  polars only where a table is given
+
     names = [path.stem for path in paths]
     if twice := sorted({name for name in names if names.count(name) > 1}):
         raise DatasetError(
@@ -74,15 +81,13 @@ def added_columns(
     for covariates in tables:
         found, reached = covariates.join(integers(segments, "start_ns"), max_age_s=config.max_age_s)
         without = {name: int(found.column(name).take(pa.array(kept)).null_count) for name in found.column_names}
-        first, last = covariates.span_ns
         told.append(
             Covariate(
                 covariates.name,
                 covariates.checksum,
                 covariates.rows.height,
                 covariates.time_column,
-                in_utc(first),
-                in_utc(last),
+                *covariates.span,
                 without,
             )
         )

@@ -8,6 +8,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +16,6 @@ from numpy.typing import NDArray
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
-from tcpipe.formats.covariates import CovariateTable
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import (
     FileFormat,
@@ -31,6 +31,9 @@ from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store
 from tcpipe.tables.levels import TABLES_VERSION
+
+if TYPE_CHECKING:
+    from tcpipe.formats.covariates import CovariateTable
 
 
 @dataclass(frozen=True, slots=True)
