@@ -76,12 +76,12 @@ test-mutants: .venv-mutants/installed
 	.venv-mutants/bin/python tests/mutants.py $(MUTANTS)
 
 # The locks: hashes, no registry address. Needs uv; run it when pyproject.toml's dependencies change.
-# The one for training holds Keras and what PyTorch needs beside itself.
+# The one for training holds what PyTorch needs beside itself.
 UV_LOCK := uv pip compile --universal --python-version 3.11 --generate-hashes --no-emit-index-url --no-annotate --no-header --quiet
 lock:
 	$(UV_LOCK) pyproject.toml --extra build --output-file requirements.lock
 	$(UV_LOCK) pyproject.toml --extra build --extra dev --constraint requirements.lock --output-file requirements-dev.lock
-	printf '%s\n' 'keras>=3.8' filelock fsspec jinja2 networkx setuptools sympy typing-extensions | \
+	printf '%s\n' filelock fsspec jinja2 networkx setuptools sympy typing-extensions | \
 	  $(UV_LOCK) - --constraint requirements-dev.lock --output-file requirements-train.lock
 
 schemas: .venv/installed

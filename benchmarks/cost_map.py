@@ -8,7 +8,6 @@ GeoTIFFs, Nav2 maps, checksums. Rounds alternate in one process. The ratio of th
 depend on what else runs. Also: how much of the time sampling and judging take without the network.
 """
 
-import os
 import sys
 import tempfile
 import time
@@ -18,17 +17,15 @@ from statistics import median
 
 import numpy as np
 
-os.environ.setdefault("KERAS_BACKEND", "torch")
-
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from made_models import CARD, made_model
 from map_worlds import World
 
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.model_card import Seen
 from tcpipe.learning.models import Model, load_model
-from tcpipe.learning.network import Architecture
 from tcpipe.planning.cost_map import make_cost_map
 from tcpipe.planning.cost_model import BATCH_PATCHES
 from tcpipe.planning.survey import new_survey

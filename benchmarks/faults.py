@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-os.environ |= {"OMP_NUM_THREADS": "1", "KERAS_BACKEND": "torch"}  # forked children have one thread
+os.environ["OMP_NUM_THREADS"] = "1"  # forked children have one thread
 
 from fault_cases import CASES, LOG, Case, make_inputs
 from fault_children import INPUTS, LATEST_S, Ended, Fault, Tree, call, different, half_written, tree, without_unfinished

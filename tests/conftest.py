@@ -9,7 +9,6 @@ settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.register_profile("explore", deadline=None, max_examples=500)
 settings.load_profile("fixed")
 
-os.environ.setdefault("KERAS_BACKEND", "torch")  # else Keras looks for another one, and its tests would be skipped
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # tests run side by side: threads of one would wait for those of another
 
 

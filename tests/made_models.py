@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
+from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.model_card import ModelCard, Seen, TrainedOn, Training
 from tcpipe.learning.models import write_model
-from tcpipe.learning.network import Architecture, resnet18
+from tcpipe.learning.network import resnet18
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 CARD = ModelCard(
@@ -50,5 +51,7 @@ def made_model(directory: Path, *, seed: int = 0, rows: int = 60, **changes) -> 
             "velocity_predicted_mps": velocity + rng.normal(0.0, 0.02, rows),
         }
     )
-    write_model(directory, card=card, network=network, residuals=residuals, history="epoch,loss\n", readme="made\n")
+    write_model(
+        directory, card=card, weights=network.arrays(), residuals=residuals, history="epoch,loss\n", readme="made\n"
+    )
     return directory

@@ -15,11 +15,10 @@ Trees = dict[str, ast.Module]
 MAPPINGS = {"dict", "Mapping", "MutableMapping"}
 
 _BY_LIBRARY = {
-    "keras": """learning/fitting.py:predicted learning/fitting.py:held_loss learning/fitting.py:_epoch learning/fitting.py:_optimizer_arrays
-        learning/fitting.py:_state learning/fitting.py:_restore learning/keras_backend.py:load_keras learning/losses.py:keras_loss
-        learning/losses.py:keras_loss.loss learning/models.py:Model.network learning/models.py:write_model learning/models.py:set_weights
-        learning/network.py:resnet18 learning/network.py:_normed learning/network.py:_basic_block learning/network.py:named_weights""",
-    "torch": "dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_tensors",
+    "torch": """dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_tensors learning/losses.py:mean_loss
+        learning/network.py:Normed.forward learning/network.py:BasicBlock.forward learning/network.py:ResNet18.forward
+        learning/network.py:ResNet18._weights learning/network.py:device learning/network.py:on_device learning/network.py:_padded
+        learning/network.py:_file_order learning/trainer.py:Trainer._memory""",
     "rasterio": """formats/maps/geotiff.py:RasterTiles._dataset formats/maps/geotiff.py:_grey formats/maps/geotiff.py:_open_as
         formats/maps/geotiff.py:_refuse_unplaced formats/maps/geotiff.py:_choose_bands formats/maps/geotiff.py:_scaling
         formats/maps/geotiff.py:_vertical_unit_m formats/maps/geotiff.py:_described""",

@@ -4,26 +4,35 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
 from tcpipe.errors import ModelError
+from tcpipe.learning.architecture import Architecture, check_trainable
 from tcpipe.learning.checkpoint import Arrays, TrainingProgress, read_checkpoint, write_checkpoint
-from tcpipe.learning.keras_backend import load_keras
-from tcpipe.learning.losses import Loss, keras_loss, loss_factors, mean_loss
-from tcpipe.learning.network import Architecture, named_weights, resnet18
+from tcpipe.learning.losses import Loss, loss_factors, mean_loss
+
+if TYPE_CHECKING:
+    from tcpipe.learning.network import ResNet18
+    from tcpipe.learning.trainer import Trainer
 
 logger = logging.getLogger("tcpipe")
 
 Floats = NDArray[np.float32]
 
 ENERGY = "energy_joule"
+
+_SLOWER = 0.1
+"""What the learning rate is multiplied by where it is too long a step."""
+
+_LAST = 0.8
+"""Share of the most epochs after which the rate is smaller in any case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,10 +87,11 @@ class Spent:
 class Fitted:
     """A trained network with the best weights, what its labels were divided by, and how it went."""
 
-    network: Any
+    network: ResNet18
     scale: tuple[float, ...]
     progress: TrainingProgress
     spent: Spent
+    device: str
 
 
 def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path) -> Fitted:
@@ -99,35 +109,38 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         Written before the first and after every epoch, and gone on from where it is.
 
     """
-    keras = load_keras()
     scale = label_scale(task)
     factors = loss_factors(config.loss, scale)
     start = labels_of(task.fit, task.outputs).mean(axis=0) / scale
     shape = Architecture(task.fit.view.stored.files.patch_px, task.fit.view.form.depth, len(scale), config.width)
+    check_trainable(shape)
+    from tcpipe.learning.network import device_name, resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
+    from tcpipe.learning.trainer import Trainer  # noqa: PLC0415
+
+    logger.info("%s: %d samples to fit, %d to stop by, on %s", name, len(task.fit), len(task.held), device_name())
     network = resnet18(shape, seed=config.seed, start=start.tolist())
-    network.compile(keras.optimizers.Adam(config.learning_rate), loss=keras_loss(factors))
-    network.optimizer.build(network.trainable_variables)
+    trainer = Trainer(network, factors)
     progress = TrainingProgress(key)
-    best: Arrays = named_weights(network)
+    best: Arrays = network.arrays()
     if checkpoint.exists():
         progress, parts = read_checkpoint(checkpoint, key)
-        _restore(network, parts, checkpoint)
+        _restore(trainer, parts, str(checkpoint))
         best = parts["best"]
         logger.info("%s: goes on after epoch %d", name, progress.epoch)
     else:  # a place that cannot be written is found now, not after an epoch
-        write_checkpoint(checkpoint, progress, _state(network, best))
+        write_checkpoint(checkpoint, progress, _state(trainer, best))
     spent = Spent()
     while progress.epoch < config.epochs and progress.epoch - progress.best_epoch < config.patience:
-        loss = _epoch(network, task, config, scale=np.array(scale, np.float32), number=progress.epoch, spent=spent)
+        loss = _epoch(trainer, task, config, scale=np.array(scale, np.float32), progress=progress, spent=spent)
         held = held_loss(network, task, scale, factors, weighted=config.weights)
         progress.epoch += 1
         progress.history.append((progress.epoch, loss, held))
         if held < progress.best_loss:
-            progress.best_loss, progress.best_epoch, best = held, progress.epoch, named_weights(network)
-        write_checkpoint(checkpoint, progress, _state(network, best))
+            progress.best_loss, progress.best_epoch, best = held, progress.epoch, network.arrays()
+        write_checkpoint(checkpoint, progress, _state(trainer, best))
         _say(name, progress, config, spent)
-    network.set_weights(list(best.values()))
-    return Fitted(network, scale, progress, spent)
+    network.set_arrays(best, str(checkpoint))
+    return Fitted(network, scale, progress, spent, device_name())
 
 
 def label_scale(task: Task) -> tuple[float, ...]:
@@ -136,19 +149,34 @@ def label_scale(task: Task) -> tuple[float, ...]:
     return tuple(float(value) for value in labels.max(axis=0))
 
 
-def predicted(network: Any, split: Split, scale: Sequence[float]) -> Floats:
+def predicted(network: ResNet18, split: Split, scale: Sequence[float]) -> Floats:
     """Return what a network says of all samples of a split, in the labels' units, shape (N, outputs)."""
-    found = [network.predict_on_batch(patches) for patches, _ in split.batches(256)]
+    batches: Iterable[Any] = split.batches(256)
+    found = [network.predict(patches) for patches, _ in batches]
     return np.concatenate([np.empty((0, len(scale)), np.float32), *found]) * np.array(scale, np.float32)
 
 
-def held_loss(network: Any, task: Task, scale: Sequence[float], factors: Floats, *, weighted: bool) -> float:
+def held_loss(network: ResNet18, task: Task, scale: Sequence[float], factors: Floats, *, weighted: bool) -> float:
     """Return the loss of the held-out fold."""
     over = np.array(scale, np.float32)
-    weights = task.held.weights if weighted and len(over) == task.held.weights.shape[1] else None
-    return mean_loss(
-        predicted(network, task.held, scale) / over, labels_of(task.held, task.outputs) / over, factors, weights
-    )
+    labels = labels_of(task.held, task.outputs) / over
+    weights = task.held.weights if weighted and len(over) == task.held.weights.shape[1] else np.ones_like(labels)
+    return float(mean_loss(predicted(network, task.held, scale) / over, labels, factors, weights))
+
+
+def learning_rate(config: FitConfig, progress: TrainingProgress) -> float:
+    """Return the rate of the next epoch: a tenth each time that half the patience brings nothing better, and a tenth of that at the end.
+
+    Steps of one length end beside the minimum, and the moving means of the batch normalisation behind the weights: predictions of
+    either are off on average.
+    """
+    rate, best, waited = config.learning_rate, float("inf"), 0
+    for _, _, held in progress.history:
+        waited = 0 if held < best else waited + 1
+        best = min(best, held)
+        if waited >= max(config.patience // 2, 1):
+            rate, waited = rate * _SLOWER, 0
+    return rate * (_SLOWER if progress.epoch >= _LAST * config.epochs else 1.0)
 
 
 def labels_of(split: Split, outputs: Sequence[str]) -> Floats:
@@ -156,56 +184,45 @@ def labels_of(split: Split, outputs: Sequence[str]) -> Floats:
     return split.column(ENERGY).astype(np.float32)[:, None] if tuple(outputs) == (ENERGY,) else split.labels
 
 
-def _epoch(network: Any, task: Task, config: FitConfig, *, scale: Floats, number: int, spent: Spent) -> float:
+def _epoch(
+    trainer: Trainer, task: Task, config: FitConfig, *, scale: Floats, progress: TrainingProgress, spent: Spent
+) -> float:
     """Train on every sample once; return the mean loss."""
     energy = task.outputs == (ENERGY,)
     rules: dict[str, Any] = {"features": (ENERGY,)} if energy else {"weights": config.weights}
     batches = task.fit.batches(config.batch, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
+    rate = learning_rate(config, progress)
     total, count, began = 0.0, 0, time.perf_counter()
-    asked, feed = began, batches.epoch(number)
+    feed: Iterator[Any] = batches.epoch(progress.epoch)
+    asked = began
     while (batch := next(feed, None)) is not None:
         patches, labels = batch[0] if energy else batch[:2]
         weights = batch[2] if len(batch) == 3 else np.ones_like(labels)
-        side_by_side = np.concatenate([labels / scale, weights], axis=1).astype(np.float32)
         spent.feeding_s += time.perf_counter() - asked
-        total += float(network.train_on_batch(patches, side_by_side)) * len(patches)
+        total += trainer.step(patches, labels / scale, weights, rate) * len(patches)
         count += len(patches)
         asked = time.perf_counter()
     spent.total_s += time.perf_counter() - began
     spent.samples += count
     if not np.isfinite(total):
         raise ModelError(
-            f"training diverged in epoch {number + 1} (the loss is {total}); try a smaller --learning-rate"
+            f"training diverged in epoch {progress.epoch + 1} (the loss is {total}); try a smaller --learning-rate"
         )
     return total / max(count, 1)
 
 
-def _optimizer_arrays(network: Any) -> Arrays:
-    """Return the optimiser's memory: its step, and two moments a weight."""
-    to_numpy = load_keras().ops.convert_to_numpy
-    return {
-        f"{number:04d}": np.array(to_numpy(value.value)) for number, value in enumerate(network.optimizer.variables)
-    }
-
-
-def _state(network: Any, best: Arrays) -> dict[str, Arrays]:
+def _state(trainer: Trainer, best: Arrays) -> dict[str, Arrays]:
     """Return all arrays of a checkpoint."""
-    return {"now": named_weights(network), "best": best, "optimizer": _optimizer_arrays(network)}
+    return {"now": trainer.network.arrays(), "best": best, "optimizer": trainer.memory()}
 
 
-def _forms(arrays: Arrays) -> dict[str, tuple[Any, ...]]:
-    return {name: (array.dtype, array.shape) for name, array in arrays.items()}
-
-
-def _restore(network: Any, parts: dict[str, Arrays], checkpoint: Path) -> None:
-    """Put weights and the optimiser's memory back."""
-    there = _state(network, named_weights(network))
-    if {part: _forms(arrays) for part, arrays in parts.items()} != {part: _forms(there[part]) for part in there}:
-        raise ModelError(f"{checkpoint}: holds the weights of another network; remove it, or start anew with --fresh")
-    network.set_weights([parts["now"][name] for name in there["now"]])
-    network.optimizer.load_own_variables(
-        {str(number): value for number, value in enumerate(parts["optimizer"].values())}
-    )
+def _restore(trainer: Trainer, parts: dict[str, Arrays], where: str) -> None:
+    """Put weights, the best ones for a look, and the optimiser's memory back."""
+    if parts.keys() != {"now", "best", "optimizer"}:
+        raise ModelError(f"{where}: not a checkpoint; remove it, or start anew with --fresh")
+    for part in ("best", "now"):
+        trainer.network.set_arrays(parts[part], where)
+    trainer.remember(parts["optimizer"], where)
 
 
 def _say(name: str, progress: TrainingProgress, config: FitConfig, spent: Spent) -> None:

@@ -10,13 +10,11 @@ Both are means over samples, with maxima of train. Here labels and predictions a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-
-from tcpipe.learning.keras_backend import load_keras
 
 Loss = Literal["nrmse", "paper_eq4"]
 Floats = NDArray[np.float32]
@@ -30,19 +28,6 @@ def loss_factors(loss: Loss, scale: Sequence[float]) -> Floats:
     return np.array(scale, np.float32) if loss == "paper_eq4" else np.ones(len(scale), np.float32)
 
 
-def mean_loss(predicted: Floats, labels: Floats, factors: Floats, weights: Floats | None = None) -> float:
-    """Return the loss of predictions, all of shape (N, outputs) but ``factors``, (outputs,)."""
-    squares = factors * (predicted.astype(np.float64) - labels) ** 2
-    return float(np.mean(np.sqrt(np.sum(squares if weights is None else squares * weights, axis=1))))
-
-
-def keras_loss(factors: Floats) -> Callable[[Any, Any], Any]:
-    """Return the same for Keras; its labels are labels and weights side by side, shape (N, 2 outputs)."""
-    ops, count = load_keras().ops, len(factors)
-
-    def loss(labels_and_weights: Any, predicted: Any) -> Any:
-        labels, weights = labels_and_weights[:, :count], labels_and_weights[:, count:]
-        squares = ops.sum(ops.convert_to_tensor(factors) * weights * ops.square(predicted - labels), axis=1)
-        return ops.mean(ops.sqrt(squares + _SMALLEST))
-
-    return loss
+def mean_loss(predicted: Any, labels: Any, factors: Any, weights: Any) -> Any:
+    """Return the loss of predictions, arrays or torch's tensors of shape (N, outputs), but for ``factors``, (outputs,)."""
+    return ((((predicted - labels) ** 2 * factors * weights).sum(1) + _SMALLEST) ** 0.5).mean()

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.seals import Checksum
+from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.network import Architecture
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe model"

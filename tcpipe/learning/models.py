@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -27,11 +27,15 @@ from tcpipe.formats.json_files import digest, typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.seals import broken_checksums, file_checksums, read_sealed, sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
+from tcpipe.learning.architecture import check_trainable
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
-from tcpipe.learning.network import named_weights, resnet18
 from tcpipe.terrain.classes import ClassTable
 
+if TYPE_CHECKING:
+    from tcpipe.learning.network import ResNet18
+
 Floats = NDArray[np.float32]
+Arrays = Mapping[str, NDArray[np.generic]]
 
 FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
     "model.json",
@@ -43,8 +47,6 @@ FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
 
 LEAST_VELOCITY_MPS = 0.05
 """A predicted velocity is never below it, so that T = d / v stays finite: slower is standing."""
-
-_PREDICTED_TOGETHER = 256
 
 
 @dataclass(frozen=True)
@@ -60,10 +62,13 @@ class Model:
     """Of the held-out fold, one row a sample: run_id, start_ns, terrain_class, labels, predictions."""
 
     @cached_property
-    def network(self) -> Any:
-        """Return the Keras model, patches (N, px, px, depth) to outputs over ``card.scale``; Keras is imported for it."""
+    def network(self) -> ResNet18:
+        """Return the torch module, images (N, depth, px, px) to outputs over ``card.scale``; torch is imported for it."""
+        check_trainable(self.card.architecture)
+        from tcpipe.learning.network import resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
+
         network = resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
-        set_weights(network, read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
+        network.set_arrays(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
         return network
 
     @property
@@ -136,21 +141,19 @@ class Model:
 
     def outputs(self, patches: Floats) -> Floats:
         """Return what the network gives, in the units of its outputs, shape (N, outputs)."""
-        out = np.empty((len(patches), len(self.card.scale)), np.float32)
-        for first in range(0, len(patches), _PREDICTED_TOGETHER):
-            part = slice(first, first + _PREDICTED_TOGETHER)
-            out[part] = self.network.predict_on_batch(np.ascontiguousarray(patches[part], np.float32))
-        return out * np.array(self.card.scale, np.float32)
+        return self.network.predict(patches) * np.array(self.card.scale, np.float32)
 
     @cached_property
     def _short_outputs(self) -> list[str]:
         return [name.removeprefix("fused_") for name in self.card.outputs]
 
 
-def write_model(place: Path, *, card: ModelCard, network: Any, residuals: pa.Table, history: str, readme: str) -> None:
+def write_model(
+    place: Path, *, card: ModelCard, weights: Arrays, residuals: pa.Table, history: str, readme: str
+) -> None:
     """Write the folder, whole or not at all."""
     with atomic_directory(place) as directory:
-        write_arrays(directory / WEIGHTS, named_weights(network))
+        write_arrays(directory / WEIGHTS, weights)
         write_table(residuals, directory / RESIDUALS)
         write_text(directory / HISTORY, history)
         write_text(directory / README, readme)
@@ -205,11 +208,3 @@ def read_model_card(place: Path) -> ModelCard:
 def card_checksum(card: ModelCard) -> str:
     """Return the hash of a card, which is of its files, too."""
     return digest(sealed(card))
-
-
-def set_weights(network: Any, arrays: Mapping[str, NDArray[np.generic]], where: str) -> None:
-    """Put weights into a network; `ModelError` if they are another network's."""
-    shapes = {name: value.shape for name, value in named_weights(network).items()}
-    if {name: value.shape for name, value in arrays.items()} != shapes:
-        raise ModelError(f"{where}: holds the weights of another network; train the model again")
-    network.set_weights([arrays[name] for name in shapes])

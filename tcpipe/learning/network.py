@@ -1,41 +1,126 @@
-"""The paper's network (section III-D): ResNet-18 with a head of two outputs, for patches of any size and depth.
+"""The paper's network (section III-D): ResNet-18 with a head of two outputs, in plain torch; import it only where one is made.
 
 He et al., Deep Residual Learning for Image Recognition, 2016, table 1: a 7 × 7 convolution and a pooling, both with stride 2, then two
-basic blocks each of 64, 128, 256 and 512 filters.
+basic blocks each of 64, 128, 256 and 512 filters. The paper's was Keras's: steps of two pixels are padded as TensorFlow's "same" does, so
+that of an odd number of missing pixels the last one comes after; first weights and the batch norm's constants are Keras's, too.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import nn
+from torch.nn import functional
 
 from tcpipe.errors import ModelError
-from tcpipe.learning.keras_backend import load_keras
+from tcpipe.learning.architecture import Architecture
+
+Floats = NDArray[np.float32]
+Arrays = Mapping[str, NDArray[np.generic]]
+
+_TOGETHER = 256
+
+_CUT_DEVIATION = 0.87962566103423978
+"""Standard deviation of a normal variable of deviation one that is cut at two, by which Keras's ``he_normal`` is widened again."""
+
+_FILED = {"weight": "kernel", "bias": "bias"}
+_FILED_NORM = {
+    "weight": "gamma",
+    "bias": "beta",
+    "running_mean": "moving_mean",
+    "running_var": "moving_variance",
+}
+"""What torch calls a weight, and its name in a file: those that Keras wrote, with whose layout older models are read as they are."""
 
 
-@dataclass(frozen=True, slots=True)
-class Architecture:
-    """What decides the shape of every weight."""
+class Normed(nn.Module):
+    """A convolution and its batch normalisation."""
 
-    patch_px: int
-    depth: int
-    """Channels of a patch."""
-    outputs: int = 2
-    width: int = 64
-    """Filters of the first stage, a multiple of `BLOCK`; 64 is ResNet-18, less is a narrower copy for quick runs."""
+    def __init__(self, depth: int, filters: int, size: int, stride: int) -> None:
+        super().__init__()
+        around = size // 2 if stride == 1 else 0
+        self.convolution = nn.Conv2d(depth, filters, size, stride, around, bias=False)
+        self.norm = nn.BatchNorm2d(
+            filters, eps=1e-5, momentum=0.1
+        )  # the share of what is new; Keras gives that of the old, 0.9
+
+    def forward(self, images: Any) -> Any:
+        """Return (N, filters, rows, columns)."""
+        size, stride = self.convolution.kernel_size[0], self.convolution.stride[0]
+        return self.norm(self.convolution(images if stride == 1 else _padded(images, size, stride)))
 
 
-BLOCK = 16
-"""Channels that CPU convolutions hold together: of fewer, oneDNN, by which PyTorch convolves there, writes beyond its memory in the
-gradient of a 1 × 1 convolution with a stride (its issue 6035); seen to crash with 4 and 8 filters."""
+class BasicBlock(nn.Module):
+    """Two convolutions, added to what came in, which is convolved 1 × 1 where its shape changes."""
+
+    def __init__(self, depth: int, filters: int, stride: int) -> None:
+        super().__init__()
+        self.first = Normed(depth, filters, 3, stride)
+        self.second = Normed(filters, filters, 3, 1)
+        self.shortcut = Normed(depth, filters, 1, stride) if stride != 1 or depth != filters else nn.Identity()
+
+    def forward(self, images: Any) -> Any:
+        """Return (N, filters, rows, columns)."""
+        return functional.relu(self.second(functional.relu(self.first(images))) + self.shortcut(images))
 
 
-def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> Any:
-    """Return the untrained network, float32 (N, px, px, depth) to (N, outputs); the same seed gives the same weights.
+class ResNet18(nn.Module):
+    """Patches, float32 (N, depth, px, px), to outputs, (N, outputs)."""
+
+    def __init__(self, shape: Architecture) -> None:
+        super().__init__()
+        self.stem = Normed(shape.depth, shape.width, 7, 2)
+        depth = shape.width
+        for stage in range(4):
+            for block in range(2):
+                filters, stride = shape.width << stage, 2 if stage and not block else 1
+                self.add_module(f"stage{stage + 1}_block{block + 1}", BasicBlock(depth, filters, stride))
+                depth = filters
+        self.head = nn.Linear(depth, shape.outputs)
+
+    def forward(self, images: Any) -> Any:
+        """Return the outputs."""
+        values = functional.relu(self.stem(images))
+        values = functional.max_pool2d(_padded(values, 3, 2), 3, 2)  # zeros: nothing is less after a ReLU
+        for name, block in self.named_children():
+            values = block(values) if name.startswith("stage") else values
+        return self.head(values.mean((2, 3)))
+
+    def predict(self, patches: Floats) -> Floats:
+        """Return outputs of patches of shape (N, px, px, depth), shape (N, outputs)."""
+        self.eval()
+        out = np.empty((len(patches), self.head.out_features), np.float32)
+        with torch.inference_mode():
+            for first in range(0, len(patches), _TOGETHER):
+                part = slice(first, first + _TOGETHER)
+                out[part] = self(on_device(patches[part])).numpy(force=True)
+        return out
+
+    def arrays(self) -> dict[str, NDArray[np.float32]]:
+        """Return a copy of every weight by its name in a file; kernels have the shape (rows, columns, channels in, channels out)."""
+        return {_filed(name): _file_order(value).numpy(force=True).copy() for name, value in self._weights().items()}
+
+    def set_arrays(self, arrays: Arrays, where: str) -> None:
+        """Put weights in; `ModelError` if they are another network's."""
+        there = self._weights()
+        shapes = {_filed(name): tuple(_file_order(value).shape) for name, value in there.items()}
+        if {name: value.shape for name, value in arrays.items()} != shapes:
+            raise ModelError(f"{where}: holds the weights of another network; remove it and train the model again")
+        for name, value in there.items():
+            _file_order(value).copy_(torch.from_numpy(np.ascontiguousarray(arrays[_filed(name)])))
+
+    def _weights(self) -> dict[str, Any]:
+        """Return every weight by torch's name, without the count of batches that no fixed share asks for."""
+        return {name: value for name, value in self.state_dict().items() if not name.endswith("num_batches_tracked")}
+
+
+def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> ResNet18:
+    """Return the untrained network on the GPU that there is, else the CPU; the same seed gives the same weights.
 
     Parameters
     ----------
@@ -46,48 +131,45 @@ def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> Any:
     start
         What it predicts on average before training: the head's biases.
 
-    Raises
-    ------
-    ModelError
-        The width is no multiple of `BLOCK`.
-
     """
-    if shape.width % BLOCK:
-        raise ModelError(f"a network of width {shape.width}: wanted a multiple of {BLOCK}, from {BLOCK} to 512")
-    keras = load_keras()
-    keras.utils.set_random_seed(seed)
-    layers = keras.layers
-    patches = keras.Input((shape.patch_px, shape.patch_px, shape.depth), name="patches")
-    values = layers.ReLU()(_normed(layers, patches, "stem", (shape.width, 7, 2)))
-    values = layers.MaxPooling2D(3, 2, padding="same")(values)
-    for stage in range(4):
-        for block in range(2):
-            name = f"stage{stage + 1}_block{block + 1}"
-            values = _basic_block(layers, values, name, shape.width << stage, 2 if stage and not block else 1)
-    values = layers.GlobalAveragePooling2D()(values)
-    small, biases = keras.initializers.RandomNormal(stddev=0.01), keras.initializers.Constant(list(start))
-    head = layers.Dense(shape.outputs, kernel_initializer=small, bias_initializer=biases, name="head")
-    return keras.Model(patches, head(values), name="resnet18")
+    network, drawn = ResNet18(shape), torch.Generator().manual_seed(seed)
+    for layer in network.modules():
+        if isinstance(layer, nn.Conv2d):
+            deviation = math.sqrt(2.0 / layer.weight[0].numel()) / _CUT_DEVIATION
+            nn.init.trunc_normal_(layer.weight, 0.0, deviation, -2.0 * deviation, 2.0 * deviation, generator=drawn)
+    nn.init.normal_(network.head.weight, 0.0, 0.01, generator=drawn)
+    network.head.bias.data[:] = torch.tensor(list(start))
+    made: ResNet18 = network.to(device(), memory_format=torch.channels_last)
+    return made
 
 
-def _normed(layers: Any, values: Any, name: str, form: tuple[int, int, int]) -> Any:
-    """Convolve by ``form``, filters, size and stride, and normalise."""
-    filters, size, stride = form
-    convolve = layers.Conv2D(
-        filters, size, stride, "same", use_bias=False, kernel_initializer="he_normal", name=f"{name}_convolution"
-    )
-    return layers.BatchNormalization(momentum=0.9, epsilon=1e-5, name=f"{name}_norm")(convolve(values))
+def device() -> Any:
+    """Return what networks run on."""
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def _basic_block(layers: Any, values: Any, name: str, filters: int, stride: int) -> Any:
-    made = layers.ReLU()(_normed(layers, values, f"{name}_first", (filters, 3, stride)))
-    made = _normed(layers, made, f"{name}_second", (filters, 3, 1))
-    if stride != 1 or values.shape[-1] != filters:
-        values = _normed(layers, values, f"{name}_shortcut", (filters, 1, stride))
-    return layers.ReLU()(layers.Add()([made, values]))
+def device_name() -> str:
+    """Return the name of the GPU that networks run on, else ``cpu``."""
+    return str(torch.cuda.get_device_name()) if torch.cuda.is_available() else "cpu"
 
 
-def named_weights(network: Any) -> dict[str, NDArray[np.float32]]:
-    """Return every weight by its path in the network, in the network's order."""
-    to_numpy = load_keras().ops.convert_to_numpy
-    return {variable.path: np.array(to_numpy(variable.value)) for variable in network.weights}
+def on_device(patches: Floats) -> Any:
+    """Return patches (N, px, px, depth) as images (N, depth, px, px), which lie in memory as the patches do."""
+    return torch.from_numpy(np.ascontiguousarray(patches, np.float32)).to(device()).permute(0, 3, 1, 2)
+
+
+def _padded(images: Any, size: int, stride: int) -> Any:
+    """Put zeros around images so that a window in steps gives ceil(pixels / stride), as TensorFlow's "same" does."""
+    missing = [max((-(-pixels // stride) - 1) * stride + size - pixels, 0) for pixels in images.shape[:1:-1]]
+    return functional.pad(images, [part for pixels in missing for part in (pixels // 2, pixels - pixels // 2)])
+
+
+def _filed(name: str) -> str:
+    """Return a weight's name in a file."""
+    layer, _, kind = name.rpartition(".")
+    return f"{layer.replace('.', '_')}/{(_FILED_NORM if layer.endswith('norm') else _FILED)[kind]}"
+
+
+def _file_order(value: Any) -> Any:
+    """Return a view with the axes that a file has: outputs last."""
+    return value.permute(2, 3, 1, 0) if value.ndim == 4 else value.T if value.ndim == 2 else value

@@ -17,13 +17,12 @@ from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
-from tcpipe.learning.checkpoint import TrainingProgress, read_checkpoint
+from tcpipe.learning.architecture import Architecture
+from tcpipe.learning.checkpoint import read_checkpoint
 from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
-from tcpipe.learning.keras_backend import device_name
 from tcpipe.learning.model_card import KIND, ModelCard, Seen, TrainedOn, Training, is_current
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
-from tcpipe.learning.network import Architecture
 from tcpipe.terrain.classes import NODATA_ID, PAPER_CLASSES, ClassTable
 from tcpipe.terrain.relief import relief_m
 
@@ -119,12 +118,11 @@ def train(
         _refuse_without_deviations(task, data)
     if fresh or (disposable and checkpoint.exists() and not _is_of(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
-    logger.info("%s: %d samples to fit, %d to stop by, on %s", place, len(task.fit), len(task.held), device_name())
     fitted = fit(task, rules, name=str(place), key=key, checkpoint=checkpoint)
     card = _card(data, task, rules, fitted, key)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.progress.history)
     write_model(
-        place, card=card, network=fitted.network, residuals=_residuals(task.held, fitted, task.outputs),
+        place, card=card, weights=fitted.network.arrays(), residuals=_residuals(task.held, fitted, task.outputs),
         history="epoch,loss,held_out_loss\n" + history, readme=model_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
@@ -137,7 +135,7 @@ def train(
         progress.epoch,
         progress.best_epoch,
         progress.best_loss,
-        device_name(),
+        fitted.device,
         fitted.spent,
         fitted.spent.feeding_share,
     )
@@ -293,7 +291,7 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         classes=class_table(card).classes,
         seen=what_was_seen(task.fit),
         dataset=TrainedOn(card.name, dataset_checksum(card), card.data_model_version, card.splits),
-        training=_told(task, config, fitted.progress, key),
+        training=_told(task, config, fitted, key),
     )
 
 
@@ -302,8 +300,9 @@ def class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
-def _told(task: Task, config: FitConfig, progress: TrainingProgress, key: str) -> Training:
+def _told(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
     """Return what a model card tells of its training."""
+    progress = fitted.progress
     return Training(
         key=key,
         config=config,
@@ -312,7 +311,7 @@ def _told(task: Task, config: FitConfig, progress: TrainingProgress, key: str) -
         epochs=progress.epoch,
         best_epoch=progress.best_epoch,
         held_out_loss=progress.best_loss,
-        device=device_name(),
+        device=fitted.device,
     )
 
 

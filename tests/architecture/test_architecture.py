@@ -64,7 +64,7 @@ SUFFIX_OF_UNIT = {
 PLAIN_UNITS = {"", "1", "bits"}
 HEAVY = {
     "numpy", "pyarrow", "polars", "numba", "scipy", "zarr", "rasterio", "pyproj", "shapely", "pydantic", "rosbags", "mcap",
-    "matplotlib", "jinja2", "rich", "filterpy", "isal", "ruamel", "pandas", "torch", "keras",
+    "matplotlib", "jinja2", "rich", "filterpy", "isal", "ruamel", "pandas", "torch",
 }  # fmt: skip
 
 
@@ -135,9 +135,7 @@ def test_page_names_every_room():
 
 def test_each_file_format_has_the_home_that_the_page_gives():
     homes = {name: {f"{home}" for home in re.findall(r"`([\w/]+\.py)`", cell)} for name, cell in _table("Homes")}
-    assert {"rosbags", "mcap", "rasterio", "zarr", "pydantic", "pyarrow.parquet", "numba", "keras", "torch"} <= set(
-        homes
-    )
+    assert {"rosbags", "mcap", "rasterio", "zarr", "pydantic", "pyarrow.parquet", "numba", "torch"} <= set(homes)
     importers = {
         name: {
             path for path, tree in TREES.items() if any(f"{used}.".startswith(f"{name}.") for used in _imported(tree))

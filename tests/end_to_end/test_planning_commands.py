@@ -12,10 +12,7 @@ from map_worlds import World
 
 from tcpipe.pipeline.maps import add_map
 
-pytestmark = [
-    pytest.mark.skipif(find_spec("keras") is None, reason="keras, of the extra train, is not installed"),
-    pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning"),  # keras, with numpy 2
-]
+pytestmark = pytest.mark.skipif(find_spec("torch") is None, reason="torch, the extra train, is not installed")
 
 _ONE_THREAD = {"OMP_NUM_THREADS": "1"}
 _FROM, _TO = "14.99990,46.95345", "15.00010,46.95360"
@@ -24,7 +21,7 @@ _FROM, _TO = "14.99990,46.95345", "15.00010,46.95360"
 @pytest.fixture(scope="module")
 def place(tmp_path_factory) -> Path:
     """A directory with a store of one map, a model, and a path."""
-    from made_models import CARD, made_model  # needs keras
+    from made_models import CARD, made_model  # needs torch
 
     from tcpipe.learning.model_card import Seen
 

@@ -9,9 +9,8 @@ import pytest
 from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe
 
 pytest.importorskip("torch")
-pytest.importorskip("keras")
 
-ENV = {"OMP_NUM_THREADS": "1", "KERAS_BACKEND": os.environ["KERAS_BACKEND"]}
+ENV = {"OMP_NUM_THREADS": "1"}
 
 
 @pytest.fixture(scope="module")

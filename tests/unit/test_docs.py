@@ -148,7 +148,7 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 @pytest.mark.filterwarnings("default")  # of other libraries
 def test_snippets_run(snippet: str, datasets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(os.environ, "KERAS_BACKEND", os.environ.get("KERAS_BACKEND", "torch"))
+    monkeypatch.setitem(os.environ, "KERAS_BACKEND", "torch")
     for name in re.findall(r"^(?:import|from) (\w+)", snippet, re.MULTILINE):
         pytest.importorskip(name)
     monkeypatch.chdir(datasets)

@@ -23,7 +23,6 @@ from tcpipe.recipe import Recipe
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 pytest.importorskip("torch")
-pytest.importorskip("keras")
 
 CONFIG = EvaluateConfig(draws=2, baselines=False)
 

@@ -17,7 +17,6 @@ from tcpipe.learning.models import WEIGHTS, load_model
 from tcpipe.pipeline.verify import verify
 
 pytest.importorskip("torch")
-pytest.importorskip("keras")
 
 
 @pytest.fixture(scope="module")
@@ -100,19 +99,19 @@ def test_an_edited_card_is_refused_and_every_damaged_file_is_named(tmp_path):
     _refused(place, r"model\.json: is not as it was written.*; remove the folder and train the model again")
 
 
-def test_a_card_is_read_without_keras(place):
+def test_a_card_is_read_without_torch(place):
     program = f"""
 import sys
 from tcpipe.learning.models import load_model
 assert load_model({str(place)!r}).class_counts == {{4: 60, 6: 25, 7: 15}}
-assert not {{"keras", "torch"}} & set(sys.modules)
+assert "torch" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_without_keras_there_is_one_line(place, monkeypatch):
-    monkeypatch.setattr("tcpipe.learning.keras_backend.find_spec", lambda _: None)
-    with pytest.raises(ModelError, match=r"keras and torch not installed, .* pip install 'tcpipe\[train\]'"):
+def test_without_torch_there_is_one_line(place, monkeypatch):
+    monkeypatch.setattr("tcpipe.learning.architecture.find_spec", lambda _: None)
+    with pytest.raises(ModelError, match=r"torch not installed, .* pip install 'tcpipe\[train\]'"):
         load_model(place).predict(np.zeros((1, 40, 40, 3), np.float32))
 
 

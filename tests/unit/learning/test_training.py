@@ -18,7 +18,6 @@ from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.layers import HEIGHT_NODATA
 
 pytest.importorskip("torch")
-pytest.importorskip("keras")
 
 CONFIG = FitConfig(width=16, epochs=3, patience=3, learning_rate=1e-3)
 
@@ -71,6 +70,26 @@ def test_the_model_knows_what_it_was_trained_on(trained, dataset):
 def test_the_same_again_is_nothing_to_do(trained, dataset):
     place, _ = trained
     assert train(dataset, place, config=CONFIG).status == "unchanged"
+
+
+@pytest.mark.parametrize(
+    ("held", "rate"),
+    [
+        ((), 1.0),
+        ((5.0, 4.0, 3.0, 2.0), 1.0),
+        ((5.0, 4.0, 4.5), 1.0),
+        ((5.0, 4.0, 4.5, 4.0), 0.1),  # the same is not better
+        ((5.0, 4.0, 4.5, 4.0, 3.9), 0.1),  # and it does not rise again
+        ((5.0, 4.0, 4.5, 4.0, 3.9, 4.0, float("nan")), 0.01),
+        (tuple(range(20, 4, -1)), 0.1),  # the last fifth of twenty
+        ((5.0, 4.0, 4.5, 4.0, *[3.9] * 2, *np.arange(3.8, 2.8, -0.1)), 0.01),
+    ],
+)
+def test_the_rate_falls_where_nothing_gets_better_and_at_the_end(held, rate):
+    history = [(number + 1, 1.0, float(loss)) for number, loss in enumerate(held)]
+    progress = fitting.TrainingProgress("key", len(history), history=history)
+    config = replace(CONFIG, epochs=20, patience=4, learning_rate=1.0)
+    assert fitting.learning_rate(config, progress) == pytest.approx(rate)
 
 
 def _stopped(monkeypatch, at, dataset, place, config, **options):

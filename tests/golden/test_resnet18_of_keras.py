@@ -1,0 +1,56 @@
+"""The network gives what Keras gave, with which models were trained before: names and shapes of weights, predictions, losses.
+
+``tests/data/keras_resnet18.json`` was written by tcpipe's network in Keras before that was removed. Weights and patches were drawn by
+NumPy and are drawn here anew, in the order of their names; the file holds names, shapes and what came out. A loss is of labels and
+weights that were drawn last, the second one after a step of Adam of 1e-3.
+"""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tcpipe.errors import ModelError
+from tcpipe.learning.architecture import Architecture
+from tcpipe.learning.losses import loss_factors
+
+pytest.importorskip("torch")
+
+CASES = json.loads((Path(__file__).parents[1] / "data/keras_resnet18.json").read_text())["cases"]
+
+
+def _drawn(rng, name, shape):
+    uniform = rng.random(shape)
+    match name.rpartition("/")[2]:
+        case "kernel":
+            value = (2.0 * uniform - 1.0) * np.sqrt(6.0 / np.prod(shape[:-1]))
+        case "gamma" | "moving_variance":
+            value = uniform + 0.5
+        case _:
+            value = uniform - 0.5
+    return value.astype(np.float32)
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case['patch_px']}px")
+def test_it_is_the_network_of_keras(case):
+    from tcpipe.learning.network import resnet18
+    from tcpipe.learning.trainer import Trainer
+
+    px, depth, outputs = case["patch_px"], case["depth"], case["outputs"]
+    rng, predicted = np.random.default_rng(px), np.array(case["predicted"])
+    weights = {name: _drawn(rng, name, shape) for name, shape in case["shapes"].items()}
+    patches, labels, weigh = (
+        rng.random(shape, np.float32) for shape in ((8, px, px, depth), (8, outputs), (8, outputs))
+    )
+    network = resnet18(Architecture(px, depth, outputs, 16), seed=0, start=[0.0] * outputs)
+    network.set_arrays(weights, "golden")
+    assert network.predict(patches) == pytest.approx(predicted, rel=1e-5, abs=1e-5)
+    assert all(np.array_equal(array, weights[name]) for name, array in network.arrays().items())
+    trainer = Trainer(network, loss_factors("nrmse", [1.0] * outputs))
+    first, second = (trainer.step(patches, labels, weigh, 1e-3) for _ in range(2))
+    assert first == pytest.approx(case["losses"][0], rel=1e-5)
+    assert second == pytest.approx(case["losses"][1], rel=1e-3)
+    del weights["head/bias"]
+    with pytest.raises(ModelError, match="golden: holds the weights of another network; remove it and train the model"):
+        network.set_arrays(weights, "golden")
