@@ -111,15 +111,9 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
     """
     scale = label_scale(task)
     factors = loss_factors(config.loss, scale)
-    start = labels_of(task.fit, task.outputs).mean(axis=0) / scale
-    shape = Architecture(task.fit.view.stored.files.patch_px, task.fit.view.form.depth, len(scale), config.width)
-    check_trainable(shape)
-    from tcpipe.learning.network import device_name, resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
-    from tcpipe.learning.trainer import Trainer  # noqa: PLC0415
-
-    logger.info("%s: %d samples to fit, %d to stop by, on %s", name, len(task.fit), len(task.held), device_name())
-    network = resnet18(shape, seed=config.seed, start=start.tolist())
-    trainer = Trainer(network, factors)
+    trainer, device = _new_trainer(task, config, scale, factors)
+    network = trainer.network
+    logger.info("%s: %d samples to fit, %d to stop by, on %s", name, len(task.fit), len(task.held), device)
     progress = TrainingProgress(key)
     best: Arrays = network.arrays()
     if checkpoint.exists():
@@ -140,7 +134,18 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         write_checkpoint(checkpoint, progress, _state(trainer, best))
         _say(name, progress, config, spent)
     network.set_arrays(best, str(checkpoint))
-    return Fitted(network, scale, progress, spent, device_name())
+    return Fitted(network, scale, progress, spent, device)
+
+
+def _new_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors: Floats) -> tuple[Trainer, str]:
+    """Return an untrained network with its optimiser, and what it runs on."""
+    start = labels_of(task.fit, task.outputs).mean(axis=0) / scale
+    shape = Architecture(task.fit.view.stored.files.patch_px, task.fit.view.form.depth, len(scale), config.width)
+    check_trainable(shape)
+    from tcpipe.learning.network import device_name, resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
+    from tcpipe.learning.trainer import Trainer  # noqa: PLC0415
+
+    return Trainer(resnet18(shape, seed=config.seed, start=start.tolist()), factors), device_name()
 
 
 def label_scale(task: Task) -> tuple[float, ...]:
