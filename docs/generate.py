@@ -102,7 +102,7 @@ def _columns() -> str:
 
 def _table(table: TableSchema) -> str:
     rows = [
-        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc} |"
+        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc}{f'; since {c.since}' if c.since else ''} |"
         for c in table.columns
     ]
     flags = [_bits(c.name, c.flags) for c in table.columns if c.flags is not None]

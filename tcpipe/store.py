@@ -45,6 +45,7 @@ from tcpipe.formats.seals import (
 from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
+    LABELLED_SEGMENTS,
     READ_VERSIONS,
     GatedTrack,
     LabelledSegments,
@@ -96,8 +97,8 @@ class RunDirectory:
         prove_files(self.path, self.manifest.checksums, names)
 
     def segments(self) -> pa.Table:
-        """Read the labelled segments (schema LABELLED_SEGMENTS)."""
-        return self.table("segments")
+        """Read the labelled segments (schema LABELLED_SEGMENTS; columns that an earlier data model lacks are null)."""
+        return LABELLED_SEGMENTS.completed(self.table("segments"))
 
     def track(self) -> GatedTrack:
         """Read the gated track as a checked level."""

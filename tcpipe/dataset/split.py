@@ -18,6 +18,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import read_samples, sample_columns
 from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.levels import SAMPLES
 
 if TYPE_CHECKING:
     from tcpipe.dataset.torch_data import TorchBatches
@@ -41,7 +42,7 @@ class SampleColumns:
         """Return one column, nulls as NaN or None, shape (N,)."""
         if name not in self._read:
             there = sample_columns(self.directory)
-            if name not in there:
+            if name not in {*there, *SAMPLES.names()}:
                 raise DatasetError(
                     f"{self.directory}: its samples have no column {name!r}; there are {', '.join(there)}"
                 )

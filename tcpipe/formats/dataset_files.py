@@ -29,6 +29,7 @@ from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
 from tcpipe.terrain.layers import Layer, in_order, missing
 
 FileFormat = Literal["zarr", "parquet"]
@@ -243,9 +244,16 @@ def read_current_card(directory: Path) -> DatasetCard:
 
 
 def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """Return the samples table of a dataset, or some of its columns; `DatasetError` if it cannot be read."""
+    """Return the samples table of a dataset, or some of its columns; `DatasetError` if it cannot be read.
+
+    Columns that an earlier data model lacks are null.
+    """
+    later = {column.name for column in SAMPLES_SCHEMA.columns if column.since}
+    asked = SAMPLES_SCHEMA.names() if columns is None else list(columns)
     try:
-        return read_table(directory / SAMPLES, None if columns is None else list(columns))
+        absent = later.intersection(asked).difference(column_names(directory / SAMPLES))
+        there = None if columns is None else [name for name in columns if name not in absent]
+        return SAMPLES_SCHEMA.only(*asked).completed(read_table(directory / SAMPLES, there))
     except StoreError as error:
         raise DatasetError(*error.problems) from None
 

@@ -111,10 +111,15 @@ def process_noise(measurements: Measurements) -> NDArray[np.float64]:
     imu = measurements.imu
     if imu is not None:
         rate_hz = 1e9 / median_period_ns(imu.stamp_ns)
-        density[kernel.GYRO_TURN :, 0:3] = 1.5 * imu.gyro_std_radps**2 / rate_hz + 1e-8
+        density[kernel.GYRO_TURN :, 0:3] = gyro_density(imu.gyro_std_radps, rate_hz)
     else:
         density[:, 3:6] = 2 * turn_scale_std(measurements) ** 2 / _TURN_SCALE_TIME_S
     return density
+
+
+def gyro_density(gyro_std_radps: float, rate_hz: float) -> float:
+    """Return how fast the variance of an angle grows that a gyroscope tells [rad²/s]."""
+    return 1.5 * gyro_std_radps**2 / rate_hz + 1e-8
 
 
 def _odometric_turns(measurements: Measurements, density: NDArray[np.float64]) -> None:

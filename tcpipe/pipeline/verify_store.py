@@ -162,7 +162,7 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
         yield broken_seal(directory / _REPORT) or ("files", 1)
     tables = {}
     for name, schema in _TABLES.items():
-        tables[name] = read_table(directory / f"{name}.parquet").replace_schema_metadata(None)
+        tables[name] = schema.completed(read_table(directory / f"{name}.parquet").replace_schema_metadata(None))
         try:
             schema.check(tables[name])
         except TcpipeError as error:

@@ -6,7 +6,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.cost.labels import Labels, labels
+from tcpipe.cost.labels import AboveStanding, Labels, above_standing, labels
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.piecewise_linear import interpolate, mean_between
 from tcpipe.motion.pieces import piece_of_rows, spans_where
@@ -14,6 +14,7 @@ from tcpipe.motion.uncertainty import along_std_m, between_durations_m, displace
 from tcpipe.power.energy import Rule, energy_joule
 from tcpipe.power.noise import energy_noise
 from tcpipe.power.rails import Rail, power_watt
+from tcpipe.power.standing import StandingPower
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason
 from tcpipe.tables.columns import floats, integers
@@ -24,9 +25,11 @@ _BETTER_HZ = 20.0
 
 
 def segment_costs(
-    cut: pa.Table, rows: pa.Table, rails: list[Rail], info: TrackInfo, *, rule: Rule
-) -> tuple[Labels, dict[str, NDArray[np.float64]]]:
-    """Return the labels of one epoch's segments, and the variances of their energies by cause [J²] (`tcpipe.cost.budget`).
+    cut: pa.Table, rows: pa.Table, rails: list[Rail], info: TrackInfo, *, rule: Rule, standing: StandingPower
+) -> tuple[Labels, AboveStanding, dict[str, NDArray[np.float64]]]:
+    """Return the labels of one epoch's segments, those above standing, and the variances of their energies by cause [J²].
+
+    The causes are those of `tcpipe.cost.budget`.
 
     Parameters
     ----------
@@ -37,7 +40,7 @@ def segment_costs(
     noise = energy_noise(rails, *spans)
     better = energy_noise(rails, *spans, rate_hz=_BETTER_HZ)
     ground_mps = np.hypot(floats(rows, "east_velocity_mps"), floats(rows, "north_velocity_mps"))
-    end_watt = power_watt(rails, end_ns)
+    end_watt, noise_joule = power_watt(rails, end_ns), noise.std_joule()
     cost = labels(
         chord_m=floats(cut, "chord_m"),
         duration_s=(end_ns - start_ns).astype(np.float64) * 1e-9,
@@ -45,11 +48,18 @@ def segment_costs(
         end_velocity_mps=interpolate(stamp_ns, ground_mps, end_ns),
         end_power_watt=end_watt,
         displacement_std_m=_displacement_std_m(cut, rows, smoothed=info.estimator == "smoother"),
-        energy_noise_joule=noise.std_joule(),
+        energy_noise_joule=noise_joule,
+    )
+    above = above_standing(
+        cost,
+        standing_watt=standing.watt,
+        standing_std_watt=standing.std_watt,
+        end_power_watt=end_watt,
+        energy_noise_joule=noise_joule,
     )
     position = (end_watt * cost.duration_std_s) ** 2
     causes = {"position": position, "rate": noise.rate, "current": noise.current, "voltage": noise.voltage}
-    return cost, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise.std_joule()) ** 2}
+    return cost, above, {**causes, "at_20_hz": position + np.minimum(better.std_joule(), noise_joule) ** 2}
 
 
 def _displacement_std_m(cut: pa.Table, rows: pa.Table, *, smoothed: bool) -> NDArray[np.float64]:

@@ -7,25 +7,24 @@ import pyarrow as pa
 
 from tcpipe.cost.physics import fit_physics
 from tcpipe.tables.arrays import numbers
-from tcpipe.tables.bits import DropReason, Quality
+from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import PhysicsFacts
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 
-_FEWEST_STANDING = 40
 
-
-def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, PhysicsFacts]:
+def with_physics(table: pa.Table, standing_watt: float) -> tuple[pa.Table, PhysicsFacts]:
     """Return the labelled segments with the power that rolling resistance and grade predict, and the fit.
 
     Parameters
     ----------
-    table : labelled segments of a run. rows : its gated track, for the power while standing.
+    table : labelled segments of a run.
+    standing_watt : [W], what the robot draws while it stands; NaN where that is not known.
     """
     speed = floats(table, "velocity_mps")
     rise = (floats(table, "end_z_m") - floats(table, "start_z_m")) / floats(table, "chord_m")
     power = floats(table, "power_watt")
-    standing = _standing_watt(rows)
+    standing = standing_watt if np.isfinite(standing_watt) else None
     found = fit_physics(power_watt=power, velocity_mps=speed, rise=rise, standing_watt=standing or 0.0)
     if found is None:
         return table, PhysicsFacts(fitted=False, standing_watt=standing)
@@ -45,10 +44,3 @@ def with_physics(table: pa.Table, rows: pa.Table) -> tuple[pa.Table, PhysicsFact
         segments=found.segments,
         outliers=int(odd.sum()),
     )
-
-
-def _standing_watt(rows: pa.Table) -> float | None:
-    power = floats(rows, "power_watt")
-    standing = (numbers(rows["dropped_by"]) & np.uint32(DropReason.STANDING)) != 0
-    drawn = power[standing & np.isfinite(power)]
-    return float(np.median(drawn)) if drawn.size >= _FEWEST_STANDING else None

@@ -29,6 +29,7 @@ from tcpipe.errors import TableError
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
+from tcpipe.tables.segment_columns import MOTION_COLUMNS, STANDING_COLUMNS
 
 DATA_MODEL_VERSION = "1.3"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
@@ -338,6 +339,7 @@ _LABEL_COLUMNS = (
     Column(
         "energy_std_joule", _F64, "J", "standard deviation of the energy, likewise; null without power", nullable=True
     ),
+    *STANDING_COLUMNS,
     Column(
         "physics_power_watt",
         _F64,
@@ -350,7 +352,10 @@ _LABEL_COLUMNS = (
 )
 
 LABELLED_SEGMENTS = TableSchema(
-    "segments", "L5", "Segments with the cost of the metre each one covers.", (*_SEGMENT_COLUMNS, *_LABEL_COLUMNS)
+    "segments",
+    "L5",
+    "Segments with the cost of the metre each one covers.",
+    (*_SEGMENT_COLUMNS, *MOTION_COLUMNS, *_LABEL_COLUMNS),
 )
 
 PLACED_SEGMENTS = LABELLED_SEGMENTS.only(
@@ -375,6 +380,7 @@ SAMPLES = TableSchema(
         ),
         Column("map", pa.string(), "", "name of the map the patch was sampled from"),
         *_SEGMENT_COLUMNS,
+        *MOTION_COLUMNS,
         *_LABEL_COLUMNS,
         Column(
             "terrain_class",

@@ -1,0 +1,62 @@
+"""What a robot draws while it stands, and how far that differs from one second to another: no ground has a part in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+FEWEST_ROWS = 40
+"""Rows of a standing robot that tell its power."""
+
+
+@dataclass(frozen=True, slots=True)
+class StandingPower:
+    """Power of the standing robot over a run.
+
+    Attributes
+    ----------
+    watt : median of the means of seconds [W]; NaN where the robot hardly stood.
+    std_watt : how far it may lie from what the robot would draw standing, over any second of the run [W]; NaN likewise.
+    """
+
+    watt: float
+    std_watt: float
+
+
+def standing_power(power_watt: Floats, halt: NDArray[np.int64], *, window_rows: int, step_watt: float) -> StandingPower:
+    """Return the power while standing. A second is about as long as a segment takes, and its mean is finer than the record's step.
+
+    Parameters
+    ----------
+    power_watt : [W], shape (N,), while the robot stands, in order of time; NaN where it is not known.
+    halt : shape (N,), which halt a row is of, increasing; negative at the edges of a halt, where motors still or already draw.
+    window_rows : rows of a second.
+    step_watt : [W], step in which power is told; while it stays on one level, nothing else tells how far that is off.
+    """
+    known = np.isfinite(power_watt)
+    if np.count_nonzero(known) < FEWEST_ROWS:
+        return StandingPower(np.nan, np.nan)
+    settled = known & (halt >= 0)
+    used = settled if settled.any() else known
+    halts = [power_watt[used & (halt == number)] for number in np.unique(halt[used]).tolist()]
+    means = np.array([float(part.mean()) for each in halts for part in _seconds(each, window_rows)])
+    watt = float(np.median(means))
+    scatter = float(np.mean((means - watt) ** 2))
+    lasting = max(scatter - _noise_variance(halts) / window_rows, 0.0)
+    levels = 1 + np.count_nonzero(np.diff(power_watt[used]))
+    return StandingPower(watt, float(np.sqrt(lasting + scatter / means.size + step_watt**2 / 12.0 / levels)))
+
+
+def _seconds(power_watt: Floats, rows: int) -> list[Floats]:
+    """Return a halt in parts of so many rows; what remains is spread over them, and a shorter halt is one part."""
+    return np.array_split(power_watt, max(power_watt.size // rows, 1))
+
+
+def _noise_variance(halts: list[Floats]) -> float:
+    """Return the variance of the samples' noise [W²]: second differences of white noise have six times its variance."""
+    second = [np.diff(each, n=2) for each in halts if each.size > 2]
+    return float(np.mean(np.concatenate(second) ** 2)) / 6.0 if second else 0.0
