@@ -19,7 +19,7 @@ from tcpipe.formats.contracts import DOCUMENTS
 from tcpipe.formats.recipe_toml import commented_toml
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.planning.path_table import PIECES
-from tcpipe.tables.columns import TableSchema
+from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -102,12 +102,16 @@ def _columns() -> str:
 
 def _table(table: TableSchema) -> str:
     rows = [
-        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc}{f'; since {c.since}' if c.since else ''} |"
+        f"| `{c.name}` | {c.dtype}{' or null' if c.nullable else ''} | {c.unit} | {c.frame} | {c.doc}{_since(c)} |"
         for c in table.columns
     ]
     flags = [_bits(c.name, c.flags) for c in table.columns if c.flags is not None]
     head = "| column | type | unit | frame | meaning |\n|---|---|---|---|---|"
     return f"## {table.name} ({table.level})\n\n{table.doc}\n\n{head}\n" + "\n".join(rows) + "\n" + "".join(flags)
+
+
+def _since(column: Column) -> str:
+    return f"; since {column.since}, null in what is older" if column.since else ""
 
 
 def _bits(column: str, flags: type[IntFlag]) -> str:

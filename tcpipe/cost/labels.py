@@ -110,7 +110,7 @@ def above_standing(
         standing_power_watt=np.where(known, standing_watt, np.nan),
         standing_power_std_watt=np.where(known, standing_std_watt, np.nan),
         power_above_standing_watt=cost.power_watt - standing_watt,
-        power_above_standing_std_watt=np.hypot(cost.power_std_watt, standing_std_watt),
+        power_above_standing_std_watt=np.where(known, np.hypot(cost.power_std_watt, standing_std_watt), np.nan),
         energy_above_standing_joule=energy_joule,
         energy_above_standing_std_joule=np.where(known, np.hypot(displaced_joule, noise_joule), np.nan),
     )

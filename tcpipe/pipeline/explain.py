@@ -36,7 +36,7 @@ from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import RunDirectory, Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, name_of
 from tcpipe.tables.columns import integers
-from tcpipe.tables.levels import LABELLED_SEGMENTS, Streams
+from tcpipe.tables.levels import PLACED_SEGMENTS, Streams
 from tcpipe.terrain.sampling import Patches
 
 _NEARBY_NS = 5_000_000_000
@@ -341,8 +341,8 @@ def _map(source: MapFile, sample: _Sample, recipe: Recipe) -> SampleMap:
 
 def _sampled(segment: Mapping[str, Value], source: MapFile, recipe: Recipe) -> Sampled:
     """Sample one segment, given as a row of values."""
-    row = {column.name: pa.array([segment[column.name]], column.dtype) for column in LABELLED_SEGMENTS.columns}
-    table = pa.Table.from_arrays(list(row.values()), schema=LABELLED_SEGMENTS.arrow())
+    row = {column.name: pa.array([segment[column.name]], column.dtype) for column in PLACED_SEGMENTS.columns}
+    table = pa.Table.from_arrays(list(row.values()), schema=PLACED_SEGMENTS.arrow())
     return sample_segments(table, source, recipe.sample, gnss_crs=recipe.read.gnss_crs)
 
 

@@ -24,6 +24,7 @@ from tcpipe.formats.dataset_files import (
     read_card,
     read_samples,
     rows_in_files,
+    sample_columns,
     zarr_sample_ids,
 )
 from tcpipe.formats.json_files import plain
@@ -184,11 +185,11 @@ def _beside_patches(directory: Path, card: DatasetCard, samples: pa.Table) -> It
         if zarr_sample_ids(directory) != samples.column("sample_id").to_pylist():
             yield f"{directory / PATCHES}: its sample ids are not those of {SAMPLES}, in their order"
         return
-    first = 0
+    first, names = 0, sample_columns(directory)
     for shard in card.shards:
-        found = read_table(directory / shard.path, samples.column_names)
+        found = read_table(directory / shard.path, names)
         wanted = samples.slice(first, shard.rows)
-        other = [name for name in samples.column_names if not found.column(name).equals(wanted.column(name))]
+        other = [name for name in names if not found.column(name).equals(wanted.column(name))]
         if other:
             yield f"{directory / shard.path}: {', '.join(other)} are not those of {SAMPLES}, in their order"
         first += shard.rows

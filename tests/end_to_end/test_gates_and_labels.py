@@ -7,9 +7,12 @@ import pytest
 
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.recipe import FuseConfig, GateConfig, LabelConfig, ReadConfig, SegmentConfig
 from tcpipe.simulation import Faults, read_truth, scenario, simulate, tiny, true_cost
 from tcpipe.simulation.messages import Recorder
+from tcpipe.simulation.robot import SimulatedRobot
+from tcpipe.simulation.sensors import Imu, Wheels
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.stages.gate import gate_track
 from tcpipe.stages.label import label_segments
@@ -95,10 +98,16 @@ def test_no_segment_contains_standing_or_turning_in_place(manoeuvres):
     assert (sums[last] == sums[first]).all()
 
 
-@pytest.mark.parametrize("power", ["husky_status", "clearpath_power"])
-def test_labels_are_as_wrong_as_they_say(power, tmp_path_factory):
-    plan = tiny(Faults.every(), recorder=Recorder("ros1" if power == "husky_status" else "ros2", power), seconds=240.0)
-    _, labelled, truth = run(simulate(tmp_path_factory.mktemp(power), scenario=plan, seed=4))
+@pytest.fixture(scope="module", params=["husky_status", "clearpath_power"])
+def faulty(request, tmp_path_factory):
+    """Four minutes with every sensor fault."""
+    recorder = Recorder("ros1" if request.param == "husky_status" else "ros2", request.param)
+    plan = tiny(Faults.every(), recorder=recorder, seconds=240.0)
+    return run(simulate(tmp_path_factory.mktemp(request.param), scenario=plan, seed=4))
+
+
+def test_labels_are_as_wrong_as_they_say(faulty):
+    _, labelled, truth = faulty
     true = true_cost(truth, integers(labelled.table, "start_ns"))
     for name in ("duration_s", "velocity_mps", "power_watt", "energy_joule"):
         quantity, unit = name.rsplit("_", 1)
@@ -107,3 +116,60 @@ def test_labels_are_as_wrong_as_they_say(power, tmp_path_factory):
         normalized = error / floats(labelled.table, f"{quantity}_std_{unit}")
         assert len(normalized) > 120
         assert 0.5 < np.sqrt(np.mean(normalized**2)) < 1.5, name
+
+
+def spans(labelled):
+    return tuple(integers(labelled.table, name) for name in ("start_ns", "end_ns"))
+
+
+def meant(truth, values, labelled):
+    """Return the mean of a series of the truth over every segment."""
+    total = np.concatenate(([0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * np.diff(truth.stamp_ns))))
+    start_ns, end_ns = spans(labelled)
+    at = [np.interp(at_ns, truth.stamp_ns, total) for at_ns in (start_ns, end_ns)]
+    return (at[1] - at[0]) / (end_ns - start_ns)
+
+
+def test_what_is_above_standing_is_as_wrong_as_it_says(faulty):
+    _, labelled, truth = faulty
+    true, idle = true_cost(truth, spans(labelled)[0]), SimulatedRobot().idle_watt
+    for name, wanted in (
+        ("standing_power_watt", np.full(labelled.table.num_rows, idle)),
+        ("power_above_standing_watt", true.power_watt - idle),
+        ("energy_above_standing_joule", true.energy_joule - idle * true.duration_s),
+    ):
+        quantity, unit = name.rsplit("_", 1)
+        normalized = (floats(labelled.table, name) - wanted) / floats(labelled.table, f"{quantity}_std_{unit}")
+        assert np.sqrt(np.mean(normalized**2)) < 1.5, name
+    assert floats(labelled.table, "standing_power_std_watt").max() < 2.0
+    identity = floats(labelled.table, "power_above_standing_watt") * floats(labelled.table, "duration_s")
+    assert floats(labelled.table, "energy_above_standing_joule") == pytest.approx(identity)
+    assert floats(labelled.table, "voltage_volt") == pytest.approx(meant(truth, truth.voltage_volt, labelled), abs=0.02)
+
+
+def test_turns_attitude_slip_and_vibration_are_the_robots(faulty):
+    _, labelled, truth = faulty
+    table, (start_ns, end_ns) = labelled.table, spans(labelled)
+    roll, pitch, yaw = rpy_from_quat(truth.quat_xyzw).T
+    turn = np.interp(end_ns, truth.stamp_ns, np.unwrap(yaw)) - np.interp(start_ns, truth.stamp_ns, np.unwrap(yaw))
+    arc = np.interp(end_ns, truth.stamp_ns, truth.distance_m) - np.interp(start_ns, truth.stamp_ns, truth.distance_m)
+    turn_rate = meant(truth, np.abs(truth.angular_velocity_radps[:, 2]), labelled)
+    wheel_mps = meant(truth, truth.wheel_velocity_mps, labelled)
+    slip = 1 - meant(truth, truth.forward_velocity_mps, labelled) / (Wheels().scale * wheel_mps)
+    for name, wanted in (
+        ("turn_rad", turn),
+        ("turn_rate_radps", turn_rate),
+        ("curvature_radpm", turn / arc),
+        ("slip_fraction", slip),
+    ):
+        quantity, unit = name.rsplit("_", 1)
+        normalized = (floats(table, name) - wanted) / floats(table, f"{quantity}_std_{unit}")
+        assert 0.5 < np.sqrt(np.mean(normalized**2)) < 1.5, name
+    middle_ns = start_ns + (end_ns - start_ns) // 2
+    for name, angle in (("roll_rad", roll), ("pitch_rad", pitch)):
+        assert floats(table, name) == pytest.approx(np.interp(middle_ns, truth.stamp_ns, angle), abs=0.006)
+    # White noise of three axes at 100 Hz, of which the band, half passed at its edges, passes 14.4 of 50 Hz.
+    white = np.hypot(Imu().vibration_mps2 * wheel_mps, Imu().accelerometer_std_mps2)
+    ratio = floats(table, "vibration_mps2") / (white * np.sqrt(3 * 14.4 / 50))
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.03)
+    assert ratio.std() < 0.12

@@ -16,7 +16,7 @@ from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.migrate import migrate
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import DATA_MODEL_VERSION, SAMPLES
 
 KEPT = Path(__file__).parents[1] / "data" / "store-1.0.tar.xz"
 
@@ -52,6 +52,18 @@ def test_a_dataset_is_built_of_it(kept):
     np.testing.assert_array_equal(new.labels, old.labels)
     sample_id = str(old.column("sample_id")[0])
     assert explain(sample_id, dataset=kept / "zarr", store=kept / "store").facts.sample["sample_id"] == sample_id
+
+
+def test_columns_added_since_are_null_in_runs_and_datasets(kept):
+    build_dataset(kept / "new", store=kept / "store", recipe=Recipe(), holdout="sample")
+    later = [column.name for column in SAMPLES.columns if column.since]
+    assert {"turn_rad", "energy_above_standing_joule"} <= set(later)
+    for name in ("zarr", "parquet", "new"):
+        train = tcpipe.open_dataset(kept / name)["train"]
+        assert train.samples.column_names == SAMPLES.names()
+        for column in later:
+            assert np.isnan(train.column(column).astype(float)).all()
+    assert verify(kept / "new").problems == ()
 
 
 def contents(directory):

@@ -43,13 +43,13 @@ def test_the_prediction_stands_beside_the_label(stages):
 
 
 def test_an_odd_metre_is_flagged_and_changes_nothing_for_the_others(stages):
-    _, gated, labelled = stages
+    labelled = stages[2]
     power = floats(labelled.table, "power_watt").copy()
     power[7] += 300.0
     odd = labelled.table.set_column(
         labelled.table.schema.get_field_index("power_watt"), labelled.table.schema.field("power_watt"), [power]
     )
-    table, facts = with_physics(odd, gated.table)
+    table, facts = with_physics(odd, labelled.info.findings.facts.label.physics.standing_watt)
     flagged = np.flatnonzero(table["quality"].to_numpy() & np.uint32(Quality.PHYSICS_OUTLIER))
     assert 7 in flagged
     assert facts.outliers == flagged.size <= 3
@@ -59,11 +59,11 @@ def test_an_odd_metre_is_flagged_and_changes_nothing_for_the_others(stages):
 
 
 def test_without_power_there_is_no_fit(stages):
-    _, gated, labelled = stages
+    labelled = stages[2]
     field = labelled.table.schema.field("power_watt")
     dark = labelled.table.set_column(
         labelled.table.schema.get_field_index("power_watt"), field, [np.full(labelled.table.num_rows, np.nan)]
     )
-    table, facts = with_physics(dark, gated.table)
+    table, facts = with_physics(dark, np.nan)
     assert facts.fitted is False
     assert table is dark
