@@ -53,6 +53,7 @@ SUFFIX_OF_UNIT = {
     "m/s": "_mps",
     "m/s2": "_mps2",
     "rad/s": "_radps",
+    "rad/m": "_radpm",
     "px": "_px",
     "V": "_volt",
     "A": "_amp",
