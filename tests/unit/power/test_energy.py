@@ -64,3 +64,10 @@ def test_samples_inside_are_counted_and_averaged():
     assert count.tolist() == [2, 3, 0]
     assert mean[:2] == pytest.approx([30, 140 / 3])
     assert np.isnan(mean[2])
+
+
+def test_a_record_counts_from_its_first_sample_to_its_last():
+    source = made_rail((1, 2, 3), (10.0,) * 3, (1.0, 1.0, 3.0))
+    assert recorded_energy_joule([source], seconds(0.0), seconds(5.0), rule="exact") == pytest.approx([10 + 20])
+    assert energy_joule([source], seconds(1.0), seconds(3.0), rule="exact") == pytest.approx([30])
+    assert np.isnan(energy_joule([source], seconds(1.0), seconds(3.5), rule="exact")).all()

@@ -6,8 +6,17 @@ from made_tracks import stamps
 from scipy.signal import lfilter
 
 from tcpipe.power.energy import energy_joule
-from tcpipe.power.noise import _steady, energy_noise, median_period_s, resolution, squared_weights_s2
-from tcpipe.power.rails import rail, samples
+from tcpipe.power.noise import (
+    _first_and_last,
+    _rounding,
+    _steady,
+    _still,
+    energy_noise,
+    median_period_s,
+    resolution,
+    squared_weights_s2,
+)
+from tcpipe.power.rails import Rail, Samples, rail, samples
 from tcpipe.power.signal_model import local_scale, signal_model
 
 ZERO = stamps(1)[0]
@@ -172,3 +181,61 @@ def test_a_span_uses_the_samples_in_it_and_one_on_either_side():
     at = ZERO + np.arange(10) * 1_000_000_000
     used = _steady(at, ZERO + np.array([2_500_000_000]), ZERO + np.array([4_500_000_000]))
     assert np.flatnonzero(used).tolist() == [2, 3, 4, 5]
+
+
+def test_a_span_begins_and_ends_one_sample_beyond():
+    at = np.arange(5) * 10
+    starts, ends = np.array([0, 10, 11, 45, -5]), np.array([10, 20, 19, 50, 5])
+    first, last = _first_and_last(at, starts, ends)
+    assert first.tolist() == [0, 1, 1, 3, 0]
+    assert last.tolist() == [1, 2, 2, 4, 1]
+
+
+def test_noise_does_not_hang_on_when_the_clock_began():
+    rng = np.random.default_rng(10)
+    value = 6 + rng.normal(0, 0.5, 240)
+    spans = np.array([[3.01, 5.27], [4.2, 6.4]])
+    found = []
+    for zero in (1_000_000_000, ZERO):
+        stamp_ns = zero + np.arange(240) * 50_000_000
+        made = [rail("drive", samples(stamp_ns, np.full(240, 24.0)), samples(stamp_ns, value), averaged=False)]
+        start_ns, end_ns = zero + np.round(spans * 1e9).astype(np.int64)
+        found.append(energy_noise_joule(made, start_ns, end_ns))
+    assert found[0] == pytest.approx(found[1], rel=1e-9)
+    assert (found[0] > 0).all()
+
+
+def test_a_sample_counts_as_still_two_tenths_of_a_second_from_any_move():
+    at = np.arange(1, 31) * 100_000_000
+    halts = np.array([[500, 1500], [1600, 2600]]) * 1_000_000
+    signal = Samples(at, np.zeros(30))
+    assert (at[_still(signal, halts, averaged=False)] // 100_000_000).tolist() == [*range(7, 14), *range(18, 25)]
+    assert (at[_still(signal, halts, averaged=True)] // 100_000_000).tolist() == [*range(8, 14), *range(19, 25)]
+    slow = Samples(np.array([700, 1300, 1800, 2300]) * 1_000_000, np.zeros(4))
+    assert _still(slow, halts, averaged=True).tolist() == [
+        True,
+        True,
+        False,
+        True,
+    ]  # the third began in the halt before
+
+
+def test_rounding_is_one_error_for_each_level_that_a_span_crosses():
+    at = np.arange(8) * 1_000_000_000
+    signal = Samples(at, np.array([0.0, 0, 0, 0.5, 0.5, 0, 0, 0]))
+    starts, ends = np.array([1, 1]) * 1_000_000_000, np.array([2, 6]) * 1_000_000_000
+    assert _rounding(signal, starts, ends) == pytest.approx([0.5**2 / 12, (0.5 * 5) ** 2 / 12 / 3])
+
+
+def test_a_resolution_shows_where_more_than_half_of_the_values_repeat():
+    assert resolution(Samples(np.arange(4), np.array([0.0, 0.5, 0.0, 0.5]))) == 0.0
+    assert resolution(Samples(np.arange(5), np.array([0.0, 0.5, 0.0, 0.5, 0.0]))) == 0.5
+    assert resolution(Samples(np.arange(5), np.zeros(5))) == 0.0
+
+
+def test_nothing_is_said_of_two_samples_and_of_a_rail_without_any():
+    second = ZERO + np.array([0]), ZERO + np.array([1_000_000_000]), NEVER_STILL
+    assert energy_noise([record(np.arange(2.0), np.arange(2.0))], *second).std_joule().tolist() == [0.0]
+    empty = Samples(np.empty(0, np.int64), np.empty(0))
+    gone = Rail("drive", empty, empty, False, empty.stamp_ns, empty.value, empty.value)
+    assert energy_noise([gone], *second).std_joule().tolist() == [0.0]

@@ -64,3 +64,10 @@ def test_an_averaged_power_between_two_samples_is_that_of_the_later():
     source = rail([0, 1000, 2000], [30, 30, 30], [1, 10, 1], averaged=True)
     at = np.array([-500, 0, 1, 999, 1000, 1001, 2000, 2500], np.int64) * MS
     assert power_watt([source], at).tolist() == [30, 30, 300, 300, 300, 30, 30, 30]
+
+
+def test_ends_are_held_whatever_the_number_of_samples():
+    for count in (2, 3, 4):
+        source = rail(range(0, 1000 * count, 1000), [30] * count, range(1, count + 1), averaged=True)
+        at = np.array([-500, 1000 * count], np.int64) * MS
+        assert power_watt([source], at).tolist() == [30, 30 * count]

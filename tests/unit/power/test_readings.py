@@ -255,3 +255,39 @@ def test_a_type_whose_drawn_current_is_negative_needs_no_recipe_line() -> None:
         {"/b": ("my_msgs/msg/Battery", columns | {"i": AMP})}, known, current_sign="drawn_positive"
     )
     np.testing.assert_allclose(power_watt(told), VOLT * AMP)
+
+
+@pytest.mark.parametrize(("drawn", "factor", "flows"), [("positive", -1, "negative"), ("negative", 1, "positive")])
+def test_a_refusal_says_which_way_the_current_flows(drawn: str, factor: int, flows: str) -> None:
+    topics = {"/b": ("my_msgs/msg/Battery", TIMES | {"v": VOLT, "i": factor * AMP})}
+    (line,) = readings.read_power(topics, [source(sign=f"drawn_{drawn}")]).warnings
+    assert f"power refused: the current is {flows}, 100 % of the charge moved flows back" in line
+
+
+@pytest.mark.parametrize(("rows", "refused"), [(19, False), (20, True)])
+def test_twenty_rows_speak_against_the_sign_of_their_type(rows, refused) -> None:
+    columns = {"log_time_ns": TIMES["log_time_ns"][:rows], "v": VOLT[:rows], "i": -AMP[:rows]}
+    found = readings.read_power({"/b": ("my_msgs/msg/Battery", columns)}, [source(sign="drawn_positive")])
+    assert bool(found.rails) != refused
+
+
+@pytest.mark.parametrize(("period_s", "count", "known"), [(10.0, 3, True), (10.0, 2, False), (10.1, 3, False)])
+def test_three_messages_ten_seconds_apart_are_enough(period_s, count, known) -> None:
+    columns = {"log_time_ns": period_s * 1e9 * np.arange(count), "v": VOLT[:count], "i": AMP[:count]}
+    found = readings.read_power({"/b": ("my_msgs/msg/Battery", columns)}, [source(sign="drawn_positive")])
+    assert bool(found.rails) == known
+
+
+def test_values_at_the_bounds_of_what_is_usual_are_kept() -> None:
+    volt, amp = np.full(N, 20.0), AMP.copy()
+    volt[[0, 1, 2, 3]], amp[[5, 6]] = [4.0, 60.0, 3.99, 60.1], [-1000.0, -1000.1]
+    topics = {"/b": ("my_msgs/msg/Battery", TIMES | {"v": volt, "i": amp})}
+    (rail,) = readings.read_power(topics, [source(sign="auto")], current_sign="drawn_positive").rails["/b"]
+    assert np.flatnonzero(np.isnan(rail.voltage_volt)).tolist() == [2, 3]
+    assert np.flatnonzero(np.isnan(rail.current_amp)).tolist() == [6]
+
+
+def test_a_row_stands_for_the_time_around_it_and_beside_a_hole_for_three_periods_at_most() -> None:
+    found = readings._weight_s(np.array([0.0, 1.0, 2.0, 3.0, 13.0, 14.0, 15.0]))
+    assert found.tolist() == [1.0, 1.0, 1.0, 3.0, 3.0, 1.0, 1.0]
+    assert readings._weight_s(np.array([5.0])).tolist() == [1.0]
