@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
-from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory, no_rejections
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rotation_vector_from_quat, rpy_from_matrix
 from tcpipe.tables.findings import StretchFacts
 
@@ -173,7 +173,7 @@ def true_track(truth):
         position_std_m=np.full((rows.size, 3), 0.01),
         yaw_std_rad=np.full(rows.size, 0.005),
         forward_velocity_std_mps=np.full(rows.size, 0.01),
-        rejections=no_rejections(),
+        rejections=Rejections(np.empty(0, np.int64), *np.empty((2, 0), np.str_), *np.empty((2, 0))),
         displacement_std_m=np.full((rows.size, 1), 0.01) * DISPLACEMENT_LAGS_S,
         facts=StretchFacts({}, {}, {}, 0),
     )

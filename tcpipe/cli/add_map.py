@@ -81,7 +81,7 @@ def add_map(
     A raster is a GeoTIFF, JPEG 2000, ERDAS Imagine or VRT. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
     repeating the option; where tiles overlap, the last lies on top.
     """
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import progress, say_result
     from tcpipe.pipeline.maps import add_map as run
 
     if strays:
@@ -104,10 +104,7 @@ def add_map(
             store=store,
             force=force,
         )
-    if as_json:
-        print_json(added)
-    else:
-        say_lines(added)
+    say_result(added, as_json=as_json)
 
 
 def _by_name(option: str, given: tuple[str, ...], hint: str) -> dict[str, str]:

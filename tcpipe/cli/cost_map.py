@@ -56,7 +56,7 @@ def cost_map(
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
     maps for Nav2. An interrupted call goes on where it was.
     """
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.models import load_model
     from tcpipe.planning.cost_map import make_cost_map
     from tcpipe.planning.inputs import chosen_map
@@ -65,7 +65,4 @@ def cost_map(
         source = chosen_map(store, map_name)
         found = load_model(model)
         result = make_cost_map(found, source, Path(out), step_m=step_m, origin_deg=origin_deg, step=shown.count)
-    if as_json:
-        print_json(result)
-    else:
-        say_lines(result)
+    say_result(result, as_json=as_json)

@@ -22,13 +22,10 @@ from tcpipe.cli.options import INPUT_DIRECTORY, json_option, quiet_option, store
 @quiet_option
 def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: bool) -> int:
     """Trace SAMPLE_ID to its log, stamps, messages, gates nearby, map tiles and recipe, and make it again: exit code 1 if it differs."""
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import progress, say_result
     from tcpipe.pipeline.explain import explain as run
 
     with progress("explain", 1, quiet=quiet):
         found = run(sample_id, dataset=dataset, store=store)
-    if as_json:
-        print_json(found)
-    else:
-        say_lines(found)
+    say_result(found, as_json=as_json)
     return 1 if found.differences else 0

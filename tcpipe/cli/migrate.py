@@ -17,12 +17,9 @@ def migrate(path: str, *, as_json: bool) -> int:
 
     What is of this data model is left alone. A call that was killed is gone on with by calling it again.
     """
-    from tcpipe.cli.output import print_json, say_lines
+    from tcpipe.cli.output import say_result
     from tcpipe.pipeline.migrate import migrate as run
 
     found = run(Path(path))
-    if as_json:
-        print_json(found)
-    else:
-        say_lines(found)
+    say_result(found, as_json=as_json)
     return found.exit_code

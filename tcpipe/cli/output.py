@@ -127,6 +127,14 @@ def say_lines(result: object) -> None:
         say(line)
 
 
+def say_result(result: object, *, as_json: bool) -> None:
+    """Print a result on stdout: one JSON object, or the lines that it tells itself in."""
+    if as_json:
+        print_json(result)
+    else:
+        say_lines(result)
+
+
 def print_json(value: Any) -> None:
     """Print one JSON object on stdout, what no terminal should see as escapes of JSON."""
     from tcpipe.formats.json_files import to_json

@@ -67,7 +67,7 @@ def plan_path(
 
     Exit code 3: some of the path has no cost, because --step is large.
     """
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.models import load_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.plan_files import PlanRequest, plan
@@ -77,8 +77,5 @@ def plan_path(
         source = chosen_map(store, map_name)
         drawn = Path(picture) if picture else None
         result = plan(load_model(model), source, request, out=Path(out), picture=drawn, step=shown.count)
-    if as_json:
-        print_json(result)
-    else:
-        say_lines(result)
+    say_result(result, as_json=as_json)
     return result.exit_code

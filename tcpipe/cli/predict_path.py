@@ -40,7 +40,7 @@ def predict_path(
     Pieces on ground where MODEL has no business (a class, slope or relief not seen in training, off the map, no data, not
     traversable) are marked and counted. Exit code 3: some pieces have no cost.
     """
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.models import load_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.path_files import predict_path as run
@@ -48,8 +48,5 @@ def predict_path(
     with progress("predict-path", 1, quiet=quiet):
         source = chosen_map(store, map_name)
         result = run(load_model(model), source, Path(path_file), Path(out) if out else None)
-    if as_json:
-        print_json(result)
-    else:
-        say_lines(result)
+    say_result(result, as_json=as_json)
     return result.exit_code

@@ -24,12 +24,9 @@ def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, as_json: bo
     Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
     paper is the pattern, not the figures. Writes reproduction.html, reproduction.json and everything behind them to DIR.
     """
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.reproduction import reproduce as run
 
     with progress("reproduce", 1, quiet=quiet):
         result = run(directory, quick=quick, seeds=seeds, jobs=jobs)
-    if as_json:
-        print_json(result)
-    else:
-        say_lines(result)
+    say_result(result, as_json=as_json)

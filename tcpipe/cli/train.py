@@ -49,13 +49,10 @@ def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **
 
     Needs the extra: pip install 'tcpipe[train]'. Runs on a GPU when there is one. A training that was stopped goes on where it was.
     """
-    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.fitting import FitConfig
     from tcpipe.learning.training import train as run
 
     with progress("train", 1, quiet=quiet):
         result = run(dataset, out, config=FitConfig(**options), fresh=fresh)
-    if as_json:
-        print_json(result)
-    else:
-        say_lines(result)
+    say_result(result, as_json=as_json)

@@ -6,10 +6,9 @@ with everything kept, and smoothed. The second pass repeats the arithmetic of th
 Gates recover. A sensor that has been refused many times in a row and for a long time (GNSS 15 s, 5 s without visual odometry or IMU;
 odometry 5 s, 0.3 s where nothing else tells velocity) is taken to be right and the filter wrong: the covariance is lifted by the
 innovation before that update, which the smoother sees as process noise. Until then a multipath jump or a slipping wheel costs nothing but
-listed refusals. Where more than a tenth of all fixes is refused, the receiver's variance is not what they scatter by (a wrong claim, or
-a clock that is off): it is raised by 16 or 256 if that lets them in again, and the facts say so. Where fixes scatter far less than they
-claim, the rest of their error lasts (satellite-based corrections wander by a metre in minutes): it is no noise that averages out. It is
-added to every position's variance and, where it is larger than what odometry drifts by, such fixes count once in half a minute.
+listed refusals. Where fixes scatter far less than they claim, the rest of their error lasts (satellite-based corrections wander by a
+metre in minutes): it is no noise that averages out. It is added to every position's variance and, where it is larger than what odometry
+drifts by, such fixes count once in half a minute.
 
 `error_state_pass` runs the kernels over a stretch, `error_state_results` says what they found. The kernels: `state_kernel` (state, errors
 and sigma points), `prediction_kernel`, `update_kernel`, `error_state_kernel` (events and gates) and `smoother_kernel`.
@@ -49,7 +48,6 @@ def run_error_state(
     output_ns: NDArray[np.int64],
     gate_probability: float = 0.999,
     smooth: bool = True,
-    covariances: bool = False,
 ) -> Trajectory:
     """Filter and smooth one stretch.
 
@@ -60,7 +58,6 @@ def run_error_state(
     output_ns : [ns], shape (N,), increasing: the wanted stamps.
     gate_probability : a measurement less likely than 1 minus this is refused.
     smooth : False gives the forward filter.
-    covariances : keep the covariance of every state as well.
 
     Returns
     -------
@@ -80,7 +77,7 @@ def run_error_state(
     for _ in range(_PASSES):
         heard = _counted(measurements, errors, doubted=doubted)
         timeline = build_timeline(heard, standing, output_ns)
-        run = FilterPass(timeline, heard, gate_probability, lags=lags_of(output_ns), covariances=covariances)
+        run = FilterPass(timeline, heard, gate_probability, lags=lags_of(output_ns))
         if doubted:
             run.doubt_fixes(errors, suspects)
         outputs = run.filtered(initial, keep=smooth)

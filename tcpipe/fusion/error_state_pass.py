@@ -23,8 +23,6 @@ from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.geometry.rotation import matrix_from_quat
 from tcpipe.tables.findings import Reopening
 
-WIDTH = kernel.SAVED
-"""Numbers in a row of outputs, as `state_kernel.saved` fills it; 81 more with covariances."""
 _BLOCK = 2048
 _KEPT_BLOCKS = 12
 """Blocks whose forward pass is kept at once: about 2.2 kB an event, 55 MB."""
@@ -73,7 +71,6 @@ class FilterPass:
     timeline, measurements : the events, and what they are made of.
     gate_probability : a measurement less likely than 1 minus this is refused.
     lags : [rows of the wanted stamps], over which displacements are judged, see `lags_of`.
-    covariances : keep the covariance of every wanted state as well.
     """
 
     def __init__(
@@ -83,11 +80,8 @@ class FilterPass:
         gate_probability: float,
         *,
         lags: Sequence[int],
-        covariances: bool = False,
     ) -> None:
         self.lags = lags
-        self.covariances = covariances
-        self._width = WIDTH + 81 if covariances else WIDTH
         self.timeline = timeline
         self.lasting_m2 = np.zeros((1, 3))
         count = timeline.stamp_ns.size
@@ -181,7 +175,7 @@ class FilterPass:
     def filtered(self, initial: InitialState, *, keep: bool = False) -> NDArray[np.float64]:
         """Forward states at the wanted stamps, rows as `state_kernel.saved` fills them; ``keep`` what `smooth` wants."""
         count = self.timeline.stamp_ns.size
-        outputs = np.full((self.timeline.output.max() + 1, self._width), np.nan)
+        outputs = np.full((self.timeline.output.max() + 1, kernel.SAVED), np.nan)
         blocks = self._blocks()
         memory = _start(initial, self.scale_stds, self.turn_scale_std, self.start_error_m2)
         self._checkpoints, self._kept = [], {}

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_of
-from tcpipe.fusion.error_state_pass import DOF, GROWS_NS, ROLES, WIDTH, FilterPass, lags_of
+from tcpipe.fusion.error_state_pass import DOF, GROWS_NS, ROLES, FilterPass, lags_of
 from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
@@ -30,9 +30,6 @@ def trajectory_of(
     outputs[:, 23:26] += run.lasting_m2
     if run.unplaced:
         outputs[:, 23:26] += (scale_std * (outputs[:, 18:21] - outputs[0, 18:21])) ** 2
-    if run.covariances:
-        for axis in range(3):
-            outputs[:, WIDTH + 10 * (6 + axis)] += run.lasting_m2[:, axis]
     if run.unseen_yaw_std:
         _doubt_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
     bias = outputs[:, 9:12] * (timeline.output_rate_radps if run.turn_scale_std else timeline.output_has_gyro[:, None])
@@ -51,7 +48,6 @@ def trajectory_of(
             scale_std * speed_mps[:, None] * DISPLACEMENT_LAGS_S,
         ),
         facts=_facts(timeline, run),
-        covariance=outputs[:, WIDTH:].reshape(-1, 9, 9) if run.covariances else None,
     )
 
 
@@ -90,12 +86,6 @@ def _doubt_yaw(
     outputs[:, 23:26] += np.column_stack((aside2, aside2, above2))
     outputs[:, 26] += yaw_std**2
     outputs[:, 27] += 1.5 * np.sum(velocity**2, axis=1)
-    if outputs.shape[1] > WIDTH:
-        up = rotation[:, 2, :]  # the vertical, in base_link's axes
-        covariance = outputs[:, WIDTH:].reshape(-1, 9, 9)
-        covariance[:, :3, :3] += yaw_std**2 * up[:, :, None] * up[:, None, :]
-        for row, doubt in ((6, aside2), (7, aside2), (8, above2)):
-            covariance[:, row, row] += doubt
 
 
 def _displacement_std_m(run: FilterPass, output_ns: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -163,10 +163,7 @@ def factor(P: Matrix, U: Matrix, tally: Vector) -> None:
 
 @kernel
 def saved(x: Vector, P: Matrix, out: Vector) -> None:
-    """State, then variances of p (3), yaw and forward velocity, then of s_w and s_v, then the fixes' error, shape (33,).
-
-    Where ``out`` is longer by 81, the covariance of (th, v, p) follows.
-    """
+    """State, then variances of p (3), yaw and forward velocity, then of s_w and s_v, then the fixes' error, shape (33,)."""
     for i in range(NX):
         out[i] = x[i]
     for i in range(3):
@@ -190,10 +187,6 @@ def saved(x: Vector, P: Matrix, out: Vector) -> None:
     out[29] = P[16, 16]
     for i in range(3):
         out[30 + i] = x[NX + i] if x.size > NX else 0.0
-    if out.size == SAVED + 81:
-        for i in range(9):
-            for j in range(9):
-                out[SAVED + 9 * i + j] = P[i if i < 3 else i + 6, j if j < 3 else j + 6]
 
 
 @kernel

@@ -59,8 +59,6 @@ class Trajectory:
         its direction, the correlation of both ends counted exactly; NaN where no row stands there, and throughout in a forward filter,
         which does not know it. In between the variance may be interpolated in time, from zero at no time.
     facts : what the filter counted and settled on.
-    covariance : shape (N, 9, 9), of the error (rotation vector in base_link axes [rad], velocity [m/s] and position [m] in ENU); None
-        where it was not asked for.
     """
 
     stamp_ns: NDArray[np.int64]
@@ -74,10 +72,3 @@ class Trajectory:
     rejections: Rejections
     displacement_std_m: NDArray[np.float64]
     facts: StretchFacts
-    covariance: NDArray[np.float64] | None = None
-
-
-def no_rejections() -> Rejections:
-    """Return an empty table of rejections."""
-    text = np.empty(0, np.str_)
-    return Rejections(np.empty(0, np.int64), text, text, np.empty(0), np.empty(0))
