@@ -43,6 +43,7 @@ class Gaps:
 def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig) -> Gaps:
     """Return the rows that bear no segment, by cause: no power in a run that has power, a moving row whose next chord is uncertain, a jump.
 
+    An error of scale that all of a run has in common makes no segment worse than the next: it is left out of a chord's own uncertainty.
     Where its sensors contradict each other in most of the way undecided, they are all rows of the run.
     """
     power = floats(track.table, "power_watt")
@@ -75,16 +76,36 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
 def _chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:
     table = track.table
     course = np.arctan2(floats(table, "north_velocity_mps"), floats(table, "east_velocity_mps"))
+    common_mps = _common_std_mps(track)
+    told_m = np.column_stack([floats(table, name) for name in _DISPLACEMENTS])
     return chord_ahead_std_m(
         rows,
-        velocity_std_mps=floats(table, "forward_velocity_std_mps"),
+        velocity_std_mps=_without(floats(table, "forward_velocity_std_mps"), common_mps),
         position_std_m=along_std_m(floats(table, "x_std_m"), floats(table, "y_std_m"), course),
         chord_m=chord_m,
         slowest_mps=config.turning_velocity_mps,
         smoothed=track.info.estimator == "smoother",
         told_s=DISPLACEMENT_LAGS_S,
-        told_std_m=np.column_stack([floats(table, name) for name in _DISPLACEMENTS]),
+        told_std_m=_without(told_m, common_mps[:, None] * DISPLACEMENT_LAGS_S),
     )
+
+
+def _common_std_mps(track: Track) -> Floats:
+    """Return the part of each row's velocity deviation that its whole stretch has in common, since nothing tells how long a metre is."""
+    table = track.table
+    stamp_ns, epoch = integers(table, "stamp_ns"), integers(table, "epoch")
+    speed_mps = np.linalg.norm([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
+    scale_std = np.zeros(len(speed_mps))
+    fuse = track.info.findings.facts.fuse
+    for stretch in fuse.stretches if fuse else ():
+        inside = (epoch == stretch.epoch) & (stamp_ns >= stretch.start_ns) & (stamp_ns <= stretch.end_ns)
+        scale_std[inside] = stretch.common_scale_std or 0.0
+    return scale_std * speed_mps
+
+
+def _without(std: Floats, part: Floats) -> Floats:
+    """Return a deviation less a part of it; NaN where it is not known."""
+    return np.sqrt(np.maximum(std**2 - part**2, 0.0))
 
 
 def _unexplained_m(track: Track, rows: MotionRows) -> Floats:
