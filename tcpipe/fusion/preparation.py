@@ -14,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Positions
+from tcpipe.fusion.pose_increments import along_pose_axes, has_twist, in_child_axes, increments
 from tcpipe.fusion.signals import median_period_ns, white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
-from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate, rotation_vector_from_quat
+from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate
 
 Columns = Mapping[str, NDArray[np.float64]]
 """Columns of a stream by name, null as NaN."""
@@ -27,13 +28,16 @@ _VELOCITY_FLOOR_MPS = 0.02
 _YAW_RATE_STD_RADPS = 0.1
 _YAW_RATE_FLOOR_RADPS = 0.02
 _MAX_VELOCITY_MPS = 50.0
-_MAX_INCREMENT_S = 1.0
 _MAX_RATE_RADPS = 100.0
 _MAX_FORCE_MPS2 = 1000.0
 _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _DATUM_FIXES = 10
 _NOISE_WINDOW_S = 2.0
 _TURNS_INTO = 0.1
+_POSE_AXES = (
+    "its twist is along the axes of its pose's frame, not of the robot as nav_msgs/Odometry asks: it is turned by its own pose (mend it "
+    "in the driver)"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,7 +103,8 @@ def body_velocities(
     """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry).
 
     Its twist is taken where it has one. A twist that is empty, or zero throughout while the poses move, is none: the velocity is then
-    that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two.
+    that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is surely
+    along the axes of the pose's frame is turned by the pose.
 
     Parameters
     ----------
@@ -113,14 +118,17 @@ def body_velocities(
     rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     variance = _matrix(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
     remarks: tuple[str, ...] = ()
-    if not _has_twist(velocity, pose):
-        quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
-        stamp_ns, velocity, rate = _increments(stamp_ns, pose, quat)
+    quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
+    if not has_twist(velocity, pose):
+        stamp_ns, velocity, rate = increments(stamp_ns, pose, quat)
         variance = np.full_like(velocity, np.nan)
         yaw_rate_var = np.full(stamp_ns.size, np.nan)
         remarks = ("no twist: pose increments are used",)
     else:
         yaw_rate_var = columns["yaw_rate_var"]
+        if along_pose_axes(stamp_ns, velocity, pose, quat):
+            velocity = in_child_axes(velocity, quat)
+            remarks = (_POSE_AXES,)
     rotation = matrix_from_quat(quat_xyzw)
     turned = _turned(rotation, velocity)
     measured = np.isfinite(turned[:, 0]) & ~(np.abs(turned) >= _MAX_VELOCITY_MPS).any(1)
@@ -248,38 +256,6 @@ def _variances(
     known = np.isfinite(variance) & (variance > 0)
     filled = np.clip(np.where(known, variance, default), floor, _NO_TRUST)
     return filled, int((~known).any(1).sum())
-
-
-def _has_twist(velocity_mps: NDArray[np.float64], pose_m: NDArray[np.float64]) -> bool:
-    """Whether the velocities are measurements: finite somewhere, and not zero throughout while the poses move."""
-    known = np.isfinite(velocity_mps).any(1)
-    if not known.any():
-        return False
-    posed = pose_m[np.isfinite(pose_m).all(1)]
-    moves = posed.size > 0 and float(np.ptp(posed, axis=0).max()) > 0.1
-    return bool(np.nansum(np.abs(velocity_mps[known])) > 0) or not moves
-
-
-def _increments(
-    stamp_ns: NDArray[np.int64], pose_m: NDArray[np.float64], quat_xyzw: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Velocity and angular velocity in the child frame, in the middle of each two successive poses."""
-    posed = np.flatnonzero(np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
-    _, first = np.unique(stamp_ns[posed], return_index=True)
-    stamp, position, quat = stamp_ns[posed][first], pose_m[posed][first], quat_xyzw[posed][first]
-    step_ns = np.diff(stamp)
-    step_s = np.asarray(step_ns, np.float64)[:, None] * 1e-9
-    turn = rotation_vector_from_quat(product(inverse(quat[:-1]), quat[1:]))
-    half_way = _half_way(quat[:-1], quat[1:])
-    velocity = rotate(inverse(half_way), np.diff(position, axis=0)) / step_s
-    near = step_s[:, 0] <= _MAX_INCREMENT_S
-    return stamp[:-1][near] + step_ns[near] // 2, velocity[near], (turn / step_s)[near]
-
-
-def _half_way(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation half-way between two: the normalised sum of the quaternions of one hemisphere."""
-    sign = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0, -1.0, 1.0)
-    return normalized(a + sign * b)
 
 
 __all__ = ["Columns", "Prepared", "body_velocities", "find_datum", "inertial", "positions"]

@@ -1,0 +1,117 @@
+"""How many times as far as the track an odometry goes: a scale that is off throughout is calibration, one that comes and goes is slip.
+
+The scale is told by windows of five seconds in which the robot drives, wherever something else tells how long a metre is: the fixes, or
+for wheels a camera. It is surely wrong where its median is further from 1 than twice what is known of such odometries beforehand, and
+most windows say so alike. Where nothing else tells it, a command still does: no robot drives faster than it is told to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
+from tcpipe.fusion.signals import hold_last, in_gap, interval_means, median_period_ns, seconds
+from tcpipe.fusion.trajectory import Trajectory
+from tcpipe.geometry.rotation import matrix_from_quat
+
+Floats = NDArray[np.float64]
+
+_WINDOW_NS = 5_000_000_000
+_MAX_GAP_NS = 500_000_000
+_MOVES_M = 1.5
+_FEWEST_WINDOWS = 8
+_SURELY = 2.0
+_ALIKE = 0.25
+_HELD_NS = 3_000_000_000
+_DRIVES_MPS = 0.3
+_FASTER = 1.03
+_SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
+
+
+@dataclass(frozen=True, slots=True)
+class Scale:
+    """How many times as far as the track an odometry goes, and its standard deviation by how windows scatter."""
+
+    factor: float
+    std: float
+
+
+def way_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
+    """Return by odometry how many times as far as the track it goes in each window that tells, where something else tells the scale."""
+    measures = (m.gnss is not None) + (m.visual is not None)
+    told = {WHEELS: measures > 0, VISUAL: m.gnss is not None}
+    return {role: _ratios(found, source) for role, source in m.odometries().items() if told[role]}
+
+
+def _ratios(found: Trajectory, source: BodyVelocities) -> Floats:
+    begin_ns = np.arange(found.stamp_ns[0], found.stamp_ns[-1] - _WINDOW_NS, _WINDOW_NS, dtype=np.int64)
+    end_ns = begin_ns + _WINDOW_NS
+    longest_ns = max(_MAX_GAP_NS, 3 * median_period_ns(source.stamp_ns))
+    whole = ~in_gap(source.stamp_ns, begin_ns, end_ns, longest_ns=longest_ns)
+    whole &= ~in_gap(found.stamp_ns, begin_ns, end_ns, longest_ns=_MAX_GAP_NS)
+    begin_ns, end_ns = begin_ns[whole], end_ns[whole]
+    point = found.velocity_enu_mps + np.einsum(
+        "kij,kj->ki", rotation := matrix_from_quat(found.quat_xyzw), np.cross(found.angular_velocity_radps, source.lever_arm_m)
+    )
+    forward = np.einsum("ki,ki->k", rotation[:, :, 0], point)
+    zero = int(found.stamp_ns[0])
+
+    def ways_m(stamp_ns: NDArray[np.int64], speed_mps: Floats) -> Floats:
+        means = interval_means(
+            seconds(stamp_ns, zero), speed_mps[:, None], seconds(begin_ns, zero), seconds(end_ns, zero)
+        )
+        return np.asarray(means[:, 0] * _WINDOW_NS * 1e-9)
+
+    said, track = ways_m(source.stamp_ns, source.velocity_mps[:, 0]), ways_m(found.stamp_ns, forward)
+    far = np.abs(track) > _MOVES_M
+    return said[far] / track[far]
+
+
+def solve_scales(told: Sequence[Mapping[str, Floats]]) -> Mapping[str, Scale]:
+    """Return by odometry the scale that it surely has in all of a run, told by each stretch; those that are as usual are left out."""
+    found = {}
+    for role in dict.fromkeys(role for each in told for role in each):
+        ratios = np.concatenate([each[role] for each in told if role in each])
+        if ratios.size < _FEWEST_WINDOWS:
+            continue
+        factor = float(np.median(ratios))
+        spread = 1.4826 * float(np.median(np.abs(ratios - factor)))
+        off = abs(factor - 1.0)
+        if factor > 0.0 and off > _SURELY * _SCALE_STD[role] and spread < _ALIKE * off:
+            found[role] = Scale(factor, spread / float(np.sqrt(ratios.size)))
+    return found
+
+
+def rescaled(source: BodyVelocities, factor: float) -> BodyVelocities:
+    """Return an odometry that goes ``factor`` times too far with its velocities, and their variances, as they should be."""
+    return replace(
+        source, velocity_mps=source.velocity_mps / factor, variance_m2ps2=source.variance_m2ps2 / factor**2
+    )
+
+
+def over_command(wheels: BodyVelocities, command_ns: NDArray[np.int64], commanded_mps: Floats) -> float | None:
+    """Return how many times as fast as it is told to a robot goes by its wheels, where that is surely too fast; None where it is not.
+
+    Only times count in which a command has stood for three seconds: a robot that brakes is faster than its command.
+
+    Parameters
+    ----------
+    command_ns, commanded_mps : stamps [ns] and forward velocities [m/s], shape (N,), in order of time.
+    """
+    if command_ns.size == 0:
+        return None
+    told = hold_last(command_ns, commanded_mps, wheels.stamp_ns)
+    changed = np.flatnonzero(np.abs(np.diff(told)) > 0.0) + 1
+    last = np.searchsorted(changed, np.arange(told.size), "right") - 1
+    since_ns = wheels.stamp_ns - wheels.stamp_ns[changed[np.maximum(last, 0)] if changed.size else np.zeros_like(last)]
+    since_ns = np.where(last >= 0, since_ns, wheels.stamp_ns - wheels.stamp_ns[0])
+    rows = (since_ns > _HELD_NS) & (np.abs(told) > _DRIVES_MPS) & np.isfinite(told)
+    if rows.sum() * median_period_ns(wheels.stamp_ns) < _FEWEST_WINDOWS * _WINDOW_NS:
+        return None
+    ratio = wheels.velocity_mps[rows, 0] / told[rows]
+    return float(np.median(ratio)) if np.quantile(ratio, 0.25) > _FASTER else None
