@@ -78,9 +78,7 @@ def _unlike(said: Floats, way: Floats, moving: NDArray[np.bool_]) -> float:
     return float(np.median(np.sum((said[moving] - scale * way[moving]) ** 2, axis=1) / (scale * size) ** 2))
 
 
-def _posed(
-    stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats
-) -> tuple[NDArray[np.int64], Floats, Floats]:
+def _posed(stamp_ns: NDArray[np.int64], pose_m: Floats, quat_xyzw: Floats) -> tuple[NDArray[np.int64], Floats, Floats]:
     """Return the rows with a pose, in order of time, one a stamp."""
     posed = np.flatnonzero(np.isfinite(pose_m).all(1) & np.isfinite(quat_xyzw).all(1))
     _, first = np.unique(stamp_ns[posed], return_index=True)

@@ -38,6 +38,8 @@ Radians = Annotated[float, Ge(-6.3), Le(6.3)]
 """An angle: one turn either way; more is mostly degrees."""
 Offset = Annotated[float, Ge(-2e9), Le(2e9)]
 """Between two clocks [s]: from one that counts from its start to UTC, or back."""
+Scale = Annotated[float, Ge(0.01), Le(100)]
+"""Of a measurement, to be multiplied with; further off are other units."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +77,8 @@ class ReadConfig:
     """Which stamp rules, by role; auto takes header.stamp when it is set and follows the log time."""
     time_offset_s: dict[Role, Offset] = field(default_factory=dict)
     """Added to the stamps of a role [s]."""
+    odometry_scale: dict[Role, Scale] = field(default_factory=dict)
+    """What the velocities and the ways of an odometry are multiplied with (wheels of another radius, a camera of another baseline)."""
     imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
     """Units of the IMU: si is rad/s and m/s² as REP-103 asks; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""
     current_sign: Literal["auto", "drawn_positive", "drawn_negative"] = "auto"

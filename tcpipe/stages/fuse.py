@@ -49,7 +49,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     clocks = clock_findings(streams, inputs)
     table = with_offset_cost(table, clocks.facts)
-    mounting, audit = mounting_findings(inputs, streams), audit_findings(fused)
+    mounting, audit = mounting_findings(inputs, streams), audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)
     warnings = (*fuse_warnings(inputs, summary), *(line for each in found for line in each.warnings))
     facts = replace(

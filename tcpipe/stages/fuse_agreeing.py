@@ -1,10 +1,14 @@
-"""The sensors that agree: one that the others contradict in most of the way is left out, and the run fused without it."""
+"""The sensors that agree: one that is contradicted in most of the way, or without which the others agree, is left out.
+
+The sensor that stands alone is not always the wrong one: an IMU whose bias has jumped leads the track away from the fixes, and the
+odometries with it. So before any is left out each is, for a trial.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tcpipe.fusion.checks.audit import alone_in_most, consistent, undecided_in_most
+from tcpipe.fusion.checks.audit import alone_in_most, confirmations, consistent, undecided_in_most
 from tcpipe.fusion.checks.sensors import Refusal
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
@@ -22,13 +26,20 @@ Judged = tuple[FusionInputs, Findings[SensorChecks]]
 def fuse_agreeing(
     inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams, config: FuseConfig
 ) -> tuple[FusionInputs, Findings[SensorChecks], Fused]:
-    """Fuse each stretch; where a sensor is alone against the others in most of the way, again without it."""
-    inputs, fused = fuse_mounted(inputs, streams, config)
-    lone = alone_in_most(fused.tallies) or _at_fault(inputs, sanity, fused, streams, config)
-    if lone:
-        inputs, sanity = _without(lone, inputs, sanity, streams)
-        inputs, fused = fuse_mounted(inputs, streams, config)
-    return inputs, sanity, fused
+    """Fuse each stretch; where sensors contradict each other in most of the way, again without the one that is at fault.
+
+    What a track that they led showed of mountings and scales is forgotten then.
+    """
+    found, fused = fuse_mounted(inputs, streams, config)
+    lone = alone_in_most(fused.tallies)
+    if not lone and not undecided_in_most(fused.tallies):
+        return found, sanity, fused
+    lone = _at_fault(inputs, sanity, streams, config) or lone
+    if not lone:
+        return found, sanity, fused
+    inputs, sanity = _without(lone, inputs, sanity, streams)
+    found, fused = fuse_mounted(inputs, streams, config)
+    return found, sanity, fused
 
 
 def _without(roles: Sequence[str], inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams) -> Judged:
@@ -36,20 +47,21 @@ def _without(roles: Sequence[str], inputs: FusionInputs, sanity: Findings[Sensor
 
 
 def _at_fault(
-    inputs: FusionInputs, sanity: Findings[SensorChecks], fused: Fused, streams: Streams, config: FuseConfig
+    inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams, config: FuseConfig
 ) -> tuple[str, ...]:
-    """Return the one sensor without which the others agree, where they contradict each other undecided; nothing where several would do.
+    """Return the one sensor without which the others agree; of several that whose others confirm each other most, none of two equals.
 
     Of two sensors either would do: nobody can tell.
     """
     roles = sorted({role for m in inputs.measurements.values() for role in m.sensors()})
-    if len(roles) <= 2 or not undecided_in_most(fused.tallies):
+    if len(roles) <= 2:
         return ()
-    agreeing = []
+    agreeing: dict[str, int] = {}
     for role in roles:
         rest, _ = _without([role], inputs, sanity, streams)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
             tried = fuse_stretches(rest, streams, config)
             if tried.tallies and consistent(tried.tallies):
-                agreeing.append(role)
-    return (agreeing[0],) if len(agreeing) == 1 else ()
+                agreeing[role] = confirmations(tried.tallies)
+    best = [role for role, confirmed in agreeing.items() if confirmed == max(agreeing.values())]
+    return (best[0],) if len(best) == 1 else ()

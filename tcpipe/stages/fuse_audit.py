@@ -5,11 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tcpipe.fusion.checks.audit import undecided_in_most
+from tcpipe.fusion.checks.odometry_scale import over_command
+from tcpipe.fusion.measurements import WHEELS
+from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_sanity import command_of, longest_epoch
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.findings import AuditFacts, Disagreement, Findings
+from tcpipe.tables.levels import Streams
 
 
-def audit_findings(fused: Fused) -> Findings[AuditFacts]:
+def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> Findings[AuditFacts]:
     """Return every disagreement, the sensors that contradict each other in most of the way, and the warnings of both."""
     undecided = undecided_in_most(fused.tallies)
     found = fused.disagreements
@@ -22,7 +27,27 @@ def audit_findings(fused: Fused) -> Findings[AuditFacts]:
             f"{who}: in most of the way the track is not what this sensor says, and no third tells which is right: no segments; leave out "
             "the sensor that is wrong ([read] ignore_topics), or mend its scale, mounting or clock"
         )
-    return Findings(tuple(lines), AuditFacts(tuple(found), tuple(sorted({sensor for sensor, _ in undecided}))))
+    sensors = {sensor for sensor, _ in undecided}
+    faster = _over_command(inputs, streams)
+    if faster is not None:
+        sensors.add(WHEELS)
+        lines.append(
+            f"{WHEELS}: it goes {faster:.2f} times as fast as commanded, which no robot does, and no fix or camera tells how long a metre "
+            f"is: no segments; state its scale in the recipe, under [read]: odometry_scale = {{ {WHEELS} = {1 / faster:.2f} }} (or "
+            "less: ground slows a robot down), or leave out the command if it is not what drives ([read] ignore_topics)"
+        )
+    return Findings(tuple(lines), AuditFacts(tuple(found), tuple(sorted(sensors))))
+
+
+def _over_command(inputs: FusionInputs, streams: Streams) -> float | None:
+    """Return how many times as fast as commanded the wheels go, where that is too fast and nothing else tells how long a metre is."""
+    if not inputs.measurements:
+        return None
+    epoch = longest_epoch(inputs)
+    m, command = inputs.measurements[epoch], command_of(streams, epoch)
+    if m.wheels is None or m.gnss is not None or m.visual is not None or command is None:
+        return None
+    return over_command(m.wheels, command.stamp_ns, command.forward_velocity_mps)
 
 
 def _line(found: Sequence[Disagreement], first_ns: int) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import preparation
 from tcpipe.fusion.checks.mounting import Arm, Tilt
+from tcpipe.fusion.checks.odometry_scale import Scale
 from tcpipe.fusion.checks.stamp_jitter import steadied
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
@@ -36,6 +37,8 @@ class FusionInputs:
     """What is known of the antenna's arm where it was mended or nobody stated it."""
     imu_tilt: Tilt | None = None
     """Roll and pitch of the IMU's mounting that were taken out."""
+    scales: Mapping[str, Scale] = field(default_factory=dict)
+    """By odometry, the scale that was taken out."""
 
     def note(self, role: str, prepared: Prepared) -> None:
         """Remember what was set aside."""

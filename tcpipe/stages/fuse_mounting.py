@@ -1,14 +1,16 @@
-"""Mountings that nobody stated, or that the motion contradicts: mended by a first track."""
+"""Mountings that nobody stated, and mountings and scales that the motion contradicts: mended by a first track."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.mounting import ARM_STD_M, Arm, Tilt, levelled, rearmed, solve_arm, solve_tilt, unknown_arm
-from tcpipe.fusion.measurements import GNSS, Measurements
+from tcpipe.fusion.checks.odometry_scale import Scale, rescaled, solve_scales
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Measurements
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused, fuse_stretches
@@ -27,7 +29,7 @@ _ANTENNA = slice(0, 2)  # what the turns show: forward and left
 
 
 def fuse_mounted(inputs: FusionInputs, streams: Streams, config: FuseConfig) -> tuple[FusionInputs, Fused]:
-    """Fuse each stretch, and again as long as that shows an antenna or an IMU to be mounted otherwise than it was taken to be."""
+    """Fuse each stretch, and again as long as that shows an antenna or an IMU to be mounted, or an odometry to be scaled, otherwise."""
     fused = fuse_stretches(inputs, streams, config)
     for _ in range(_ROUNDS):
         mended = _mended(inputs, fused, streams)
@@ -42,12 +44,14 @@ def _mended(inputs: FusionInputs, fused: Fused, streams: Streams) -> FusionInput
     tilt = _tilted(inputs, fused)
     turn = np.zeros(2) if tilt is None else tilt.rad
     arm, move_m = _rearming(inputs, fused, streams, trusted=tilt is None)
-    if tilt is None and arm is None:
+    scales = solve_scales(fused.ratios)
+    if tilt is None and arm is None and not scales:
         return None
-    mended = {epoch: _remounted(m, turn, move_m) for epoch, m in inputs.measurements.items()}
+    mended = {epoch: _remounted(m, turn, move_m, scales) for epoch, m in inputs.measurements.items()}
     if tilt is not None and inputs.imu_tilt is not None:
         tilt = replace(tilt, rad=tilt.rad + inputs.imu_tilt.rad)
-    return replace(inputs, measurements=mended, arm=arm or inputs.arm, imu_tilt=tilt or inputs.imu_tilt)
+    arm, tilt = arm or inputs.arm, tilt or inputs.imu_tilt
+    return replace(inputs, measurements=mended, arm=arm, imu_tilt=tilt, scales={**inputs.scales, **scales})
 
 
 def _tilted(inputs: FusionInputs, fused: Fused) -> Tilt | None:
@@ -101,9 +105,16 @@ def moved_m(inputs: FusionInputs, streams: Streams) -> NDArray[np.float64]:
     return np.asarray(arms[0]) - np.asarray(streams.sensors[GNSS].xyz_m) if arms else np.zeros(3)
 
 
-def _remounted(m: Measurements, turn_rad: NDArray[np.float64], move_m: NDArray[np.float64]) -> Measurements:
+def _remounted(
+    m: Measurements, turn_rad: NDArray[np.float64], move_m: NDArray[np.float64], scales: Mapping[str, Scale]
+) -> Measurements:
+    def in_metres(role: str, source: BodyVelocities | None) -> BodyVelocities | None:
+        return source if source is None or role not in scales else rescaled(source, scales[role].factor)
+
     return replace(
         m,
         imu=None if m.imu is None else levelled(m.imu, turn_rad) if turn_rad.any() else m.imu,
         gnss=None if m.gnss is None else rearmed(m.gnss, move_m),
+        wheels=in_metres(WHEELS, m.wheels),
+        visual=in_metres(VISUAL, m.visual),
     )

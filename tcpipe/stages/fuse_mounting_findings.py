@@ -1,4 +1,4 @@
-"""What was mended of mountings, said with the recipe lines that would state it."""
+"""What was mended of mountings and scales, said with the recipe lines that would state it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.mounting import Arm, Tilt
+from tcpipe.fusion.checks.odometry_scale import Scale
 from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import FusionInputs
@@ -19,12 +20,22 @@ def mounting_findings(inputs: FusionInputs, streams: Streams) -> Findings[Mounti
     arm, tilt = inputs.arm, inputs.imu_tilt
     warnings = [] if arm is None else [_arm_warning(arm, streams.sensors[GNSS])]
     warnings += [] if tilt is None else [_tilt_warning(tilt, streams.sensors[IMU])]
+    given = streams.findings.facts.odometry_scale or {}
+    warnings += [_scale_warning(role, scale, given.get(role, 1.0)) for role, scale in inputs.scales.items()]
     if not warnings:
         return Findings((), None)
     std_m = None if arm is None else vector(np.sqrt(np.diag(arm.covariance)[:3]))
     moved = None if arm is None else vector(moved_m(inputs, streams))
     roll_pitch = None if tilt is None else (float(tilt.rad[0]), float(tilt.rad[1]))
-    return Findings(tuple(warnings), MountingFacts(moved, std_m, roll_pitch))
+    scales = {role: scale.factor for role, scale in inputs.scales.items()} or None
+    return Findings(tuple(warnings), MountingFacts(moved, std_m, roll_pitch, scales))
+
+
+def _scale_warning(role: str, scale: Scale, given: float) -> str:
+    return (
+        f"{role}: it goes {scale.factor:.3f} (± {scale.std:.3f}) times as far as the track, in all of the run: that is its scale, not "
+        f"slip, and is taken out; to state it, under [read]: odometry_scale = {{ {role} = {given / scale.factor:.4f} }}"
+    )
 
 
 def _arm_warning(arm: Arm, sensor: Sensor) -> str:

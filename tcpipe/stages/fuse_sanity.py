@@ -26,7 +26,7 @@ def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, F
     epoch = longest_epoch(inputs)
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
     checks = check_sensors(
-        inputs.measurements[epoch], command=_command(streams, epoch), stated=stated, felt=_felt(streams)
+        inputs.measurements[epoch], command=command_of(streams, epoch), stated=stated, felt=_felt(streams)
     )
     return left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
 
@@ -63,7 +63,8 @@ def _rows(measurements: Measurements) -> int:
     return sum(sensor.stamp_ns.size for sensor in measurements.sensors().values())
 
 
-def _command(streams: Streams, epoch: int) -> CommandedSpeed | None:
+def command_of(streams: Streams, epoch: int) -> CommandedSpeed | None:
+    """Return the commanded speed of a clock epoch; None without."""
     if "command" not in streams.tables:
         return None
     table = rows_where(streams.tables["command"], "epoch", epoch)

@@ -18,6 +18,7 @@ from tcpipe.fusion.checks.mounting import (
     tilt_evidence,
     with_antenna_doubt,
 )
+from tcpipe.fusion.checks.odometry_scale import way_ratios
 from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import InitialState
@@ -43,6 +44,7 @@ class Fused:
     tallies: list[Tally] = field(default_factory=list)
     arms: list[ArmEvidence | None] = field(default_factory=list)
     tilts: list[TiltEvidence | None] = field(default_factory=list)
+    ratios: list[Mapping[str, NDArray[np.float64]]] = field(default_factory=list)
     skipped_s: float = 0.0
 
 
@@ -59,9 +61,10 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
         initial = _initial(stretch, fused.found[-1] if fused.found and inputs.datum_deg_m is None else None)
         # 2. Filter and smoother.
         trajectory = _estimate(stretch, initial, output_ns, config)
-        # 3. What it tells of how antenna and IMU are mounted, and what nobody knows of it.
+        # 3. What it tells of how antenna and IMU are mounted and odometries scaled, and what nobody knows of it.
         fused.arms.append(arm_evidence(trajectory, stretch.measurements))
         fused.tilts.append(tilt_evidence(trajectory, stretch.measurements))
+        fused.ratios.append(way_ratios(trajectory, stretch.measurements))
         trajectory = _doubted(trajectory, stretch, inputs)
         # 4. What came out is held against what went in.
         trajectory, audit = audited(trajectory, stretch.measurements)

@@ -100,7 +100,8 @@ def _common_std_mps(track: Track) -> Floats:
     for stretch in fuse.stretches if fuse else ():
         inside = (epoch == stretch.epoch) & (stamp_ns >= stretch.start_ns) & (stamp_ns <= stretch.end_ns)
         scale_std[inside] = stretch.common_scale_std or 0.0
-    return scale_std * speed_mps
+    common_mps: Floats = scale_std * speed_mps
+    return common_mps
 
 
 def _without(std: Floats, part: Floats) -> Floats:

@@ -63,7 +63,9 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
     findings = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
-    findings = replace(findings, warnings=(*findings.warnings, *unread, *unplaced))
+    scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
+    facts = replace(findings.facts, odometry_scale=scale)
+    findings = replace(findings, warnings=(*findings.warnings, *unread, *unplaced), facts=facts)
     if not any(role in streams for role in MOTION_ROLES):
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry and gnss have no usable row"
         raise RoleError(what, *findings.warnings)

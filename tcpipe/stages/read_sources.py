@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.logs.imu_units import imu_in_si
 from tcpipe.logs.messages import Readings, needed_fields, read_messages
+from tcpipe.logs.odometry_scale import scaled
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.readings import PowerReadings
@@ -74,6 +75,8 @@ def read_sources(
             readings = read_messages(columns, role, types[topic])
             if role == "imu":
                 readings = imu_in_si(readings, config.imu_units)
+            elif role in config.odometry_scale:
+                readings = scaled(readings, config.odometry_scale[role])
             sources.append(TopicReadings(topic, role, types[topic], columns, readings))
         elif topic in power.rails:
             sources.append(TopicReadings(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))

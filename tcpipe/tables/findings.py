@@ -186,11 +186,15 @@ class SensorChecks:
 
 @dataclass(frozen=True, slots=True)
 class MountingFacts:
-    """What was mended: by how much the antenna was moved in base_link, how well its place is known, roll and pitch of the IMU."""
+    """What was mended: by how much the antenna was moved in base_link, how well its place is known, roll and pitch of the IMU.
+
+    ``odometry_scale`` is by odometry how many times as far as the track it went, which is taken out.
+    """
 
     antenna_moved_m: Vector | None = field(default=None, metadata=LEFT_OUT)
     antenna_std_m: Vector | None = field(default=None, metadata=LEFT_OUT)
     imu_tilt_rad: tuple[float, float] | None = field(default=None, metadata=LEFT_OUT)
+    odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -374,6 +378,8 @@ class RunFacts:
     clock_steps: tuple[ClockStep, ...] = ()
     time_offset_s: Mapping[str, float] = field(default_factory=dict)
     """What the recipe adds to a role's stamps."""
+    odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
+    """What the recipe multiplies a role's ways and velocities with."""
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)

@@ -175,8 +175,14 @@ def undecided_in_most(tallies: Iterable[Tally]) -> tuple[tuple[str, What], ...]:
 
 
 def consistent(tallies: Iterable[Tally]) -> bool:
-    """Return whether nothing is contradicted undecided in more than a little of the way, positions included."""
-    return all(t.undecided <= _LITTLE * t.moving for t in _summed(tallies))
+    """Return whether nothing is contradicted in more than a little of the way, positions included."""
+    return all(t.undecided + t.alone <= _LITTLE * t.moving for t in _summed(tallies))
+
+
+def confirmations(tallies: Iterable[Tally]) -> int:
+    """Return how many sensors say a thing that another says as well: those that nothing else tells are held against themselves alone."""
+    told = [t.what for t in _summed(tallies) if _most(t.moving, t.moving) and t.what != "position"]
+    return len(told) - len(set(told))
 
 
 def _most(windows: int, moving: int) -> bool:

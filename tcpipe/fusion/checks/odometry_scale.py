@@ -28,6 +28,7 @@ _FEWEST_WINDOWS = 8
 _SURELY = 2.0
 _ALIKE = 0.25
 _HELD_NS = 3_000_000_000
+_STEP_MPS = 0.1
 _DRIVES_MPS = 0.3
 _FASTER = 1.03
 _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
@@ -56,7 +57,9 @@ def _ratios(found: Trajectory, source: BodyVelocities) -> Floats:
     whole &= ~in_gap(found.stamp_ns, begin_ns, end_ns, longest_ns=_MAX_GAP_NS)
     begin_ns, end_ns = begin_ns[whole], end_ns[whole]
     point = found.velocity_enu_mps + np.einsum(
-        "kij,kj->ki", rotation := matrix_from_quat(found.quat_xyzw), np.cross(found.angular_velocity_radps, source.lever_arm_m)
+        "kij,kj->ki",
+        rotation := matrix_from_quat(found.quat_xyzw),
+        np.cross(found.angular_velocity_radps, source.lever_arm_m),
     )
     forward = np.einsum("ki,ki->k", rotation[:, :, 0], point)
     zero = int(found.stamp_ns[0])
@@ -88,10 +91,9 @@ def solve_scales(told: Sequence[Mapping[str, Floats]]) -> Mapping[str, Scale]:
 
 
 def rescaled(source: BodyVelocities, factor: float) -> BodyVelocities:
-    """Return an odometry that goes ``factor`` times too far with its velocities, and their variances, as they should be."""
-    return replace(
-        source, velocity_mps=source.velocity_mps / factor, variance_m2ps2=source.variance_m2ps2 / factor**2
-    )
+    """Return an odometry that goes ``factor`` times too far with its velocities as they should be; its claim does not become better."""
+    variance = source.variance_m2ps2 * max(1.0, factor**-2.0)
+    return replace(source, velocity_mps=source.velocity_mps / factor, variance_m2ps2=variance)
 
 
 def over_command(wheels: BodyVelocities, command_ns: NDArray[np.int64], commanded_mps: Floats) -> float | None:
@@ -106,7 +108,7 @@ def over_command(wheels: BodyVelocities, command_ns: NDArray[np.int64], commande
     if command_ns.size == 0:
         return None
     told = hold_last(command_ns, commanded_mps, wheels.stamp_ns)
-    changed = np.flatnonzero(np.abs(np.diff(told)) > 0.0) + 1
+    changed = np.flatnonzero(np.abs(np.diff(told)) > _STEP_MPS) + 1
     last = np.searchsorted(changed, np.arange(told.size), "right") - 1
     since_ns = wheels.stamp_ns - wheels.stamp_ns[changed[np.maximum(last, 0)] if changed.size else np.zeros_like(last)]
     since_ns = np.where(last >= 0, since_ns, wheels.stamp_ns - wheels.stamp_ns[0])

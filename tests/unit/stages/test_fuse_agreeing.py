@@ -70,7 +70,7 @@ def test_one_that_is_alone_in_most_of_the_way_is_left_out(fusing):
     tried = fusing({frozenset(ROLES): contradicted(0, alone=15, sensor="gnss")})
     sensors, sanity = agreed(inputs())
     assert sensors == set(ROLES) - {"gnss"}
-    assert len(tried) == 2
+    assert len(tried) == 2 + len(ROLES)
     assert "/gnss is not fused: in most of the way the others contradict it" in sanity.warnings[0]
 
 
@@ -85,6 +85,23 @@ def test_where_either_of_two_would_do_nobody_can_tell_and_none_is_left_out(fusin
     fusing({frozenset(ROLES) - {role}: contradicted(1) for role in ("imu", "gnss")})
     sensors, sanity = agreed(inputs())
     assert (sensors, sanity.facts.refused) == (set(ROLES), {})
+
+
+def test_of_several_it_is_the_one_whose_others_confirm_each_other_though_another_stands_alone(fusing):
+    """An IMU that leads the track off the fixes: without the fixes nothing tells what wheels and IMU tell, so they agree."""
+    every = frozenset(ROLES) - {"visual_odometry"}
+    ways = [Tally(role, "displacement", 20, 0, 0) for role in ("gnss", "wheel_odometry")]
+    turns = [Tally("imu", "turn", 20, 0, 0)]
+    fusing(
+        {
+            every: contradicted(0, alone=15, sensor="gnss"),
+            every - {"imu"}: ways,
+            every - {"gnss"}: [ways[1], *turns],
+        }
+    )
+    sensors, sanity = agreed(inputs(visual=False))
+    assert sensors == {"gnss", "wheel_odometry"}
+    assert list(sanity.facts.refused) == ["imu"]
 
 
 def test_of_two_sensors_nobody_can_tell_and_nothing_is_tried(fusing):

@@ -1,15 +1,26 @@
 """What a person reads of the audit: one line for each sensor and thing, and why a run has no segments."""
 
+import tomllib
+
+import numpy as np
+import pytest
+
 from tcpipe.fusion.checks.audit import Tally
+from tcpipe.fusion.measurements import BodyVelocities, Measurements
 from tcpipe.stages.fuse_audit import audit_findings
+from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.tables.findings import Disagreement, StretchFacts
+from tcpipe.tables.levels import STREAMS, Streams
 
 SECOND_NS = 1_000_000_000
 
 
 def off(begin_s, end_s, size, *, sensor="gnss", what="position", alone=False):
     return Disagreement(begin_s * SECOND_NS, end_s * SECOND_NS, sensor, what, size, "m", 0.02, alone)
+
+
+NOBODY = FusionInputs(None), Streams({}, {}, "husky")
 
 
 def fused(*found, tallies=()):
@@ -19,13 +30,13 @@ def fused(*found, tallies=()):
 
 
 def test_nothing_is_said_where_nobody_disagrees():
-    told = audit_findings(fused())
+    told = audit_findings(fused(), *NOBODY)
     assert told.warnings == ()
     assert (told.facts.disagreements, told.facts.undecided) == ((), ())
 
 
 def test_a_line_holds_sensor_what_window_size_and_what_was_expected():
-    told = audit_findings(fused(off(110, 130, 0.2), off(160, 220, 0.49), off(150, 155, 9.0, alone=True)))
+    told = audit_findings(fused(off(110, 130, 0.2), off(160, 220, 0.49), off(150, 155, 9.0, alone=True)), *NOBODY)
     shared, lone = told.warnings
     assert shared == (
         "gnss: its position is off the track 2 times, 80 s in all; most from 60 to 120 s of the run by 0.49 m, "
@@ -38,9 +49,32 @@ def test_a_line_holds_sensor_what_window_size_and_what_was_expected():
 
 
 def test_a_run_that_no_third_decides_says_why_it_has_no_segments():
-    told = audit_findings(fused(tallies=[Tally("wheel_odometry", "displacement", 20, 15, 0)]))
+    told = audit_findings(fused(tallies=[Tally("wheel_odometry", "displacement", 20, 15, 0)]), *NOBODY)
     assert told.facts.undecided == ("wheel_odometry",)
     (line,) = told.warnings
     assert line.startswith("displacement by wheel_odometry: in most of the way the track is not what this sensor says")
     assert "no segments" in line
     assert "ignore_topics" in line
+
+
+def wheels_alone(speed_mps):
+    """Wheels of one speed that nothing else is held against, and a command of 1 m/s."""
+    stamp_ns = np.arange(0, 100 * SECOND_NS, SECOND_NS // 10, dtype=np.int64)
+    velocity = np.column_stack((np.full(stamp_ns.size, speed_mps), np.full((stamp_ns.size, 2), np.nan)))
+    nothing = np.full(stamp_ns.size, np.nan)
+    wheels = BodyVelocities(stamp_ns, velocity, velocity, nothing, nothing)
+    command = STREAMS["command"].table(
+        stamp_ns=stamp_ns, log_time_ns=stamp_ns, epoch=np.zeros(stamp_ns.size, np.int16),
+        forward_velocity_mps=np.ones(stamp_ns.size), yaw_rate_radps=np.zeros(stamp_ns.size),
+    )  # fmt: skip
+    return FusionInputs(None, {0: Measurements(wheels=wheels)}), Streams({"command": command}, {}, "husky")
+
+
+def test_wheels_faster_than_any_command_bear_no_segment_where_nothing_else_tells_how_long_a_metre_is():
+    assert audit_findings(fused(), *wheels_alone(0.9)).facts.undecided == ()
+    told = audit_findings(fused(), *wheels_alone(1.25))
+    assert told.facts.undecided == ("wheel_odometry",)
+    (line,) = told.warnings
+    assert "1.25 times as fast as commanded" in line
+    entry = tomllib.loads(line.split("under [read]: ")[1].split(" (or less")[0])
+    assert entry["odometry_scale"] == {"wheel_odometry": pytest.approx(0.8)}

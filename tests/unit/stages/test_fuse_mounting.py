@@ -1,13 +1,14 @@
 """When a mounting is mended, when it is left as somebody stated it, and the lines that a person can put into the recipe."""
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from tcpipe.fusion.checks.mounting import Arm, ArmEvidence, Tilt, TiltEvidence
-from tcpipe.fusion.measurements import InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.stages import fuse_mounting
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting_findings import mounting_findings
@@ -109,3 +110,18 @@ def test_both_are_said_where_both_were_mended():
     taken.arm, taken.imu_tilt = Arm(np.array([0.1, 0, 0, 0]), np.eye(4)), Tilt(np.array([0.05, 0.0]), np.zeros(2))
     told = mounting_findings(taken, streams("recipe"))
     assert [line.split(":")[0] for line in told.warnings] == ["gnss", "imu"]
+
+
+def test_a_scale_that_is_off_throughout_is_taken_out_and_the_recipe_line_states_it_beside_what_it_states_already():
+    stamp_ns = np.arange(5, dtype=np.int64)
+    wheels = BodyVelocities(stamp_ns, np.full((5, 3), 1.3), np.ones((5, 3)), np.zeros(5), np.ones(5))
+    log = streams("tf_static")
+    given = replace(log.findings, facts=replace(log.findings.facts, odometry_scale={"wheel_odometry": 0.5}))
+    evidence = Fused(ratios=[{"wheel_odometry": np.linspace(1.29, 1.31, 21)}])
+    found = fuse_mounting._mended(FusionInputs(None, {0: Measurements(wheels=wheels)}), evidence, log)
+    assert found.measurements[0].wheels.velocity_mps == pytest.approx(np.ones((5, 3)))
+    told = mounting_findings(found, replace(log, findings=given))
+    assert told.facts.odometry_scale == {"wheel_odometry": pytest.approx(1.3)}
+    (line,) = told.warnings
+    entry = tomllib.loads(line.rsplit("under [read]: ", 1)[1])["odometry_scale"]
+    assert entry == {"wheel_odometry": pytest.approx(0.5 / 1.3, rel=1e-3)}

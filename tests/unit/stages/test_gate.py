@@ -10,7 +10,7 @@ from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.gate import gate_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.findings import AuditFacts, Findings
+from tcpipe.tables.findings import AuditFacts, Findings, FuseFacts, StretchFacts
 
 T = np.arange(0, 60, 0.05)
 
@@ -124,6 +124,17 @@ def test_relative_not_absolute_position_error_makes_a_gap():
     unsure = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.12))
     assert rows_of(unsure, DropReason.GAP).all()
     assert "is not known to 0.1 m (gate.max_relative_position_std_m)" in unsure.info.findings.warnings[0]
+
+
+def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
+    track = straight_track(np.full(200, 0.9), std_m=2.0, velocity_std_mps=np.hypot(0.12 * 0.9, 0.005))
+    assert rows_of(gate(track), DropReason.GAP).all()
+    stamp_ns = track.table["stamp_ns"].to_numpy()
+    ends = {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1])}
+    stretch = StretchFacts({}, {}, {}, 0, common_scale_std=0.12, **ends)
+    facts = replace(track.info.findings.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (stretch,)))
+    known = gate(replace(track, info=replace(track.info, findings=Findings((), facts))))
+    assert not rows_of(known, DropReason.GAP).any()
 
 
 def test_a_run_whose_sensors_contradict_each_other_undecided_is_all_gap():

@@ -319,6 +319,7 @@ def test_settings_of_the_recipe_reach_their_role() -> None:
         husky(),
         time={"imu": "log"},
         time_offset_s={"gnss": 0.25},
+        odometry_scale={"wheel_odometry": 0.5},
         current_sign="drawn_negative",
         power_averaged="yes",
         gnss_crs="EPSG:7844",
@@ -327,6 +328,16 @@ def test_settings_of_the_recipe_reach_their_role() -> None:
     assert found.tables["imu"]["stamp_ns"][0].as_py() == START + 2_000_000
     assert found.tables["gnss"]["stamp_ns"][0].as_py() == START + S // 4
     assert found.tables["power"]["current_amp"][0].as_py() < 0
+    plain, scaled = (of.tables["wheel_odometry"] for of in (read(husky()), found))
+    for column, factor in (
+        ("velocity_x_mps", 0.5),
+        ("x_m", 0.5),
+        ("velocity_var_x_m2ps2", 0.25),
+        ("angular_velocity_z_radps", 1.0),
+    ):
+        expected = factor * plain[column].to_numpy(zero_copy_only=False)
+        np.testing.assert_array_equal(scaled[column].to_numpy(zero_copy_only=False), expected)
+    assert found.findings.facts.odometry_scale == {"wheel_odometry": 0.5}
     assert found.power_averaged
     assert found.gnss_crs == "EPSG:7844"
 
