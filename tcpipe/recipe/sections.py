@@ -77,7 +77,7 @@ class ReadConfig:
     """Which stamp rules, by role; auto takes header.stamp when it is set and follows the log time."""
     time_offset_s: dict[Role, Offset] = field(default_factory=dict)
     """Added to the stamps of a role [s]."""
-    odometry_scale: dict[Role, Scale] = field(default_factory=dict)
+    odometry_scale: dict[Role, Scale] = field(default_factory=dict, metadata=LEFT_OUT)
     """What the velocities and the ways of an odometry are multiplied with (wheels of another radius, a camera of another baseline)."""
     imu_units: Literal["si", "deg", "g", "deg_g"] = "si"
     """Units of the IMU: si is rad/s and m/s² as REP-103 asks; deg is deg/s and m/s²; g is rad/s and g; deg_g is deg/s and g."""

@@ -18,6 +18,8 @@ WHOLLY = (
     "stretches",
     "checks.audit",
     "checks.mounting",
+    "checks.odometry_scale",
+    "pose_increments",
 )
 """Modules of which every number is listed."""
 UNLISTED = {"_MAX_GAP_NS", "_GRAVITY_BAND_MPS2"}  # the recipe's default beside the recipe; a band, told in words
