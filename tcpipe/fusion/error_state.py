@@ -6,9 +6,9 @@ with everything kept, and smoothed. The second pass repeats the arithmetic of th
 Gates recover. A sensor that has been refused many times in a row and for a long time (GNSS 15 s, 5 s without visual odometry or IMU;
 odometry 5 s, 0.3 s where nothing else tells velocity) is taken to be right and the filter wrong: the covariance is lifted by the
 innovation before that update, which the smoother sees as process noise. Until then a multipath jump or a slipping wheel costs nothing but
-listed refusals. Where fixes scatter far less than they claim, the rest of their error lasts (satellite-based corrections wander by a
-metre in minutes): it is no noise that averages out. It is added to every position's variance and, where it is larger than what odometry
-drifts by, such fixes count once in half a minute.
+listed refusals. Fixes that contradict the rest while it carries the pose are not followed: in a second round an error of theirs is part of
+the state, where both ends tell that they have one (`wrong_fixes`). Where fixes scatter far less than they claim, the rest of their error
+lasts (`fix_errors`): it is no noise that averages out.
 
 `error_state_pass` runs the kernels over a stretch, `error_state_results` says what they found. The kernels: `state_kernel` (state, errors
 and sigma points), `prediction_kernel`, `update_kernel`, `error_state_kernel` (events and gates) and `smoother_kernel`.
@@ -16,7 +16,7 @@ and sigma points), `prediction_kernel`, `update_kernel`, `error_state_kernel` (e
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,14 @@ from tcpipe.fusion.measurements import GNSS, InitialState, Measurements, part
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
 from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.standing import standing_intervals
-from tcpipe.fusion.timeline import build_timeline
+from tcpipe.fusion.timeline import EventTimeline, build_timeline
 from tcpipe.fusion.trajectory import Trajectory
+from tcpipe.fusion.wrong_fixes import Explained, Spans, WrongFixes, find_wrong_fixes, inside, returned
 from tcpipe.geometry.rotation import quat_from_matrix
 from tcpipe.tables.findings import Reopening
 
 _MANY_FIXES = 50
 _LEVELLING_NS = 60_000_000_000
-_PASSES = 3
 _ODOMETRY_HOLDS_M, _LASTS_S = 0.1, 30.0
 
 
@@ -72,29 +72,81 @@ def run_error_state(
         initial = _levelled(measurements, initial, output_ns, gate_probability)
     standing = standing_intervals(measurements)
     errors = find_fix_errors(measurements)
-    suspects: tuple[Reopening, ...] = ()
-    doubted = errors is not None and errors.matters
-    for _ in range(_PASSES):
-        heard = _counted(measurements, errors, doubted=doubted)
-        timeline = build_timeline(heard, standing, output_ns)
-        run = FilterPass(timeline, heard, gate_probability, lags=lags_of(output_ns))
-        if doubted:
-            run.doubt_fixes(errors, suspects)
-        outputs = run.filtered(initial, keep=smooth)
-        found = tuple(reopening for reopening in reopenings(timeline, run) if reopening.role == GNSS)
-        if suspects or not (run.fixes_contradict() if not doubted else run.carried and found):
-            break
-        # Once more: with an error of the fixes as part of the state, then with what led up to where they were off.
-        doubted, suspects = True, found if doubted else ()
-    run.suspects = suspects
+    case = _Case(measurements, initial, output_ns, gate_probability, None)
+    if errors is not None and errors.matters:
+        case = replace(case, errors=errors)
+    timeline = case.timeline(standing, errors)
+    run, outputs = case.passed(timeline, keep=smooth)
+    wrong = None
+    if errors is not None and run.fixes_contradict():  # again, with an error of theirs where both ends tell of one
+        case = replace(case, errors=errors)
+        timeline = case.timeline(standing, errors)
+        wrong = _wrong_fixes(case, timeline)
+        run, outputs = case.passed(timeline, () if wrong is None else wrong.spans, keep=smooth)
+    elif not run.carried:
+        wrong = returned(run.jumps())
     if smooth:
         run.smooth(outputs)
-    if errors is not None and not doubted:
-        run.lasting_m2 = _at_outputs(errors, heard, output_ns)
-    run.unseen_scale_std = _unseen_scale_std(run, heard)
+    if errors is not None and case.errors is None:
+        run.lasting_m2 = _at_outputs(errors, measurements, output_ns)
+    if wrong is not None:
+        run.wrong = _as_reopenings(wrong, outputs, output_ns)
+        run.lasting_m2 = run.lasting_m2 + wrong.doubt_m2(output_ns)
+    run.unseen_scale_std = _unseen_scale_std(run, measurements)
     if not np.isfinite(outputs).all():
         raise FusionError("fusion: the estimate is not finite; look at the streams' values with tcpipe inspect --full")
-    return trajectory_of(timeline, outputs, run, output_ns)
+    return trajectory_of(run.timeline, outputs, run, output_ns)
+
+
+@dataclass(frozen=True, slots=True)
+class _Case:
+    """A stretch that is filtered, more than once where its fixes contradict the rest; with ``errors`` that of the fixes is in the state."""
+
+    measurements: Measurements
+    initial: InitialState
+    output_ns: NDArray[np.int64]
+    gate_probability: float
+    errors: FixErrors | None
+
+    def timeline(self, standing: NDArray[np.int64], errors: FixErrors | None) -> EventTimeline:
+        """Return the events, fixes with the variance that counts from one to the next."""
+        heard = _counted(self.measurements, errors, doubted=self.errors is not None)
+        return build_timeline(heard, standing, self.output_ns)
+
+    def passed(
+        self, timeline: EventTimeline, spans: Spans = (), *, follows: bool = True, keep: bool = False
+    ) -> tuple[FilterPass, NDArray[np.float64]]:
+        """Return the forward pass in which the error of the fixes is free in ``spans``, and its states at the wanted stamps."""
+        lags = lags_of(self.output_ns)
+        run = FilterPass(timeline, self.measurements, self.gate_probability, lags=lags)
+        if self.errors is not None:
+            run.doubt_fixes(self.errors, spans, follows=follows)
+        return run, run.filtered(self.initial, keep=keep)
+
+
+def _wrong_fixes(case: _Case, timeline: EventTimeline) -> WrongFixes | None:
+    """Return when the fixes erred together, where that explains what contradicts them."""
+    follower, _ = case.passed(timeline)
+    known = tuple((r.start_ns, r.end_ns) for r in reopenings(timeline, follower) if r.role == GNSS)
+    usual = case.passed(timeline, follows=False)[0].usual()
+
+    def tried(spans: Spans) -> Explained:
+        run, _ = case.passed(timeline, spans, follows=False)
+        return run.explained(spans, usual)
+
+    return find_wrong_fixes(tried, (int(timeline.stamp_ns[0]), int(timeline.stamp_ns[-1])), known)
+
+
+def _as_reopenings(
+    wrong: WrongFixes, outputs: NDArray[np.float64], output_ns: NDArray[np.int64]
+) -> tuple[Reopening, ...]:
+    """Return the spans in which the fixes were wrong, with how far they were off; then those of which nobody can tell."""
+    off_m = np.linalg.norm(outputs[:, kernel.SAVED - 3 : kernel.SAVED - 1], axis=1)
+    found = []
+    for span in wrong.spans:
+        within = off_m[inside(output_ns, (span,))]
+        found.append(Reopening(GNSS, *span, float(within.max()) if within.size else wrong.size_m))
+    return (*found, *(Reopening(GNSS, *span, wrong.size_m) for span in wrong.doubtful))
 
 
 def _counted(measurements: Measurements, errors: FixErrors | None, *, doubted: bool) -> Measurements:

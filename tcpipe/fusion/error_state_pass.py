@@ -20,6 +20,7 @@ from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.smoother_kernel import smooth_block
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
+from tcpipe.fusion.wrong_fixes import Explained, Innovations, Jump, Spans, explained, inside
 from tcpipe.geometry.rotation import matrix_from_quat
 from tcpipe.tables.findings import Reopening
 
@@ -37,14 +38,13 @@ _NO_ERROR = np.empty(0)
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
 _NEVER = 1e18
 _FIXED = 1e-6
-GROWS_NS = 3_000_000_000
 _CARRIED_M = 0.5
 _LOCK_OUT = {
     kernel.GNSS_POSITION: (5.0, 15.0, 5.0),
     kernel.WHEEL_VELOCITY: (5.0, 5.0, 0.3),
     kernel.VISUAL_VELOCITY: (5.0, 5.0, 0.3),
 }
-_DOUBTED = (5.0, 2.0, 2.0, 1.0)
+_DOUBTED, _DEAF = (5.0, 2.0, 2.0, 1.0), (_NEVER, _NEVER, _NEVER, 0.0)
 """Refusals in a row, and seconds since the last accepted measurement, after which a gate reopens; the seconds where no other sensor
 of velocity is heard. `_DOUBTED`: the same of fixes whose error is part of the state; the 1 says that it is lifted, and not the pose."""
 
@@ -87,7 +87,7 @@ class FilterPass:
         count = timeline.stamp_ns.size
         self.nis = np.full(count, np.nan)
         self.innovation = np.full((count, 3), np.nan)
-        self.suspects: tuple[Reopening, ...] = ()
+        self.wrong: tuple[Reopening, ...] = ()  # when the fixes erred together, as both ends tell
         self.start_error_m2 = np.empty(0)  # of the fixes, where the state holds it
         self.kept_error, self.error_noise_m2 = np.ones(count), np.zeros((count, 3))
         self.error_level_m2 = np.zeros((count, 3))
@@ -110,7 +110,8 @@ class FilterPass:
         self._lock_out = np.full((8, 4), _NEVER)
         for kind, limits in _LOCK_OUT.items():
             self._lock_out[kind] = (*limits, 0.0)
-        gnss, carriers = measurements.gnss, measurements.imu is not None and bool(measurements.odometries())
+        gnss, carriers = measurements.gnss, _carries(measurements)
+        self._tilt_known = measurements.imu is not None
         self.carried = carriers and gnss is not None and float(np.median(gnss.variance_m2[:, 0])) < _CARRIED_M**2
         if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
             self._lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
@@ -131,19 +132,18 @@ class FilterPass:
         self.scale_stds = scale_stds(measurements)
         self.last: _Memory
 
-    def doubt_fixes(self, errors: FixErrors | None, suspects: Sequence[Reopening]) -> None:
+    def doubt_fixes(self, errors: FixErrors | None, wrong: Spans = (), *, follows: bool = True) -> None:
         """Make the fixes' own error part of the state: a Gauss-Markov process, as large and as lasting as they are of their kind.
 
-        In the seconds before they were found to be off, ``suspects``, it may have grown already.
+        In the spans in which they are ``wrong`` it may be as large as a wrong fix is. Unless it ``follows``, the gate never reopens.
         """
         stamp_ns = self.timeline.stamp_ns[self.timeline.kind == kernel.GNSS_POSITION]
         if errors is None or stamp_ns.size == 0:
             return
         fix = np.searchsorted(stamp_ns, self.timeline.stamp_ns, "right").clip(1, stamp_ns.size) - 1
         lasting_m2 = np.maximum(errors.lasting_m2, _LEAST_ERROR_M**2)
-        for off in suspects:
-            before = (stamp_ns > off.start_ns - GROWS_NS) & (stamp_ns < off.start_ns)
-            lasting_m2[before] = np.maximum(lasting_m2[before], max(off.size, OFF_M) ** 2)
+        if wrong:
+            lasting_m2[inside(stamp_ns, wrong)] = np.maximum(lasting_m2[inside(stamp_ns, wrong)], OFF_M**2)
         lasting_m2 = lasting_m2[fix]
         # What comes with another kind of fix comes when time passes next.
         passes = np.maximum.accumulate(np.where(self.timeline.dt_s > 0, np.arange(fix.size), 0))
@@ -155,22 +155,48 @@ class FilterPass:
         self.error_level_m2 = lasting_m2
         self.start_error_m2 = lasting_m2[0]
         if self.carried:
-            self._lock_out[kernel.GNSS_POSITION] = _DOUBTED
+            self._lock_out[kernel.GNSS_POSITION] = _DOUBTED if follows else _DEAF
 
     def fixes_contradict(self) -> bool:
         """Return whether fixes were refused for seconds on end while the other sensors carried the pose: they may err together."""
         of_gnss = np.flatnonzero(self.timeline.kind == kernel.GNSS_POSITION)
         if not self.carried or of_gnss.size == 0:
             return False
+        if self.start_error_m2.size:  # it was taken to last, and yet
+            return bool((self.verdict[of_gnss] == kernel.REOPENED).any())
         refused = self.verdict[of_gnss] != kernel.ACCEPTED
         edges = np.flatnonzero(np.diff(np.concatenate(([0], refused.astype(np.int8), [0]))))
         first, last = edges[::2], edges[1::2] - 1
         long_s = (self.timeline.stamp_ns[of_gnss[last]] - self.timeline.stamp_ns[of_gnss[first]]) * 1e-9
         if ((last - first + 1 >= _DOUBTED[0]) & (long_s >= _DOUBTED[1])).any():
             return True
+        if not self._tilt_known:  # a start that is not level yet looks like a drift
+            return False
         heard = of_gnss[~refused]
         normal = self.innovation[heard] / np.sqrt(self.timeline.variance[heard])
         return bool(most_drift(normal) > SURELY * self.gates[kernel.GNSS_POSITION])
+
+    def jumps(self) -> list[Jump]:
+        """Return where the gate of the fixes reopened, and which way they then were off."""
+        rows = np.flatnonzero((self.timeline.kind == kernel.GNSS_POSITION) & (self.verdict == kernel.REOPENED))
+        return [Jump(int(self.timeline.stamp_ns[row]), self.innovation[row, :2]) for row in rows]
+
+    def explained(self, spans: Spans, usual: float) -> Explained:
+        """Return what remains unexplained if the fixes err in ``spans``; ``usual`` is the squared innovation of a fix that is right."""
+        fixes = self._innovations(kernel.GNSS_POSITION)
+        others = [self._innovations(kind) for kind in (kernel.WHEEL_VELOCITY, kernel.VISUAL_VELOCITY)]
+        return explained(spans, fixes, others, usual)
+
+    def usual(self) -> float:
+        """Return the mean squared normalised innovation of the fixes that the gate took."""
+        fixes = self._innovations(kernel.GNSS_POSITION)
+        return float(fixes.squared[~fixes.refused].mean()) if (~fixes.refused).any() else DOF[kernel.GNSS_POSITION]
+
+    def _innovations(self, kind: int) -> Innovations:
+        rows = self.timeline.kind == kind
+        off_m = np.linalg.norm(self.innovation[rows, :2], axis=1)
+        refused = self.verdict[rows] != kernel.ACCEPTED
+        return Innovations(self.timeline.stamp_ns[rows], self.nis[rows], refused, float(self.gates[kind]), off_m)
 
     def filtered(self, initial: InitialState, *, keep: bool = False) -> NDArray[np.float64]:
         """Forward states at the wanted stamps, rows as `state_kernel.saved` fills them; ``keep`` what `smooth` wants."""
@@ -279,6 +305,11 @@ class FilterPass:
             self.verdict,
             outputs,
         )
+
+
+def _carries(m: Measurements) -> bool:
+    """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on without fixes."""
+    return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
 
 
 def _links(lags: Sequence[int], n: int) -> tuple[NDArray[Any], ...]:

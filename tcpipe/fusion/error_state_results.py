@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_of
-from tcpipe.fusion.error_state_pass import DOF, GROWS_NS, ROLES, FilterPass, lags_of
+from tcpipe.fusion.error_state_pass import DOF, ROLES, FilterPass, lags_of
+from tcpipe.fusion.measurements import GNSS
 from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
@@ -117,14 +118,10 @@ def reopenings(timeline: EventTimeline, run: FilterPass) -> tuple[Reopening, ...
         first = same[same > heard[-1]][0] if heard.size and heard[-1] < same[-1] else event
         size = float(np.linalg.norm(run.innovation[event, : 2 if timeline.kind[event] == kernel.GNSS_POSITION else 1]))
         role = ROLES[int(timeline.kind[event])]
-        if any(
-            abs(int(timeline.stamp_ns[first]) - known.start_ns) < GROWS_NS
-            for known in run.suspects
-            if known.role == role
-        ):
-            continue  # known from the pass before
+        if role == GNSS and any(w.start_ns <= timeline.stamp_ns[event] <= w.end_ns for w in run.wrong):
+            continue  # known by both ends
         found.append(Reopening(role, int(timeline.stamp_ns[first]), int(timeline.stamp_ns[event]), size))
-    return tuple(sorted((*run.suspects, *found), key=lambda reopening: reopening.start_ns))
+    return tuple(sorted((*run.wrong, *found), key=lambda reopening: reopening.start_ns))
 
 
 def _facts(timeline: EventTimeline, run: FilterPass) -> StretchFacts:

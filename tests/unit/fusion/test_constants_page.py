@@ -13,6 +13,7 @@ WHOLLY = (
     "initial",
     "course",
     "fix_errors",
+    "wrong_fixes",
     "standing",
     "preparation",
     "stretches",
