@@ -57,6 +57,7 @@ class PhysicsModel:
     chord_m: float = 1.0
     max_arc_to_chord: float = 1.02
     label_velocity: str = "ground"
+    label_energy: str = "total"
     class_counts: dict = field(default_factory=lambda: dict.fromkeys(CLASSES_SEEN, 100))
     pixel_classes: tuple = CLASSES_SEEN
     seen: dict = field(

@@ -26,6 +26,7 @@ from tcpipe.tables.levels import (
     TrackInfo,
 )
 
+STANDING_WATT = 90.0
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)
 
 
@@ -74,6 +75,11 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
         "energy_joule": power * 1.2 if powered else np.full(n, np.nan),
         "power_std_watt": np.ones(n) if powered else np.full(n, np.nan),
         "energy_std_joule": np.ones(n) if powered else np.full(n, np.nan),
+        "standing_power_watt": np.full(n, STANDING_WATT),
+        "power_above_standing_watt": power - STANDING_WATT if powered else np.full(n, np.nan),
+        "power_above_standing_std_watt": 1.0 + 0.1 * (np.arange(n) % 7) if powered else np.full(n, np.nan),
+        "energy_above_standing_joule": 1.2 * (power - STANDING_WATT) if powered else np.full(n, np.nan),
+        "energy_above_standing_std_joule": np.full(n, 1.2) if powered else np.full(n, np.nan),
     }
     rest = {}
     for column in LABELLED_SEGMENTS.columns:

@@ -40,6 +40,10 @@ from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRan
     type=click.IntRange(16, 512),
     help="Filters of the first stage, a multiple of 16; 64 is ResNet-18.",
 )
+@click.option(
+    "--label", default="total", show_default=True, type=click.Choice(["total", "above_standing"]),
+    help="Energy to train on: all that was measured, or less what the robot draws while it stands.",
+)  # fmt: skip
 @click.option("--seed", default=0, show_default=True, type=SEED, help="Of weights, shuffles and mirrors.")
 @click.option("--fresh", is_flag=True, help="Do not go on from where an earlier training was stopped.")
 @json_option

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tcpipe.dataset.energies import Energy, energy_called
 from tcpipe.dataset.pixels import StoredPixels, View
 from tcpipe.dataset.split import SampleColumns, Split
 from tcpipe.dataset.tensor import tensor_form
@@ -45,7 +46,7 @@ class Dataset(Mapping[str, Split]):
         return f"Dataset({str(self.path)!r}: {counts})"
 
 
-def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None) -> Dataset:
+def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label: str = "total") -> Dataset:
     """Open a dataset that ``tcpipe build-dataset`` wrote.
 
     Parameters
@@ -54,6 +55,9 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None) -> Da
         Its directory, of either format.
     layers
         The tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, those of them that are there.
+    label
+        Which energy the labels are of: ``total``, all that the power source measured, or ``above_standing``, less what the robot draws
+        while it stands. T = d / v and E = w d / v hold for either.
 
     Returns
     -------
@@ -62,21 +66,32 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None) -> Da
     Raises
     ------
     DatasetError
-        There is no dataset, it is of another data model, or its samples do not fit its card, or it has no such layer.
+        There is no dataset, it is of another data model, or its samples do not fit its card, or it has no such layer or label.
 
     """
-    directory = Path(path)
+    directory, energy = Path(path), energy_called(label)
     card = read_current_card(directory)
     split = read_samples(directory, ["split"]).column("split").to_numpy()
     if len(split) != card.samples:
         raise DatasetError(
             f"{directory}: samples.parquet has {len(split)} rows, its card says {card.samples}; build it again"
         )
+    _refuse_without(energy, directory, card)
     files = open_patches(directory, card)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
     form = tensor_form(asked, files.layers)
     parts = {}
     for name, rows in rows_in_files(card, split).items():
         columns = SampleColumns(directory, np.flatnonzero(split == name))
-        parts[name] = Split(name, card, columns, View(StoredPixels(files, rows), np.arange(len(rows)), form))
+        parts[name] = Split(name, card, columns, View(StoredPixels(files, rows), np.arange(len(rows)), form), energy)
     return Dataset(directory, card, parts)
+
+
+def _refuse_without(energy: Energy, directory: Path, card: DatasetCard) -> None:
+    """Raise an error if no sample of the dataset has the label."""
+    column = read_samples(directory, [energy.power]).column(energy.power)
+    if card.samples and column.null_count == len(column):
+        raise DatasetError(
+            f"{directory}: no sample has {energy.power}: its robot hardly stood in any run, or they were ingested before data model 1.3; "
+            "ingest the logs and build it again, or take the label total"
+        )

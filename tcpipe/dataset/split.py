@@ -12,6 +12,7 @@ import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
 from tcpipe.dataset.batches import BatchContent, Batches, BatchRules
+from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.dataset.pixels import View
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
@@ -63,12 +64,22 @@ class Split:
         ``train``, ``test``, ``unseen`` or ``buffer``.
     view
         Where its pixels come from.
+    energy
+        Which of the two energies its labels are of.
 
     """
 
-    def __init__(self, name: str, card: DatasetCard, columns: SampleColumns, view: View) -> None:
+    def __init__(
+        self,
+        name: str,
+        card: DatasetCard,
+        columns: SampleColumns,
+        view: View,
+        energy: Energy = ENERGIES["total"],
+    ) -> None:
         self.name = name
         self.view = view
+        self.energy = energy
         self._card = card
         self._columns = columns
         self._labels: Floats | None = None
@@ -116,10 +127,15 @@ class Split:
         return self._columns.table().take(pa.array(self.view.at))
 
     @property
+    def label_columns(self) -> tuple[str, str]:
+        """Columns of samples.parquet that train: the power of its energy, and the velocity that the card says."""
+        return self.energy.power, self._card.label.columns[1]
+
+    @property
     def labels(self) -> Floats:
-        """Power [W] and velocity [m/s], float32, shape (N, 2); the card says which velocity."""
+        """Power [W] and velocity [m/s], float32, shape (N, 2): its `label_columns`."""
         if self._labels is None:
-            columns = [self.column(name) for name in self._card.label.columns]
+            columns = [self.column(name) for name in self.label_columns]
             self._labels = np.column_stack(columns).astype(np.float32)
         return self._labels
 
@@ -127,7 +143,7 @@ class Split:
     def weights(self) -> Floats:
         """Inverse variance of each label over its mean, float32, shape (N, 2): how much it says of the ground; 0 where it is not known."""
         if self._weights is None:
-            std = np.column_stack([self.column(name) for name in ("power_std_watt", "velocity_std_mps")])
+            std = np.column_stack([self.column(name) for name in (self.energy.power_std, "velocity_std_mps")])
             self._weights = np.column_stack([_inverse_variance(column) for column in std.T]).astype(np.float32)
         return self._weights
 
@@ -185,7 +201,7 @@ class Split:
             raise DatasetError(f"quality {', '.join(unknown)}: wanted some of {', '.join(named)}")
         bits = sum(named[name] for name in set(without))
         good = (self.column("quality").astype(np.int64) & bits) == 0
-        for name, limit in (("power_std_watt", max_power_std_watt), ("velocity_std_mps", max_velocity_std_mps)):
+        for name, limit in ((self.energy.power_std, max_power_std_watt), ("velocity_std_mps", max_velocity_std_mps)):
             if limit is not None:
                 good &= self.column(name).astype(np.float64) <= limit
         return self.take(good)
@@ -244,7 +260,7 @@ class Split:
         return TorchBatches(self.batches(size, **rules))
 
     def _with(self, view: View) -> Split:
-        return Split(self.name, self._card, self._columns, view)
+        return Split(self.name, self._card, self._columns, view, self.energy)
 
     def _tensor(self, indices: Ints) -> Floats:
         layers = self.view.form.layers

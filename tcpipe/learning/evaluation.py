@@ -12,6 +12,7 @@ import numpy as np
 from tcpipe import __version__
 from tcpipe.balance.repeats import Floor
 from tcpipe.dataset import Dataset, Split, open_dataset
+from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.robot_files import shipped_profiles
@@ -97,7 +98,8 @@ def evaluate(
         The model is none or does not fit the dataset, or there is nothing to evaluate on.
 
     """
-    ours, data = load_model(model), open_dataset(dataset)
+    ours = load_model(model)
+    data = open_dataset(dataset, label=ours.label_energy)
     check_fit(ours.card, data, str(model))
     fitting, fitted = _how_it_was_trained(ours)
     names = {entry.id: entry.name for entry in ours.classes.classes}
@@ -123,14 +125,14 @@ def evaluate(
     return Evaluation(
         tcpipe_version=__version__,
         key=key,
-        model=EvaluatedModel(ours.name, ours.checksum, ours.card.training),
+        model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
         dataset=EvaluatedDataset(data.card.name, dataset_checksum(data.card), data.card.splits),
         config=config,
         splits={name: _split_errors(found, said[name], plant) for name, found in sets.items()},
         ablation=tuple(ablation),
         energy=energy,
         time=_time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
-        repeatability=_repeatability(data.card),
+        repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
         warnings=(*_warnings(ours, data, sets), *_left_out(data, sets, energy)),
         plots={name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
     )
@@ -141,9 +143,9 @@ def _how_it_was_trained(model: Model) -> tuple[FitConfig, int]:
     return model.card.training.config, model.card.training.samples["fitted"]
 
 
-def _repeatability(card: DatasetCard) -> dict[str, Floor | None]:
+def _repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:
     """Return how well each label repeats itself where ground was driven twice, as the dataset's card has it; None where it was not."""
-    columns = {"w": "power_watt", "v": card.label.columns[1], "T": "duration_s", "E": "energy_joule"}
+    columns = {"w": energy.power, "v": card.label.columns[1], "T": "duration_s", "E": energy.energy}
     found = card.balance.repeatability
     return {quantity: found.get(column) for quantity, column in columns.items()}
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, TypeAlias, TypedDict
 
 from tcpipe.balance.repeats import Floor
+from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.metrics import Errors
 from tcpipe.learning.model_card import Training
 from tcpipe.tables.findings import ABSENT
@@ -42,6 +43,8 @@ class EvaluatedModel:
     name: str
     checksum: str
     training: Training
+    label_energy: EnergyName = "total"
+    """Which power and energy it predicts, and was measured by."""
 
 
 @dataclass(frozen=True, slots=True)

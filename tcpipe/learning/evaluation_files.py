@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tcpipe import __version__
+from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import read_card
@@ -76,7 +77,8 @@ def run_evaluation(
         write_json(place / JSON, evaluate(model, dataset, place, rules, key=key, plant=plant))
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
     name = values.dataset.name
-    lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E, beside the paper's."
+    of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
+    lead = f"Model {Path(model).name} on dataset {name}: errors of power w, velocity v, time T and energy E{of}, beside the paper's."
     warnings = [SIMULATED] if plant is not None else []
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
+from tcpipe.dataset.energies import EnergyName
 from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import Architecture, check_trainable
 from tcpipe.learning.checkpoint import Arrays, TrainingProgress, read_checkpoint, write_checkpoint
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger("tcpipe")
 
 Floats = NDArray[np.float32]
-
-ENERGY = "energy_joule"
 
 _SLOWER = 0.1
 """What the learning rate is multiplied by where it is too long a step."""
@@ -56,6 +55,8 @@ class FitConfig:
     """Weigh each label by its inverse variance."""
     width: int = 64
     """Filters of the first stage, a multiple of 16."""
+    label: EnergyName = "total"
+    """Which energy is trained on: all that was measured, or what is above standing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +66,7 @@ class Task:
     fit: Split
     held: Split
     outputs: tuple[str, ...]
-    """The dataset's labels, or `ENERGY` alone."""
+    """The split's label columns, or its energy alone."""
 
 
 @dataclass(slots=True)
@@ -186,15 +187,15 @@ def learning_rate(config: FitConfig, progress: TrainingProgress) -> float:
 
 def labels_of(split: Split, outputs: Sequence[str]) -> Floats:
     """Return what a network is to predict of a split's samples, float32, shape (N, outputs)."""
-    return split.column(ENERGY).astype(np.float32)[:, None] if tuple(outputs) == (ENERGY,) else split.labels
+    return split.column(outputs[0]).astype(np.float32)[:, None] if len(outputs) == 1 else split.labels
 
 
 def _epoch(
     trainer: Trainer, task: Task, config: FitConfig, *, scale: Floats, progress: TrainingProgress, spent: Spent
 ) -> float:
     """Train on every sample once; return the mean loss."""
-    energy = task.outputs == (ENERGY,)
-    rules: dict[str, Any] = {"features": (ENERGY,)} if energy else {"weights": config.weights}
+    energy = len(task.outputs) == 1
+    rules: dict[str, Any] = {"features": task.outputs} if energy else {"weights": config.weights}
     batches = task.fit.batches(config.batch, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
     rate = learning_rate(config, progress)
     total, count, began = 0.0, 0, time.perf_counter()

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from tcpipe.dataset.energies import EnergyName
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.seals import Checksum
 from tcpipe.learning.architecture import Architecture
@@ -76,6 +77,8 @@ class ModelCard:
     """No segment that it was trained on is more curved."""
     label_velocity: str
     """ground or fused: which velocity v is."""
+    label_energy: EnergyName = "total"
+    """total or above_standing: which power w is, and so which energy E."""
     robot: str
     classes: tuple[TerrainClass, ...]
     seen: Seen

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from jinja2 import Environment, StrictUndefined
 
+from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import plain_line
 from tcpipe.learning.model_card import ModelCard
 
@@ -17,7 +18,7 @@ Predicts {{ outputs }} of {{ chord }} m of ground ahead of the robot from a patc
 mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{ chord }} m.
 
 - Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
-- Velocity is the {{ velocity }} one; robot {{ robot }}.
+- Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
 - Network: ResNet-18 of width {{ width }}; loss {{ config.loss }}, Adam {{ config.learning_rate }}, batch {{ config.batch }},
   seed {{ config.seed }}; best of {{ told.epochs }} epochs by fold {{ config.fold }} of train: {{ told.best_epoch }},
   loss {{ "%.4f" | format(told.held_out_loss) }}.
@@ -43,7 +44,7 @@ def model_readme(card: ModelCard) -> str:
     return Environment(autoescape=False, undefined=StrictUndefined, keep_trailing_newline=True).from_string(_TEXT).render(  # noqa: S701  Markdown
         outputs=", ".join(card.outputs), chord=f"{card.chord_m:g}", px=card.architecture.patch_px,
         depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
-        velocity=card.label_velocity, robot=card.robot, width=card.architecture.width,
+        velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words, robot=card.robot, width=card.architecture.width,
         config=card.training.config, told=card.training, dataset=dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.seen.ranges["slope_rad"]),
         relief=" to ".join(f"{value:.2f} m" for value in card.seen.ranges.get("relief_m", ())) or "not looked at",

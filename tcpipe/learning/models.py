@@ -107,6 +107,11 @@ class Model:
         return self.card.label_velocity
 
     @property
+    def label_energy(self) -> str:
+        """``total`` or ``above_standing``: which power and energy it predicts."""
+        return self.card.label_energy
+
+    @property
     def robot(self) -> str:
         """Whose cost it predicts."""
         return self.card.robot

@@ -43,22 +43,23 @@ def measured(split: Split, names: Mapping[int, str]) -> Measured:
         Of its classes, by id.
 
     """
-    with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column("energy_joule").astype(np.float64))
+    of = split.energy
+    with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column(of.energy).astype(np.float64))
     chosen = split.take(with_label)
     labels = chosen.labels.astype(np.float64)
     plain = {name: chosen.column(name).astype(np.float64) for name in (
-        "duration_s", "energy_joule", "power_std_watt", "velocity_std_mps", "duration_std_s", "energy_std_joule", "terrain_class",
+        "duration_s", of.energy, of.power_std, "velocity_std_mps", "duration_std_s", of.energy_std, "terrain_class",
     )}  # fmt: skip
     class_ids = np.nan_to_num(plain["terrain_class"], nan=_UNKNOWN[0]).astype(np.int64)
     known = dict([_UNKNOWN, *names.items()])
     return Measured(
         chosen,
-        {"w": labels[:, 0], "v": labels[:, 1], "T": plain["duration_s"], "E": plain["energy_joule"]},
+        {"w": labels[:, 0], "v": labels[:, 1], "T": plain["duration_s"], "E": plain[of.energy]},
         {
-            "w": plain["power_std_watt"],
+            "w": plain[of.power_std],
             "v": plain["velocity_std_mps"],
             "T": plain["duration_std_s"],
-            "E": plain["energy_std_joule"],
+            "E": plain[of.energy_std],
         },
         class_ids,
         {class_id: known.get(class_id, str(class_id)) for class_id in np.unique(class_ids).tolist()},

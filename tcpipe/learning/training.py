@@ -19,7 +19,7 @@ from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.checkpoint import read_checkpoint
-from tcpipe.learning.fitting import ENERGY, FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
+from tcpipe.learning.fitting import FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
 from tcpipe.learning.model_card import KIND, ModelCard, Seen, TrainedOn, Training, is_current
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
@@ -105,7 +105,8 @@ def train(
         The dataset has nothing to train on or to weigh by, ``out`` is something else, or the state is cut short or of another training.
 
     """
-    rules, other, place, data = config or FitConfig(), variant or Variant(), Path(out), open_dataset(dataset)
+    rules, other, place = config or FitConfig(), variant or Variant(), Path(out)
+    data = open_dataset(dataset, label=rules.label)
     clear_beside(place)
     key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     checkpoint = _checkpoint_of(place)
@@ -155,7 +156,8 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
         There is nothing to train on, or the fold is empty.
 
     """
-    train, outputs = data["train"], (ENERGY,) if variant.energy_only else tuple(data.card.label.columns)
+    train = data["train"]
+    outputs = (train.energy.energy,) if variant.energy_only else train.label_columns
     wanted = np.isfinite(train.labels).all(axis=1)
     if unlabelled := len(train) - int(wanted.sum()):
         logger.info("%s: %d of %d samples of train have no label and are left out", data.path, unlabelled, len(train))
@@ -287,6 +289,7 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         chord_m=card.recipe.segment.chord_m,
         max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
         label_velocity=card.label.velocity,
+        label_energy=config.label,
         robot=", ".join(card.robots),
         classes=class_table(card).classes,
         seen=what_was_seen(task.fit),

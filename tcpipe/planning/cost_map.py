@@ -97,6 +97,8 @@ class CostMapCard:
     checksums: Mapping[str, Checksum]
     origin_deg: tuple[float, float] | None = None
     """Longitude and latitude where the frame of the Nav2 maps begins; None where it is the CRS's own."""
+    label_energy: str = "total"
+    """``total`` or ``above_standing``: which power and energy it is."""
     kind: str = KIND
     version: str = VERSION
 
@@ -324,6 +326,7 @@ def _card(
         map=source.name,
         model=model.checksum,
         robot=model.robot,
+        label_energy=model.label_energy,
         grid=costs.grid,
         courses_deg=tuple(ANGLES_DEG.tolist()),
         bands=dict.fromkeys(_QUANTITIES, (*_BAND_NAMES, "min", "mean", "best course")),

@@ -69,6 +69,10 @@ class CostModel(Protocol):
         """``ground``: chord over duration; ``fused``: forward velocity along the surface (docs/adr, Velocity is chord over duration)."""
 
     @property
+    def label_energy(self) -> str:
+        """``total``: all that the power source measured; ``above_standing``: less what the robot draws while it stands."""
+
+    @property
     def class_counts(self) -> Mapping[int, int]:
         """How many training samples each class had under its chord."""
 

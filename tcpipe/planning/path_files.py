@@ -27,6 +27,8 @@ class NamedTotals(PathTotals):
     model: str
     map: str
     robot: str
+    label_energy: str = "total"
+    """``total`` or ``above_standing``: which energy it is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +56,8 @@ class PathResult(NamedTotals):
 
     def __str__(self) -> str:
         """Return the totals, their intervals, and where the model has no business, as plain lines."""
-        return plain_lines((f"{self.path}: {cost_text(self)}", *_reason_lines(self), *self._out_lines()))
+        above = ", above standing" if self.label_energy == "above_standing" else ""
+        return plain_lines((f"{self.path}: {cost_text(self)}{above}", *_reason_lines(self), *self._out_lines()))
 
     def _out_lines(self) -> tuple[str, ...]:
         if self.out is None:
@@ -108,7 +111,9 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
     if out is not None and (known := _totals_of(out, key)) is not None:
         return recast(known, PathResult, path=path, out=out, status="unchanged")
     cost = cost_of_path(model, source, lonlat_deg, where=str(path))
-    totals = recast(cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot)
+    totals = recast(
+        cost.totals, NamedTotals, model=model.name, map=source.name, robot=model.robot, label_energy=model.label_energy
+    )
     if out is not None:
         write_pieces(out, cost.pieces)
         write_sealed(summary_path(out), recast(totals, TableTotals, key=key, sha256=file_checksum(out).sha256))

@@ -45,6 +45,8 @@ class PlannedPath(PlanTotals):
     map: str
     robot: str
     allow_unseen: bool
+    label_energy: str = "total"
+    """``total`` or ``above_standing``: which energy it is."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +146,7 @@ def plan(
         origin = replace(origin, picture_sha256=file_checksum(picture).sha256)
     asked = plans[request.objective]
     who = {"model": model.name, "map": source.name, "robot": model.robot, "allow_unseen": request.allow_unseen}
+    who["label_energy"] = model.label_energy
     path = line_feature(asked.lonlat_deg, recast(asked.totals, PlannedPath, **who))
     write_json(out, PlanFile((path,), origin))
     return PlanResult(request.objective, out, picture, "done", origin.plans)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import tcpipe
-from tcpipe.errors import UsageError
+from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.seals import write_sealed
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -64,6 +64,8 @@ def test_columns_added_since_are_null_in_runs_and_datasets(kept):
         for column in later:
             assert np.isnan(train.column(column).astype(float)).all()
     assert verify(kept / "new").problems == ()
+    with pytest.raises(DatasetError, match="no sample has power_above_standing_watt: its robot hardly stood"):
+        tcpipe.open_dataset(kept / "zarr", label="above_standing")
 
 
 def contents(directory):

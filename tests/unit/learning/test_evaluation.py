@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from made_models import CARD, made_model
-from synthetic_store import small_store
+from synthetic_store import STANDING_WATT, small_store
 
 from tcpipe.dataset import Split, open_dataset
 from tcpipe.errors import DatasetError, ModelError, UsageError
@@ -55,6 +55,21 @@ def test_the_figures_are_the_arrays_own(evaluated, model, dataset):
     assert expected.mape_percent == pytest.approx(
         100 * np.mean(np.abs(1.0 - unseen.column("duration_s")) / unseen.column("duration_s"))
     )
+
+
+def test_a_model_of_what_is_above_standing_is_held_against_that(model, dataset, tmp_path):
+    training = load_model(model).card.training
+    names = ("power_above_standing_watt", "velocity_mps")
+    made = made_model(tmp_path / "above", training=training, outputs=names, label_energy="above_standing")
+    values = run_evaluation(made, dataset, tmp_path / "evaluation", config=CONFIG).values
+    assert values.model.label_energy == "above_standing"
+    unseen = open_dataset(dataset)["unseen"]
+    said = load_model(made).predict(unseen.patches).astype(float)
+    energy, told = unseen.column("energy_joule") - 1.2 * STANDING_WATT, said[:, 0] / said[:, 1]
+    found = values.splits["unseen"]
+    assert found.errors["E"]["all"].rmse == pytest.approx(np.sqrt(np.mean((told - energy) ** 2)), rel=1e-4)
+    assert found.label_floor["E"]["all"].rmse == pytest.approx(1.2)
+    assert "above what the robot draws" in (tmp_path / "evaluation" / "evaluation.html").read_text()
 
 
 def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):

@@ -1,0 +1,42 @@
+"""The two energies of a metre, either of which can be trained on: all that the power source measured, and what of it is above standing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from tcpipe.errors import DatasetError
+
+EnergyName = Literal["total", "above_standing"]
+
+
+@dataclass(frozen=True, slots=True)
+class Energy:
+    """The columns of one of them: power [W] and energy [J], E = w d / v, and their standard deviations."""
+
+    power: str
+    power_std: str
+    energy: str
+    energy_std: str
+    words: str
+    """What it is, for people."""
+
+
+ENERGIES: Mapping[str, Energy] = {
+    "total": Energy("power_watt", "power_std_watt", "energy_joule", "energy_std_joule", "all that was measured"),
+    "above_standing": Energy(
+        "power_above_standing_watt",
+        "power_above_standing_std_watt",
+        "energy_above_standing_joule",
+        "energy_above_standing_std_joule",
+        "above what the robot draws while it stands",
+    ),
+}
+
+
+def energy_called(name: str) -> Energy:
+    """Return an energy by its name; `DatasetError` lists those there are."""
+    if name not in ENERGIES:
+        raise DatasetError(f"label {name!r}: wanted one of {', '.join(ENERGIES)}")
+    return ENERGIES[name]
