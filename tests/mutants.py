@@ -43,7 +43,11 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tcpipe/stages/fuse_findings.py",
             "tcpipe/stages/label_quality.py",
         ),
-        ("tests/unit/stages",),
+        (
+            "tests/unit/stages/test_read_findings.py",
+            "tests/unit/stages/test_fuse_findings.py",
+            "tests/unit/stages/test_label_quality.py",
+        ),
     ),
     "verify": (("tcpipe/pipeline/verify_dataset.py",), ("tests/unit/pipeline/test_trust.py",)),
 }
