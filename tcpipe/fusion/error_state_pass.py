@@ -97,26 +97,12 @@ class FilterPass:
         self.gates = np.full(8, np.inf)
         for kind in (*ROLES, kernel.STANDING, kernel.STANDING_RATE):
             self.gates[kind] = chi_square_gate(DOF[kind], gate_probability)
-        self._levers = np.zeros((8, 3))
-        for kind, source in (
-            (kernel.GNSS_POSITION, measurements.gnss),
-            (kernel.WHEEL_VELOCITY, measurements.wheels),
-            (kernel.SIDEWAYS, measurements.wheels),
-            (kernel.VISUAL_VELOCITY, measurements.visual),
-        ):
-            if source is not None:
-                self._levers[kind] = source.lever_arm_m
+        self._levers = _lever_arms(measurements)
         self._densities = process_noise(measurements)
-        self._lock_out = np.full((8, 4), _NEVER)
-        for kind, limits in _LOCK_OUT.items():
-            self._lock_out[kind] = (*limits, 0.0)
+        self._lock_out = _lock_out(measurements)
         gnss, carriers = measurements.gnss, _carries(measurements)
         self._tilt_known = measurements.imu is not None
         self.carried = carriers and gnss is not None and float(np.median(gnss.variance_m2[:, 0])) < _CARRIED_M**2
-        if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
-            self._lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
-        if measurements.imu is None and measurements.visual is None:  # wheels that dig in must not overrule GNSS
-            self._lock_out[kernel.GNSS_POSITION, 1:3] = 1.0
         # Without GNSS nothing tells how long a metre of odometry is; an accelerometer has a scale and an alignment of its own.
         self.unseen_scale_std = 0.0
         # From positions alone forward and reverse look the same: yaw is the course, and may be anything.
@@ -310,6 +296,32 @@ class FilterPass:
 def _carries(m: Measurements) -> bool:
     """Return whether an IMU and an odometry, or a camera that sees all turns, carry the pose on without fixes."""
     return bool(m.odometries()) if m.imu is not None else m.visual is not None and m.visual.turn_rate_radps is not None
+
+
+def _lever_arms(measurements: Measurements) -> NDArray[np.float64]:
+    """Return the lever arm by kind of event [m], shape (8, 3)."""
+    levers = np.zeros((8, 3))
+    for kind, source in (
+        (kernel.GNSS_POSITION, measurements.gnss),
+        (kernel.WHEEL_VELOCITY, measurements.wheels),
+        (kernel.SIDEWAYS, measurements.wheels),
+        (kernel.VISUAL_VELOCITY, measurements.visual),
+    ):
+        if source is not None:
+            levers[kind] = source.lever_arm_m
+    return levers
+
+
+def _lock_out(measurements: Measurements) -> NDArray[np.float64]:
+    """Return by kind of event when its gate reopens, as `filter_block` takes it, shape (8, 4)."""
+    lock_out = np.full((8, 4), _NEVER)
+    for kind, limits in _LOCK_OUT.items():
+        lock_out[kind] = (*limits, 0.0)
+    if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
+        lock_out[kernel.GNSS_POSITION, 1] = _LOCK_OUT[kernel.GNSS_POSITION][2]
+    if measurements.imu is None and measurements.visual is None:  # wheels that dig in must not overrule GNSS
+        lock_out[kernel.GNSS_POSITION, 1:3] = 1.0
+    return lock_out
 
 
 def _links(lags: Sequence[int], n: int) -> tuple[NDArray[Any], ...]:
