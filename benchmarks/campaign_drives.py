@@ -182,7 +182,7 @@ def _fields(type_name: str) -> tuple[str, ...]:
 
 def log_of(drive: Drive, sensors: Sensors, fault: Fault) -> MemoryLog:
     """Return what is recorded of a drive where a fault is."""
-    real = fault.recorder.heard(fault.sensors(sensors)).mounted(WHOLE)
+    real = fault.sensors(sensors).mounted(WHOLE)
     readings = fault.readings(record(drive.truth, drive.site, real, WHOLE, drive.noise), drive)
     messages = streams(readings, fault.told(real), fault.recorder, geoid_m=drive.site.geoid_m)
     recorded = fault.messages(messages, drive)

@@ -143,19 +143,28 @@ def _robots() -> str:
         measures = ((of.width_m, "m"), (of.length_m, "m"), (of.max_velocity_mps, "m/s"))
         cells = [f"{value:g} {unit}" if value is not None else "not known" for value, unit in measures]
         sizes += f"| `{name}` | {' | '.join(cells)} | {volts} |\n"
-    power = "| message type | for | voltage | current | averaged | drawn current |\n|---|---|---|---|---|---|\n"
+    power = "| message type | for | voltage | current | averaged | drawn current | not known |\n|---|---|---|---|---|---|---|\n"
+    refused = "".join(f"- `{name}` {why}.\n" for name, why in known.refusals().items())
     for source in known.power_sources:
+        if source.refused:
+            continue
         only = (source.platform, source.topic and f"…{source.topic}", source.husky_power and f"`{source.husky_power}`")
+        only += ("in place of those above" if source.fallback else None,)
+        counter = f"counter {source.energy} times {source.energy_scale:g} J" if source.energy else ""
         drawn = {"drawn_positive": "positive", "drawn_negative": "negative", "auto": "told by its mean"}[source.sign]
-        fields = f"{source.voltage} | {source.current}{', with ' + source.includes if source.includes else ''}"
-        averaged = "yes" if source.averaged else "no"
-        power += f"| `{source.type}` | {', '.join(filter(None, only))} | {fields} | {averaged} | {drawn} |\n"
+        fields = (
+            f"{source.voltage} | {counter or source.current}{', with ' + source.includes if source.includes else ''}"
+        )
+        averaged = "told by motion" if source.averaging_unknown else "yes" if source.averaged else "no"
+        cells = (f"`{source.type}`", ", ".join(filter(None, only)), fields, averaged, drawn, source.unknown)
+        power += f"| {' | '.join(cells)} |\n"
     return (
         f"{_NOTE}\n# Robots and power messages\n\nWhat comes with tcpipe, from the TOML files in `tcpipe/robots/`, where each number has "
         "its source. A recipe holds the same tables ([your robot](../how-to/your-robot.md)).\n\n## Robots\n\nA log with "
         "`clearpath_platform_msgs/Power` and no other platform's name is a Husky's, the first to publish it.\n\n"
         f"{found_by}{sizes}\n## Power messages\n\nBest first; a row is a rail. Bare numbers "
-        f"(`std_msgs/Float32`, `Float64`) are told by their topic's name.\n\n{power}"
+        f"(`std_msgs/Float32`, `Float64`) are told by their topic's name.\n\n{power}\n"
+        f"Types whose currents are no power drawn from a battery, or cannot be known to be; they play no role:\n\n{refused}"
     )
 
 

@@ -85,6 +85,8 @@ class _Decisions:
     """Message types that can play each role, best first."""
     propulsion: Sequence[str]
     """Those that tell propulsion apart, best first."""
+    refusals: Mapping[str, str]
+    """Those whose currents tell no power, and why."""
     roles: dict[str, PlayedRole] = field(default_factory=dict)
     left_out: dict[str, str] = field(default_factory=dict)
     passed_over: dict[str, dict[str, str]] = field(default_factory=dict)
@@ -134,7 +136,8 @@ def assign_roles(
     wanted = {str(role): names for role, names in chosen.items()}
     name, robot_why = find_robot(listed.values(), robot, known.robots)
     types = {**ROLE_TYPES, "power": tuple(dict.fromkeys([*known.types(), *FLOAT_TYPES]))}
-    decided = _Decisions(types, [of for of in known.types(propulsion=True) if of not in FLOAT_TYPES])
+    propulsion = [of for of in known.types(propulsion=True) if of not in FLOAT_TYPES]
+    decided = _Decisions(types, propulsion, known.refusals())
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
         decided.problems.append(
             f"recipe read.namespace: no topic lies below {namespace}; the log holds {_listing(every.values())}"
@@ -267,7 +270,7 @@ def _candidates(
     for topic in topics:
         if topic.type_name in FLOAT_TYPES:
             continue
-        role, rank, why = (_SORTERS.get(topic.type_name) or partial(_sort_power, decided.propulsion))(topic)
+        role, rank, why = (_SORTERS.get(topic.type_name) or partial(_sort_power, decided))(topic)
         if role is None:
             decided.left_out[topic.name] = why
             usual = next(role for role, types in decided.types.items() if topic.type_name in types)
@@ -331,10 +334,12 @@ def _sort_command(topic: Topic) -> Sorted:
 _DRIVES = re.compile(r"drive|motor|wheel|traction")
 
 
-def _sort_power(propulsion: Sequence[str], topic: Topic) -> Sorted:
+def _sort_power(decided: _Decisions, topic: Topic) -> Sorted:
     """Rank: messages that tell propulsion apart, then what hangs on the drives, then whole batteries."""
-    if topic.type_name in propulsion:
-        return "power", (0, propulsion.index(topic.type_name)), "its type tells propulsion apart"
+    if topic.type_name in decided.refusals:
+        return None, (), f"its type {decided.refusals[topic.type_name]}"
+    if topic.type_name in decided.propulsion:
+        return "power", (0, decided.propulsion.index(topic.type_name)), "its type tells propulsion apart"
     if topic.type_name == BATTERY_STATE:
         return "power", (1 if _says(_DRIVES, topic.name) else 4,), ""
     return "power", (3,), ""

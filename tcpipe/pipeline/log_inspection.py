@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 from typing import Literal
 
+from tcpipe.cost.quality import MIN_AVERAGED_HZ, MIN_INSTANTANEOUS_HZ
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.logs.clocks import Timeline, settle_clocks
@@ -14,7 +15,9 @@ from tcpipe.logs.roles import RoleAssignment, assign_roles
 from tcpipe.logs.simulated_clock import CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic
 from tcpipe.pipeline.log_stamps import TopicStamps
+from tcpipe.power.sources import sources_of
 from tcpipe.recipe import Recipe
+from tcpipe.robots.profiles import Profiles
 from tcpipe.tables.findings import ABSENT, ClockStep
 
 
@@ -83,13 +86,13 @@ def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> I
     full
         Read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
     """
-    config = recipe.read
+    config, known = recipe.read, profiles_of(recipe)
     cast = assign_roles(
         log.topics.values(),
         config.topics,
         config.ignore_topics,
         robot,
-        known=profiles_of(recipe),
+        known=known,
         namespace=config.namespace,
     )
     topics, steps = tuple(_indexed(topic, cast) for topic in sorted(log.topics.values(), key=attrgetter("name"))), None
@@ -109,7 +112,7 @@ def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> I
         clock_epochs=None if steps is None else len(steps) + 1,
         clock_steps=steps,
         problems=tuple(cast.problems),
-        warnings=(*cast.warnings, *_simulated(log.topics.values())),
+        warnings=(*cast.warnings, *_simulated(log.topics.values()), *_slow_power(log, cast, recipe, known)),
         damage=tuple(str(damage) for damage in log.damage if damage.is_loss),
         remarks=tuple(log.remarks),
     )
@@ -171,6 +174,29 @@ def _with_stamps(
         wrong_stamps=max(wrong, 0),
         simulated_time=simulated,
     )
+
+
+def _slow_power(log: Log, cast: RoleAssignment, recipe: Recipe, known: Profiles) -> Iterable[str]:
+    """Yield a line of each power topic that comes too slowly to tell what a metre costs, with what sets its rate where that is known."""
+    robot = known.robots[cast.robot]
+    for name in cast.roles["power"].topics if "power" in cast.roles else ():
+        topic = log.topics[name]
+        choices = sources_of(
+            topic.type_name, name, known.power_sources, platform=robot.platform, husky_power=recipe.read.husky_power
+        )
+        rate_hz = _rate_hz(topic)
+        if isinstance(choices, str) or rate_hz is None:
+            continue
+        averaged = {"auto": choices[0][0].averaged, "yes": True, "no": False}[recipe.read.power_averaged]
+        wanted_hz, what = (MIN_AVERAGED_HZ, "averaged") if averaged else (MIN_INSTANTANEOUS_HZ, "sampled")
+        if rate_hz < _NEARLY * wanted_hz:
+            speed_mps = robot.max_velocity_mps or 1.0
+            metre = f"a metre at {speed_mps:g} m/s holds {rate_hz / speed_mps:.2g} values; {wanted_hz:g} Hz are wanted"
+            setting = f"; what sets it: {choices[0][0].rate_setting}" if choices[0][0].rate_setting else ""
+            yield f"power: {name} comes at {rate_hz:g} Hz, {what}, too slowly for segments of 1 m: {metre}{setting}"
+
+
+_NEARLY = 0.98
 
 
 def _simulated(topics: Iterable[Topic]) -> list[str]:

@@ -8,6 +8,8 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from tcpipe.power.sources import (
+    BATTERY_STATE,
+    FLOAT_TYPES,
     LARGEST_AMP,
     Columns,
     Floats,
@@ -19,6 +21,7 @@ from tcpipe.power.sources import (
     why_refused,
     with_sign,
 )
+from tcpipe.power.wrapped import wrap_of
 from tcpipe.robots.profiles import CurrentSign, PowerSource
 
 _LOG_TIME = "log_time_ns"
@@ -39,6 +42,8 @@ class PowerReadings:
 
     rails: Rails = field(default_factory=dict)
     averaged: bool = False
+    averaging_unknown: bool = False
+    """Nobody knows whether it averages; ``averaged`` is what to take where the motion does not tell either."""
     warnings: tuple[str, ...] = ()
     current_sign: str | None = None
     """What a drawn current is counted as, and what tells it; None without power."""
@@ -64,34 +69,83 @@ def read_power(
     rails: dict[str, list[RailReadings]] = {}
     sources: list[PowerSource] = []
     refused: list[str] = []
+    warnings: list[str] = []
     for topic, (type_name, columns) in topics.items():
-        told = sources_of(type_name, topic, known, platform=platform, husky_power=husky_power)
-        found = told if isinstance(told, str) else read_rails(columns, told, topic)
-        if isinstance(found, str) or isinstance(told, str):
-            refused.append(str(found))
+        if seldom := _too_seldom(topic, np.asarray(columns[_LOG_TIME], np.float64)):
+            refused += seldom
             continue
-        refused += [why for rail in found if (why := why_refused(rail, columns)) is not None]
-        refused += _too_seldom(topic, np.asarray(columns[_LOG_TIME], np.float64))
-        sources += told
-        if current_sign == "auto":
-            found = [
-                with_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in zip(found, told, strict=True)
-            ]
-        rails[topic] = found
+        choices = sources_of(type_name, topic, known, platform=platform, husky_power=husky_power)
+        found = choices if isinstance(choices, str) else _first_that_holds_power(topic, columns, choices, known)
+        if isinstance(found, str):
+            refused.append(found)
+            continue
+        sources += found.sources
+        warnings += found.warnings
+        rails[topic] = found.rails if current_sign != "auto" else found.by_type()
     rails = _paired(rails)
     refused = refused or _incomplete([rail for found in rails.values() for rail in found])
     if refused:
         return PowerReadings(warnings=tuple(f"power refused: {why}; there will be no energy" for why in refused))
     rails, odd = _believable(rails)
     log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
-    sign, warnings, told_by = _sign(rails, log_times, sources, current_sign)
+    sign, told, told_by = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
-        return PowerReadings(warnings=tuple(warnings))
-    warnings += odd
-    warnings += [f"power: {source.includes} are part of it" for source in sources if source.includes]
+        return PowerReadings(warnings=tuple(told))
+    warnings += [*told, *odd, *(f"power: {of.includes} are part of it" for of in sources if of.includes)]
     signed = {topic: [with_sign(rail, sign) for rail in found] for topic, found in rails.items()}
-    averaged = any(source.averaged for source in sources)
-    return PowerReadings(signed, averaged, tuple(dict.fromkeys(warnings)), told_by)
+    counts = any(of.energy for of in sources)
+    unknown = any(of.averaging_unknown for of in sources) and not counts
+    averaged = counts or any(of.averaged for of in sources)
+    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(warnings)), told_by)
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What a topic's messages hold: a rail for each source."""
+
+    sources: list[PowerSource]
+    rails: list[RailReadings]
+    warnings: list[str]
+
+    def by_type(self) -> list[RailReadings]:
+        """Return the rails with the sign that their type gives a drawn current."""
+        each = zip(self.rails, self.sources, strict=True)
+        return [with_sign(rail, -1 if of.sign == "drawn_negative" else 1) for rail, of in each]
+
+
+def _first_that_holds_power(
+    topic: str, columns: Columns, choices: Sequence[list[PowerSource]], known: Sequence[PowerSource]
+) -> _Told | str:
+    """Return the rails of the first choice whose numbers can be power, or why there are none."""
+    why_not: list[str] = []
+    for sources in choices:
+        found = read_rails(columns, sources, topic, known)
+        if isinstance(found, str):
+            why_not.append(found)
+            continue
+        read = [_unwrapped(rail) for rail in found]
+        rails, warnings = [rail for rail, _ in read], [line for _, lines in read for line in lines]
+        if problems := [why for rail in rails if (why := why_refused(rail, columns)) is not None]:
+            why_not.append("; ".join(problems))
+            continue
+        instead = " + ".join(rail.name for rail in rails)
+        warnings += [f"power: {why}; {instead} is taken instead" for why in why_not]
+        return _Told(sources, rails, warnings)
+    return "; ".join(why_not)
+
+
+def _unwrapped(rail: RailReadings) -> tuple[RailReadings, list[str]]:
+    """Return a rail with its counter's resets said, and with negative currents that were read as unsigned made negative again."""
+    if rail.counter is not None:
+        resets = int(rail.counter.resets.max(initial=0))
+        said = f"power: {rail.name}: its counter of energy was reset {resets} times; what was drawn across that is not known"
+        return rail, [said] if resets else []
+    wraps_amp = wrap_of(rail.current_amp)
+    if wraps_amp is None:
+        return rail, []
+    upper = rail.current_amp > wraps_amp / 2
+    said = f"power: {rail.name}: {np.count_nonzero(upper)} currents are negative ones read as unsigned: {wraps_amp:g} A less each"
+    return replace(rail, current_amp=np.where(upper, rail.current_amp - wraps_amp, rail.current_amp)), [said]
 
 
 def _paired(rails: dict[str, list[RailReadings]]) -> dict[str, list[RailReadings]]:
@@ -177,6 +231,14 @@ def _sign(
         return 1, [f'{why}; settle it with read.current_sign = "drawn_positive"'], "drawn_positive (mean)"
     if sign < 0:
         return -1, [], "drawn_negative (mean, as ROS has it)"
+    return _unclear(share, sources)
+
+
+def _unclear(share: str, sources: Sequence[PowerSource]) -> tuple[int, list[str], str]:
+    """Return what `_sign` does where as much flows one way as the other: ROS' convention counts where it may be meant, else it is asked."""
+    if any(of.sign == "auto" and of.type not in (BATTERY_STATE, *FLOAT_TYPES) for of in sources):
+        why = f"power refused: which sign a drawn current has is not known of its type, nor clear from the record (net {share})"
+        return 0, [f'{why}; write in the recipe under [read]: current_sign = "drawn_positive" or "drawn_negative"'], ""
     why = f"power: the current's sign is unclear (net {share}): taken as negative when drawn, as ROS has it"
     cure = 'settle it with read.current_sign = "drawn_positive" or "drawn_negative"'
     return -1, [f"{why}; {cure}"], "drawn_negative (ROS)"

@@ -14,7 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.robots.profiles import PowerSource, fields_of
+from tcpipe.power.counters import Counter, counted
+from tcpipe.robots.profiles import FieldPath, PowerSource, fields_of
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
@@ -23,11 +24,15 @@ HuskyPower = Literal["battery", "drivers"]
 
 @dataclass(frozen=True, slots=True)
 class RailReadings:
-    """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,)."""
+    """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,).
+
+    Of a counter of energy the current is a first one, by the times of the log.
+    """
 
     name: str
     voltage_volt: Floats
     current_amp: Floats
+    counter: Counter | None = None
 
 
 BATTERY_STATE = "sensor_msgs/msg/BatteryState"
@@ -39,8 +44,8 @@ FLOAT_TYPES = ("std_msgs/msg/Float32", "std_msgs/msg/Float64")
 
 def sources_of(
     type_name: str, topic: str, known: Sequence[PowerSource], *, platform: str | None, husky_power: HuskyPower
-) -> list[PowerSource] | str:
-    """Return what a topic says about power, one source a rail, or one plain line that says why it cannot be known.
+) -> list[list[PowerSource]] | str:
+    """Return what a topic says about power, one source a rail, then what to fall back on; or one plain line why it cannot be known.
 
     Of the tables of its type that fit, the most particular count: those of ``husky_power``, of the platform, of the topic.
     """
@@ -52,9 +57,10 @@ def sources_of(
         and source.husky_power in (None, husky_power)
         and topic.endswith(source.topic or "")
     ]
-    if fitting:
-        best = max(map(_particular, fitting))
-        return [source for source in fitting if _particular(source) == best]
+    choices = [_most_particular([of for of in fitting if of.fallback is last]) for last in (False, True)]
+    if choices := [choice for choice in choices if choice]:
+        refused = next((of.refused for of in choices[0] if of.refused), None)
+        return f"{topic}: {type_name} {refused}" if refused else choices
     if type_name in FLOAT_TYPES:
         return _float_source(type_name, topic)
     platforms = sorted({source.platform for source in of_type if source.platform})
@@ -64,6 +70,17 @@ def sources_of(
     return (
         f"{topic}: {type_name} carries no power that is known here; describe it in the recipe under [[power_sources]]"
     )
+
+
+def power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
+    """Return the columns inside lists of messages that a type's tables name, as drivers[].current."""
+    texts = [text for of in known if of.type == type_name for text in (of.voltage, of.current, of.energy)]
+    return frozenset(of.column for text in texts for of in fields_of(text) if "[]." in of.column)
+
+
+def _most_particular(fitting: Sequence[PowerSource]) -> list[PowerSource]:
+    best = max(map(_particular, fitting), default=None)
+    return [source for source in fitting if _particular(source) == best]
 
 
 def _particular(source: PowerSource) -> tuple[bool, bool, bool]:
@@ -97,56 +114,79 @@ def is_corrected(topic: str) -> bool:
     return topic.lower().endswith(_CORRECTED)
 
 
-def _float_source(type_name: str, topic: str) -> list[PowerSource] | str:
+def _float_source(type_name: str, topic: str) -> list[list[PowerSource]] | str:
     """Return the source of a bare number, by its topic's name."""
     what = quantity(topic)
     if what is None:
         return f"{topic}: neither its type nor its name says whether it is a voltage or a current"
     voltage, current = ("data", "") if what == "voltage" else ("", "data")
-    return [PowerSource(type_name, voltage, current, sign="auto")]
+    return [[PowerSource(type_name, voltage, current, sign="auto")]]
 
 
-def read_rails(columns: Columns, sources: Sequence[PowerSource], topic: str) -> list[RailReadings] | str:
+def read_rails(
+    columns: Columns, sources: Sequence[PowerSource], topic: str, known: Sequence[PowerSource] = ()
+) -> list[RailReadings] | str:
     """Return the rails of a topic, or one plain line that says why its messages do not fit the sources.
 
     Parameters
     ----------
-    columns : the message's fields by dotted name; lists as shape (N, k), rows padded with NaN.
+    columns : ``log_time_ns`` and the message's fields by dotted name; lists as shape (N, k), rows padded with NaN.
     sources : from `sources_of`.
     topic : its name; a rail without a name of its own is called so.
+    known : every table, for those that would fit.
     """
     for source in sources:
-        if why := _misfit(columns, source):
+        if why := _misfit(columns, source, known):
             return f"{topic}: {why}"
     return [_rail(columns, source, topic) for source in sources]
 
 
-def _misfit(columns: Columns, source: PowerSource) -> str | None:
+def _misfit(columns: Columns, source: PowerSource, known: Sequence[PowerSource]) -> str | None:
     """Return why messages do not fit a source."""
     currents = fields_of(source.current)
-    for name, index in [*fields_of(source.voltage), *currents]:
-        if name not in columns:
-            return f"its messages have no field {name}"
-        width = columns[name].shape[1] if columns[name].ndim == 2 else None
-        if index is not None and (width is None or width <= index):
-            return f"{name} holds {width or 0} values, the robot's platform needs {index + 1}"
-        if (name, index) in currents and source.currents_listed not in (None, width):
-            return f"{name} holds {width} values, this platform's {source.currents_listed}; name the robot with --robot"
+    for of in [*fields_of(source.voltage), *currents, *fields_of(source.energy)]:
+        if of.column not in columns:
+            return f"its messages have no field {of.column}"
+        width = columns[of.column].shape[1] if columns[of.column].ndim == 2 else None
+        if not of.every and of.index is None and width is not None:
+            return f"{of.column} is a list; wanted {of.column}[0] for one of its values, {of.column}[] for their sum"
+        needed = of.index + 1 if of.index is not None else int(of.every)
+        if needed and (width is None or width < needed):
+            return f"{of.column} holds {width or 0} values, the robot's platform needs {needed}"
+        if of in currents and source.currents_listed not in (None, width):
+            return f"{of.column} holds {width} values, this platform's {source.currents_listed}; {_fitting(source, width, known)}"
     return None
 
 
+def _fitting(source: PowerSource, width: int | None, known: Sequence[PowerSource]) -> str:
+    """Return which robot's message it could be, by how many currents it lists."""
+    platforms = {of.platform for of in known if of.type == source.type and of.currents_listed == width and of.platform}
+    which = f" of platform {', '.join(sorted(platforms))}" if platforms else ""
+    return f"name the robot{which} with --robot"
+
+
 def _rail(columns: Columns, source: PowerSource, topic: str) -> RailReadings:
-    voltage, current = (_summed(columns, fields_of(text)) for text in (source.voltage, source.current))
+    name = source.rail or (rail_of(topic) if source.type in FLOAT_TYPES else topic)
+    voltage = source.voltage_scale * _summed(columns, fields_of(source.voltage))
+    if source.energy:
+        parts = [(of.sign * source.energy_scale, _values(columns, of)) for of in fields_of(source.energy)]
+        counter = counted(parts, wraps=source.counter_wraps)
+        stamps = np.asarray(columns["log_time_ns"], np.int64)
+        return RailReadings(name, voltage, counter.mean_amp(stamps, voltage), counter)
+    current = source.current_scale * _summed(columns, fields_of(source.current))
     if source.wraps_amp is not None:
         current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)
-    return RailReadings(source.rail or (rail_of(topic) if source.type in FLOAT_TYPES else topic), voltage, current)
+    return RailReadings(name, voltage, current)
 
 
-def _summed(columns: Columns, fields: Sequence[tuple[str, int | None]]) -> Floats:
-    """Return the sum of fields, NaN where there is none."""
+def _summed(columns: Columns, fields: Sequence[FieldPath]) -> Floats:
+    """Return the sum of fields, NaN where there is none or one of them is not known."""
     if not fields:
         return np.full(len(next(iter(columns.values()))), np.nan)
-    total: Floats = np.sum([_values(columns, *of) for of in fields], axis=0)
+    parts = [
+        np.where(np.abs(values) <= _IMPOSSIBLE, values, np.nan) for values in (_values(columns, of) for of in fields)
+    ]
+    total: Floats = np.sum([of.sign * values for of, values in zip(fields, parts, strict=True)], axis=0)
     return total
 
 
@@ -154,10 +194,10 @@ _IMPOSSIBLE = 1e6
 """No battery has more volts, no drive more amperes (a current in milliamperes is refused by its median)."""
 
 
-def _values(columns: Columns, name: str, index: int | None) -> Floats:
-    values = columns[name]
-    chosen = np.asarray(values if index is None else values[:, index], np.float64)
-    return np.where(np.abs(chosen) <= _IMPOSSIBLE, chosen, np.nan)
+def _values(columns: Columns, of: FieldPath) -> Floats:
+    """Return a field's values, shape (N,); of a list that is summed NaN where a row is shorter than others."""
+    values = np.asarray(columns[of.column], np.float64)
+    return values.sum(axis=1) if of.every else values if of.index is None else values[:, of.index]
 
 
 def why_refused(rail: RailReadings, columns: Columns) -> str | None:
@@ -227,4 +267,5 @@ def sign_by_mean(current_amp: Floats, weight_s: Floats) -> tuple[int, float]:
 
 def with_sign(rail: RailReadings, sign: int) -> RailReadings:
     """Return the rail with its current positive when drawn."""
-    return replace(rail, current_amp=sign * rail.current_amp)
+    counter = None if rail.counter is None else rail.counter.times(sign)
+    return replace(rail, current_amp=sign * rail.current_amp, counter=counter)

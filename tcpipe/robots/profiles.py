@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
-from annotated_types import Ge, Le
+from annotated_types import Ge, Gt, Le
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
@@ -15,14 +15,29 @@ Size = Annotated[float, Ge(0.05), Le(100)]
 """Of a robot [m]: from a toy's to a mining truck's."""
 Speed = Annotated[float, Ge(0.01), Le(100)]
 Volt = Annotated[float, Ge(0.1), Le(1e4)]
+Scale = Annotated[float, Gt(0), Le(1e9)]
 
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
 
 CurrentSign = Literal["drawn_positive", "drawn_negative", "auto"]
 
-_FIELD = re.compile(r"\s*([\w.]+)(?:\[(\d+)\])?\s*")
+_FIELD = re.compile(r"\s*(?P<path>[\w.]+)(?P<of_list>\[(?P<index>\d*)\](?P<inner>\.[\w.]+)?)?\s*")
 _TYPE = re.compile(r"\w+/msg/\w+")
+
+
+@dataclass(frozen=True, slots=True)
+class FieldPath:
+    """One field of a message that a power source names.
+
+    ``column`` is its column: the dotted name, with ``[]`` behind a list of messages (``drivers[].current``). Of a list ``index`` is the
+    element that is meant, and with ``every`` all are summed. ``sign`` is -1 where it is subtracted.
+    """
+
+    column: str
+    index: int | None = None
+    every: bool = False
+    sign: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,26 +69,50 @@ class Robot:
 
 @dataclass(frozen=True, slots=True)
 class PowerSource:
-    """What a message type tells of one rail: one voltage and the current that drives the wheels at it. Several rails are several tables."""
+    """What a message type tells of one rail: one voltage and the current that drives the wheels at it. Several rails are several tables.
+
+    Fields are named by dotted path; ``volts[0]`` is an element of a list, ``drivers[0].amps`` a field of a message in a list,
+    ``drivers[].amps`` the sum over all of them; ``left + right - spare`` is a sum of fields.
+    """
 
     __pydantic_config__ = _STRICT
 
     type: str
     """Message type, as package/msg/Name in ROS 1 and 2 alike."""
     voltage: str = ""
-    """Field of the voltage [V] by dotted name, an element of a list as volts[0]; none where the message carries a current alone."""
+    """Field of the voltage [V]; none where the message carries a current alone."""
     current: str = ""
-    """Field of the current [A], several that are to be summed as left_current + right_current; none where it carries a voltage alone."""
+    """Field of the current [A]; none where it carries a voltage alone, or a counter."""
+    energy: str = ""
+    """Field of a counter of energy, in place of a current, for example drawn - given_back."""
+    voltage_scale: Scale = 1.0
+    """What the voltage's field is multiplied by: 0.001 where it is in millivolts."""
+    current_scale: Scale = 1.0
+    """What the current's field is multiplied by: 0.001 where it is in milliamperes."""
+    energy_scale: Scale = 1.0
+    """What the counter is multiplied by: 3600 where it counts watt-hours."""
+    counter_wraps: Annotated[float, Gt(0), Le(1e19)] | None = None
+    """Where the counter begins at zero again, in its own unit; without, a counter that falls was reset."""
     rail: str = ""
     """The rail's name; none takes the topic's."""
     averaged: bool = False
     """Whether a value is the mean over the period that ends with the message, rather than sampled."""
+    averaging_unknown: bool = False
+    """Nobody knows whether it averages: the motion tells where it can, else `averaged` counts."""
     sign: CurrentSign = "drawn_positive"
     """Which sign a drawn current has; auto where robots disagree: the mean over the run tells."""
     propulsion: bool = True
     """Whether the current drives the wheels alone; such a source is taken before others."""
     includes: str = ""
     """What the current feeds besides the drives; said in a warning."""
+    unknown: str = ""
+    """What is not known of it; stands in the reference."""
+    refused: str = ""
+    """Why this type tells no power, and what would; then it plays no role, and no field is named."""
+    rate_setting: str = ""
+    """What sets its rate; said where it comes too slowly."""
+    fallback: bool = False
+    """Only where the type's other tables cannot be read or hold no power (a current that is zero throughout)."""
     platform: str | None = None
     """Only for robots of this platform."""
     topic: str | None = None
@@ -83,17 +122,22 @@ class PowerSource:
     currents_listed: Annotated[int, Ge(1), Le(1000)] | None = None
     """How many currents the message's list holds, where its definition says so; a message of another length is refused."""
     wraps_amp: Annotated[float, Ge(1), Le(1e9)] | None = None
-    """A current above half of this is a negative one that was read as unsigned [A]."""
+    """A current above half of this is a negative one that was read as unsigned [A]; without, the record tells."""
 
     def contradictions(self) -> Iterator[tuple[str, str]]:
         """Yield each key whose value cannot be, and what was wanted."""
         if not _TYPE.fullmatch(self.type):
             yield "type", "package/msg/Name"
-        for key in ("voltage", "current"):
-            if (text := getattr(self, key)) and not all(map(_FIELD.fullmatch, text.split("+"))):
-                yield key, "fields joined by +, for example status.left_amp + amps[1]"
-        if not self.voltage and not self.current:
+        for key in ("voltage", "current", "energy"):
+            if (text := getattr(self, key)) and not all(map(_FIELD.fullmatch, re.split(r"[+-]", text))):
+                yield key, "fields joined by + or -, for example status.left_amp + amps[1] or drivers[].amp"
+        if self.refused:
+            if self.voltage or self.current or self.energy:
+                yield "refused", "no field beside it"
+        elif not self.voltage and not self.current:
             yield "current", "a voltage, a current or both"
+        if self.energy and (self.current or not self.voltage):
+            yield "energy", "a voltage beside it, and no current"
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,7 +149,14 @@ class Profiles:
 
     def types(self, *, propulsion: bool = False) -> list[str]:
         """Return the message types that carry power, best first; with ``propulsion`` those that tell it apart for some robot."""
-        return list(dict.fromkeys(of.type for of in self.power_sources if of.propulsion or not propulsion))
+        return list(
+            dict.fromkeys(of.type for of in self.power_sources if (of.propulsion and not of.refused) or not propulsion)
+        )
+
+    def refusals(self) -> dict[str, str]:
+        """Return the message types that carry currents but tell no power, and why."""
+        telling = {of.type for of in self.power_sources if not of.refused}
+        return {of.type: of.refused for of in self.power_sources if of.type not in telling}
 
     def before(self, others: Profiles) -> Profiles:
         """Return these and others: a robot's name and a message type that are here are not taken from there."""
@@ -114,7 +165,12 @@ class Profiles:
         return Profiles({**others.robots, **self.robots}, [*self.power_sources, *there])
 
 
-def fields_of(text: str) -> list[tuple[str, int | None]]:
-    """Return the fields that a source's text joins by +: dotted name, and index where it is an element of a list."""
-    found = [_FIELD.fullmatch(part) for part in text.split("+") if text]
-    return [(of[1], None if of[2] is None else int(of[2])) for of in found if of]
+def fields_of(text: str) -> list[FieldPath]:
+    """Return the fields that a source's text joins by + and -."""
+    found = []
+    for part in re.finditer(r"([+-]?)([^+-]+)", text):
+        if of := _FIELD.fullmatch(part[2]):
+            column = of["path"] + (f"[]{of['inner']}" if of["inner"] else "")
+            index = int(of["index"]) if of["index"] else None
+            found.append(FieldPath(column, index, bool(of["of_list"]) and index is None, -1 if part[1] == "-" else 1))
+    return found

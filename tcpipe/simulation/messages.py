@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -50,12 +50,6 @@ class Recorder:
     """NavSatFix, or GGA sentences."""
     placements: bool = True
     """Whether /tf_static tells where the sensors sit."""
-
-    def heard(self, sensors: Sensors) -> Sensors:
-        """Return the sensors as this recorder's messages mean them: clearpath's Power is averaged over its period, others are not."""
-        if sensors.power is None:
-            return sensors
-        return replace(sensors, power=replace(sensors.power, averaged=self.power == "clearpath_power"))
 
 
 def streams(

@@ -111,7 +111,7 @@ def simulated_drive(scenario: Scenario, index: int = 0, *, seed: int = 1) -> tup
         weave_m=spec.weave_m,
         rng=noise("drive"),
     )
-    sensors = spec.recorder.heard(spec.sensors).mounted(spec.faults)
+    sensors = spec.sensors.mounted(spec.faults)
     return truth, record(truth, scenario.world.site, sensors, spec.faults, noise)
 
 

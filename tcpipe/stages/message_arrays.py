@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -13,10 +14,11 @@ from tcpipe.logs.placements import Transforms
 from tcpipe.tables.arrays import numbers, texts
 
 
-def message_arrays(table: pa.Table) -> dict[str, NDArray[Any]]:
+def message_arrays(table: pa.Table, in_lists: Collection[str] = ()) -> dict[str, NDArray[Any]]:
     """Return a table's columns: numbers as they are, texts as str, lists of numbers as (N, k) with NaN where a row is shorter.
 
-    Columns of other kinds (lists of messages, null) are left out.
+    Columns of other kinds (lists of messages, null) are left out, but for the numbers inside lists of messages that ``in_lists`` names
+    (``drivers[].current``): those are (N, k) as well.
     """
     found: dict[str, NDArray[Any]] = {}
     for name in table.column_names:
@@ -28,7 +30,27 @@ def message_arrays(table: pa.Table) -> dict[str, NDArray[Any]]:
             found[name] = numbers(array)
         elif _is_list(kind) and _is_number(kind.value_type):
             found[name] = _matrix(array)
+    for path in in_lists:
+        name, _, inner = path.partition("[].")
+        if (
+            name in table.column_names
+            and (values := _inside(_combined(table.column(name)), inner.split("."))) is not None
+        ):
+            found[path] = values
     return found
+
+
+def _inside(lists: pa.Array, path: list[str]) -> NDArray[np.float64] | None:
+    """Return a number of every message in lists of messages, shape (N, k); None where there is no such number."""
+    kind = lists.type.value_type if _is_list(lists.type) else pa.null()
+    for name in path:
+        index = kind.get_field_index(name) if pa.types.is_struct(kind) else -1
+        if index < 0:
+            return None
+        kind = kind.field(index).type
+    if not _is_number(kind):
+        return None
+    return _filled(numbers(pc.list_value_length(lists)).astype(np.int64), pc.struct_field(pc.list_flatten(lists), path))
 
 
 def _combined(column: pa.ChunkedArray) -> pa.Array:
@@ -45,10 +67,14 @@ def _is_list(kind: pa.DataType) -> bool:
 
 
 def _matrix(lists: pa.Array) -> NDArray[np.float64]:
-    lengths = numbers(pc.list_value_length(lists)).astype(np.int64)
-    values: NDArray[np.float64] = numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
     if pa.types.is_fixed_size_list(lists.type):
-        return values.reshape(len(lengths), lists.type.list_size)
+        values: NDArray[np.float64] = numbers(pc.list_flatten(lists)).astype(np.float64, copy=False)
+        return values.reshape(len(lists), lists.type.list_size)
+    return _filled(numbers(pc.list_value_length(lists)).astype(np.int64), pc.list_flatten(lists))
+
+
+def _filled(lengths: NDArray[np.int64], flat: pa.Array) -> NDArray[np.float64]:
+    values: NDArray[np.float64] = numbers(flat).astype(np.float64, copy=False)
     if len(lengths) and lengths.min() == lengths.max():
         return values.reshape(len(lengths), -1)
     matrix = np.full((len(lengths), int(lengths.max(initial=0))), np.nan)

@@ -18,8 +18,9 @@ from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.protocols import LogReader
+from tcpipe.stages.read_averaging import with_averaging
 from tcpipe.stages.read_findings import read_findings
-from tcpipe.stages.read_power import columns_of
+from tcpipe.stages.read_power import currents_of
 from tcpipe.stages.read_sensors import place_sensors
 from tcpipe.stages.read_sources import TopicReadings, read_sources
 from tcpipe.tables.levels import STREAMS, Streams
@@ -62,15 +63,15 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     }
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
+    power, asked = with_averaging(power, streams, config)
     findings = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
     facts = replace(findings.facts, odometry_scale=scale)
-    findings = replace(findings, warnings=(*findings.warnings, *unread, *unplaced), facts=facts)
+    findings = replace(findings, warnings=(*findings.warnings, *unread, *unplaced, *asked), facts=facts)
     if not any(role in streams for role in MOTION_ROLES):
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry and gnss have no usable row"
         raise RoleError(what, *findings.warnings)
-    averaged = {"auto": power.averaged, "yes": True, "no": False}[config.power_averaged]
-    return Streams(streams, sensors, assignment.robot, config.gnss_crs, averaged, findings)
+    return Streams(streams, sensors, assignment.robot, config.gnss_crs, power.averaged, findings)
 
 
 def _times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
@@ -111,7 +112,7 @@ def _parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> l
         return [times | columns]
     parts = []
     for rail in power.rails[source.topic]:
-        voltage, current = (columns[name] for name in columns_of(rail.name))
+        voltage, current = currents_of(rail, times, columns)
         known = np.isfinite(voltage) | np.isfinite(current)
         values = {**times, "rail": np.full(len(known), rail.name), "voltage_volt": voltage, "current_amp": current}
         parts.append({name: value[known] for name, value in values.items()})

@@ -15,6 +15,7 @@ from tcpipe.logs.odometry_scale import scaled
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.readings import PowerReadings
+from tcpipe.power.sources import power_lists
 from tcpipe.recipe import ReadConfig, Role
 from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.message_arrays import message_arrays
@@ -55,7 +56,8 @@ def read_sources(
         if topic not in tables:
             warnings.append(f"{role}: {topic} cannot be decoded and plays no part (see the log's damage)")
             continue
-        found = message_arrays(tables[topic])
+        in_lists = power_lists(topics[topic].type_name, known.power_sources) if role == "power" else ()
+        found = message_arrays(tables[topic], in_lists)
         needed = () if role == "power" else needed_fields(topics[topic].type_name)
         if missing := [name for name in needed if name not in found]:
             warnings.append(f"{role}: {topic} plays no part, its messages have no field {', '.join(missing)}")

@@ -118,5 +118,5 @@ def test_two_robots_of_a_recipe_are_not_pooled_unasked(drive, tmp_path):
 
 def test_a_name_that_neither_the_recipe_nor_the_package_has(drive, tmp_path):
     log, _, recipe = drive
-    with pytest.raises(UsageError, match="known: dingo, generic, husky, jackal, ridgeback, scout, warthog"):
+    with pytest.raises(UsageError, match="known: dingo, generic, husky, husky_a300, jackal, ridgeback, scout, warthog"):
         ingest([log], store=tmp_path / "store", recipe=recipe, robot="scuot")

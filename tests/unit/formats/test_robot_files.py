@@ -9,7 +9,7 @@ from tcpipe.formats.json_files import plain
 from tcpipe.formats.recipe_toml import commented_toml, parse_recipe
 from tcpipe.formats.robot_files import profiles_of, shipped_profiles
 from tcpipe.recipe import Recipe
-from tcpipe.robots.profiles import GENERIC, PowerSource, Robot, fields_of
+from tcpipe.robots.profiles import GENERIC, FieldPath, PowerSource, Robot, fields_of
 
 
 def test_a_robot_has_a_file_of_its_name_and_stands_in_the_recipe_that_init_writes():
@@ -45,11 +45,13 @@ def test_a_recipes_own_come_before_the_packages():
     ("text", "wanted"),
     [
         ("", []),
-        ("current", [("current", None)]),
-        ("a.b[0]+a.b[12] + c", [("a.b", 0), ("a.b", 12), ("c", None)]),
+        ("current", [FieldPath("current")]),
+        ("a.b[0]+a.b[12] - c", [FieldPath("a.b", 0), FieldPath("a.b", 12), FieldPath("c", sign=-1)]),
+        ("drivers[].state.amp", [FieldPath("drivers[].state.amp", every=True)]),
+        ("drivers[1].amp + amps[]", [FieldPath("drivers[].amp", 1), FieldPath("amps", every=True)]),
     ],
 )
-def test_fields_are_joined_by_plus(text, wanted):
+def test_fields_are_joined_by_plus_and_minus(text, wanted):
     assert fields_of(text) == wanted
 
 
@@ -67,6 +69,8 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
                     {"type": "Foo", "current": "i["},
                     {"type": "a/msg/B"},
                     {"type": "a/msg/B", "voltage": "v", "sign": "plus"},
+                    {"type": "a/msg/B", "energy": "e", "current": "i"},
+                    {"type": "a/msg/B", "voltage": "v", "refused": "tells phases"},
                 ],
             },
             where="tcpipe.toml",
@@ -82,6 +86,8 @@ def test_everything_that_is_wrong_with_a_robot_is_said_at_once_by_its_key():
         'power_sources.1.current is "i["; wanted fields joined by +',
         "power_sources.2.current",
         'power_sources.3.sign is "plus"; wanted one of drawn_positive',
+        'power_sources.4.energy is "e"; wanted a voltage beside it, and no current',
+        'power_sources.5.refused is "tells phases"; wanted no field beside it',
     ]
     assert len(said) == len(keys)
     assert all(line.startswith(key) for line, key in zip(said, keys, strict=True)), said

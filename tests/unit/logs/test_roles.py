@@ -333,10 +333,21 @@ def test_the_robot_is_found_by_types_then_by_names(topics: list[tuple[str, str]]
 
 def test_the_robot_given_rules_and_must_exist() -> None:
     assert assign(("/status", HUSKY), ("/odom", ODOMETRY), robot="warthog").robot == "warthog"
-    with pytest.raises(RecipeError, match="there are dingo, generic, husky, jackal, ridgeback, warthog"):
+    with pytest.raises(RecipeError, match="there are dingo, generic, husky, husky_a300, jackal, ridgeback, warthog"):
         assign(("/odom", ODOMETRY), robot="spot")
 
 
 def test_the_order_of_the_topics_does_not_matter() -> None:
     topics = [topic("/b/imu", IMU), topic("/a/imu", IMU), topic("/odom", ODOMETRY), topic("/z/odom", ODOMETRY)]
     assert assign_roles(topics, {}) == assign_roles(topics[::-1], {})
+
+
+def test_a_motors_phase_currents_play_no_role_and_the_reason_is_said() -> None:
+    found = assign(
+        ("/a300_0001/platform/odom", ODOMETRY),
+        ("/a300_0001/platform/motors/feedback", "clearpath_motor_msgs/msg/LynxMultiFeedback"),
+        ("/a300_0001/platform/bms/state", "sensor_msgs/msg/BatteryState"),
+    )
+    assert found.roles["power"].topics == ("/a300_0001/platform/bms/state",)
+    assert any("the current in the motor's phases" in line for line in found.warnings)
+    assert found.problems == ()

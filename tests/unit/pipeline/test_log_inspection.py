@@ -151,3 +151,22 @@ def test_a_link_that_leads_to_itself_is_refused(tmp_path):
     (tmp_path / "loop").symlink_to("loop")
     with pytest.raises(UsageError, match="there is no such file"):
         inspect(tmp_path / "loop", recipe=Recipe())
+
+
+def battery_log(path, rate_hz):
+    """Ten seconds of a power topic at a rate."""
+    log_ns = START_NS + (np.arange(10 * rate_hz + 1) * 1e9 / rate_hz).astype(np.int64)
+    columns = {"battery_voltage": np.full(len(log_ns), 25.0), "left_driver_current": np.full(len(log_ns), 4.0)}
+    write_mcap(path, [MessageStream("/status", "husky_msgs/msg/HuskyStatus", log_ns, columns, {})])
+    return path
+
+
+@pytest.mark.parametrize(("rate_hz", "said"), [(1, True), (20, False)])
+def test_power_that_is_too_slow_for_a_metre_is_said_with_what_sets_its_rate(tmp_path, rate_hz, said):
+    with open_log(battery_log(tmp_path / "a.mcap", rate_hz)) as log:
+        found = inspect_log(log, Recipe(), None, full=False)
+    lines = [line for line in found.warnings if "too slowly for segments of 1 m" in line]
+    assert len(lines) == said
+    if said:
+        assert "/status comes at 1 Hz, sampled" in lines[0]
+        assert "diagnostic_frequency of husky_base" in lines[0]

@@ -76,7 +76,7 @@ def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarr
     columns["measured_currents"][:, 0] += np.where(np.arange(N) == 0, 1e-9, 0)  # a current that moves, if little
     found = read_power({"/power": (CLEARPATH_POWER, columns)}, robot, husky_power=option)
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
-    assert found.averaged
+    assert found.averaged == (robot != "husky")  # a Husky's driver asks for the state of the moment
     assert bool(found.warnings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
 
 
@@ -85,8 +85,11 @@ def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:
     assert "measured_currents holds 2 values" in read_power({"/p": (CLEARPATH_POWER, two)}, "husky").warnings[0]
     four = clearpath((VOLT, VOLT, VOLT), (AMP, AMP, AMP, AMP))  # a Jackal's, whose second and third are no drivers'
     assert "holds 4 values, this platform's 3" in read_power({"/p": (CLEARPATH_POWER, four)}, "husky").warnings[0]
+    a300 = clearpath((VOLT,) * 13, (AMP,) * 13)
+    said = read_power({"/p": (CLEARPATH_POWER, a300)}, "husky").warnings[0]
+    assert "holds 13 values, this platform's 3; name the robot of platform A300 with --robot" in said
     unknown = read_power({"/p": (CLEARPATH_POWER, two)}, "generic")
-    assert "names its currents by platform (A200, D100, J100, R100, W200)" in unknown.warnings[0]
+    assert "names its currents by platform (A200, A300, D100, J100, R100, W200)" in unknown.warnings[0]
     assert unknown.rails == {}
 
 
@@ -164,18 +167,34 @@ def test_voltage_and_current_on_two_topics_are_one_rail() -> None:
     np.testing.assert_array_equal(motor.current_amp, AMP)
 
 
-@pytest.mark.parametrize("robot", ["warthog", "generic"])
-def test_a_warthogs_negative_currents_come_as_unsigned(robot: str) -> None:
-    current = np.where(np.arange(N) % 8 == 0, -2.0, AMP)
+@pytest.mark.parametrize(
+    ("robot", "topic", "step_amp"),
+    [
+        ("warthog", "/left_drive/status/battery", 1 / 16),
+        ("generic", "/motor/rear", 1 / 16),
+        ("generic", "/motor/rear", 0.1),
+    ],
+)
+def test_negative_currents_come_as_unsigned_on_any_topic(robot: str, topic: str, step_amp: float) -> None:
+    current = step_amp * np.rint(np.where(np.arange(N) % 8 == 0, -2.0, AMP) / step_amp)
     topics = {
-        "/left_drive/status/battery_voltage": ("std_msgs/msg/Float64", TIMES | {"data": VOLT}),
-        "/left_drive/status/battery_current": ("std_msgs/msg/Float64", TIMES | {"data": current % 4096}),
+        f"{topic}_voltage": ("std_msgs/msg/Float64", TIMES | {"data": VOLT}),
+        f"{topic}_current": ("std_msgs/msg/Float64", TIMES | {"data": current % (65536 * step_amp)}),
     }
-    found = read_power(topics, robot)
-    (rail,) = found.rails["/left_drive/status/battery_current"]
-    assert rail.name == "/left_drive/status/battery"
-    np.testing.assert_array_equal(rail.current_amp, np.where((current > 0) | (robot == "warthog"), current, np.nan))
-    assert any("currents above 1000 A are set aside" in line for line in found.warnings) == (robot == "generic")
+    (rail,) = read_power(topics, robot).rails[f"{topic}_current"]
+    assert rail.name == topic
+    np.testing.assert_allclose(rail.current_amp, current, atol=1e-9)
+    if robot == "generic":
+        assert any(
+            "5 currents are negative ones read as unsigned" in line for line in read_power(topics, robot).warnings
+        )
+
+
+def test_a_large_current_that_is_no_wrap_stays_as_it_is() -> None:
+    """On the grid of milliamperes, as a wrapped number of 16 bits is, but with values all the way up."""
+    rising = np.round(np.linspace(0.0, 65.0, N), 3)
+    (rail,) = read_power({"/b": (BATTERY_STATE, battery(VOLT, rising))}, "generic").rails["/b"]
+    np.testing.assert_array_equal(rail.current_amp, rising)
 
 
 @pytest.mark.parametrize(
@@ -291,3 +310,34 @@ def test_a_row_stands_for_the_time_around_it_and_beside_a_hole_for_three_periods
     found = readings._weight_s(np.array([0.0, 1.0, 2.0, 3.0, 13.0, 14.0, 15.0]))
     assert found.tolist() == [1.0, 1.0, 1.0, 3.0, 3.0, 1.0, 1.0]
     assert readings._weight_s(np.array([5.0])).tolist() == [1.0]
+
+
+def test_a_jackals_drive_feedback_and_the_voltage_of_its_power_are_one_rail() -> None:
+    """The worked example of the how-to: 50 Hz of current, a voltage now and then."""
+    feedback = TIMES | {"drivers[].current": np.stack((AMP, 2 * AMP), -1)}
+    power = {"log_time_ns": np.arange(4) * 500_000_000, "measured_voltages": np.full((4, 3), 26.0)}
+    topics = {"/feedback": ("clearpath_platform_msgs/msg/Feedback", feedback), "/power": (CLEARPATH_POWER, power)}
+    known = [
+        PowerSource("clearpath_platform_msgs/msg/Feedback", current="drivers[].current"),
+        PowerSource(CLEARPATH_POWER, "measured_voltages[0]"),
+    ]
+    found = readings.read_power(topics, known)
+    (current,), (voltage,) = found.rails["/feedback"], found.rails["/power"]
+    assert current.name == voltage.name
+    np.testing.assert_allclose(current.current_amp, 3 * AMP)
+    np.testing.assert_array_equal(voltage.voltage_volt, 26.0)
+
+
+@pytest.mark.parametrize(
+    ("type_name", "reason"),
+    [
+        ("clearpath_motor_msgs/msg/LynxMultiFeedback", "the current in the motor's phases"),
+        ("clearpath_motor_msgs/msg/PumaMultiFeedback", "the motor's current behind the bridge"),
+        ("clearpath_platform_msgs/msg/Feedback", "without a voltage"),
+        ("scout_msgs/msg/ScoutStatus", "neither manual nor driver says"),
+    ],
+)
+def test_currents_that_are_not_known_to_be_drawn_are_refused_with_the_reason(type_name: str, reason: str) -> None:
+    found = read_power({"/motors": (type_name, TIMES)}, "generic")
+    assert found.rails == {}
+    assert reason in found.warnings[0]

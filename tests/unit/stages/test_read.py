@@ -369,3 +369,46 @@ def test_rows_of_power_that_carry_nothing_are_counted() -> None:
     found = power_rows({"log_time_ns": np.arange(6)}, [RailReadings("battery", volt, amp)])
     assert found.dropped == {"not_finite": 1}
     assert found.row.tolist() == [0, 1, 2, 4, 5]
+
+
+def vesc(joule: np.ndarray, late_ns: np.ndarray) -> tuple[str, pa.Table]:
+    """A counter of energy whose messages are written down late by uneven times."""
+    table = message_table(len(joule), 20.0, **{"state.voltage_input": full(len(joule), 24.0)})
+    columns = {"state.energy_drawn": joule / 3600.0, "state.energy_regen": full(len(joule), 0.0)}
+    for name, values in columns.items():
+        table = table.append_column(name, pa.array(values))
+    late = pa.array(table["log_time_ns"].to_numpy() + late_ns)
+    return "vesc_msgs/msg/VescStateStamped", table.set_column(0, "log_time_ns", late)
+
+
+@pytest.mark.parametrize("stepped", [False, True])
+def test_a_counter_of_energy_is_power_by_the_stamps_that_rule(*, stepped: bool) -> None:
+    joule = np.cumsum(np.random.default_rng(3).uniform(3.0, 20.0, 200))
+    late_ns = np.random.default_rng(4).integers(0, 15_000_000, 200)
+    topics = {**husky(), "/sensors/core": vesc(joule, late_ns)}
+    del topics["/left/battery"], topics["/right/battery"]
+    if stepped:
+        topics = {name: (kind, with_step(table)) for name, (kind, table) in topics.items()}
+    found = read(topics)
+    table = found.tables["power"]
+    stamp_s, epoch = table["stamp_ns"].to_numpy() / 1e9, table["epoch"].to_numpy()
+    watt = table["voltage_volt"].to_numpy() * table["current_amp"].to_numpy(zero_copy_only=False)
+    first = np.flatnonzero(np.diff(epoch, prepend=-1))
+    assert np.flatnonzero(np.isnan(watt)).tolist() == first.tolist()
+    assert len(first) == 1 + stepped
+    within = np.diff(epoch) == 0
+    np.testing.assert_allclose((watt[1:] * np.diff(stamp_s))[within], np.diff(joule)[within], rtol=1e-5)
+    assert found.power_averaged
+
+
+@pytest.mark.parametrize(("setting", "averaged", "said"), [("auto", False, "nobody knows"), ("yes", True, None)])
+def test_averaging_that_nobody_knows_and_no_motion_tells_is_asked(
+    *, setting: str, averaged: bool, said: str | None
+) -> None:
+    slow = message_table(11, 1.0, frame=None, power_v=full(11, 28.0), power_a=6.0 + np.cos(np.arange(11)))
+    topics = {**husky(), "/lowstate": ("unitree_go/msg/LowState", slow)}
+    del topics["/left/battery"], topics["/right/battery"]
+    found = read(topics, power_averaged=setting)
+    assert found.power_averaged == averaged
+    asked = [line for line in found.findings.warnings if "nobody knows whether its values are means" in line]
+    assert bool(asked) == (said is not None)

@@ -1,0 +1,58 @@
+"""Whether power is averaged over its messages' period: what its type knows, what the recipe says, or what the motion tells."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.power.averaging import told_averaged
+from tcpipe.power.readings import PowerReadings
+from tcpipe.recipe import ReadConfig
+from tcpipe.tables.arrays import rows_where
+from tcpipe.tables.columns import floats, integers
+
+
+def with_averaging(
+    power: PowerReadings, streams: Mapping[str, pa.Table], config: ReadConfig
+) -> tuple[PowerReadings, list[str]]:
+    """Return the power with whether its values are means over their period, and what is to be said of that."""
+    counts = any(rail.counter is not None for rails in power.rails.values() for rail in rails)
+    if config.power_averaged != "auto" and not counts:
+        return replace(power, averaged=config.power_averaged == "yes"), []
+    if not power.averaging_unknown or "power" not in streams:
+        return power, []
+    table = rows_where(streams["power"], "epoch", 0)
+    rail = rows_where(table, "rail", table["rail"][0].as_py())
+    watt = floats(rail, "voltage_volt") * floats(rail, "current_amp")
+    known = np.isfinite(watt)
+    power_ns = integers(rail, "stamp_ns")[known]
+    period_s = float(np.median(np.diff(power_ns))) / 1e9 if len(power_ns) > 1 else np.inf
+    if period_s < _FAST_S:
+        return power, []
+    motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
+    told = None if motion is None else _by_motion(power_ns, watt[known], rows_where(motion, "epoch", 0))
+    averaged = power.averaged if told is None else told
+    how = "the mean since the one before it" if averaged else "sampled at its stamp"
+    why = (
+        "nobody knows whether its values are means over their period, nor does the motion tell"
+        if told is None
+        else "the motion tells"
+    )
+    said = f'power: {why}: each is taken as {how}; settle it with read.power_averaged = "yes" or "no"'
+    return replace(power, averaged=averaged), [] if told is None and period_s < _SLOW_S else [said]
+
+
+_FAST_S = 0.04
+"""Of what comes as often it makes no difference."""
+_SLOW_S = 0.11
+"""Of what comes as often half a period is no question worth asking."""
+
+
+def _by_motion(power_ns: NDArray[np.int64], watt: NDArray[np.float64], motion: pa.Table) -> bool | None:
+    twist = np.column_stack([floats(motion, name) for name in ("velocity_x_mps", "angular_velocity_z_radps")])
+    moving = np.isfinite(twist).all(axis=1)
+    return told_averaged(power_ns, watt, integers(motion, "stamp_ns")[moving], *twist[moving].T)

@@ -1,0 +1,196 @@
+"""A message of each robot family, written by rosbags from its own definition and read through a real log: the power that was put in."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.robot_files import profiles_of, shipped_profiles
+from tcpipe.logs.definitions import DEFINITIONS
+from tcpipe.power.readings import PowerReadings, read_power
+from tcpipe.power.sources import power_lists
+from tcpipe.recipe import Recipe
+from tcpipe.robots.profiles import PowerSource
+from tcpipe.stages.message_arrays import message_arrays
+
+N = 60
+VOLT = 25.0 + 0.1 * np.arange(N) / N
+AMP = 5.0 + np.cos(np.arange(N))
+STEP_NS = 50_000_000
+FLAGS = {"error": False, "write_pdo_cmds_error": False}
+
+
+def filled(types, name: str, given: dict):
+    """Return a message of zeros but for what is given; nested messages as dicts, of lists each element."""
+    empty = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}
+    values = {}
+    for field, (kind, of) in types.get_msgdef(name).fields:
+        values[field] = made(types, kind, of, given.get(field), empty)
+    return types.types[name](**values)
+
+
+def made(types, kind, of, value, empty):
+    if int(kind) == 1:
+        return empty.get(of[0], 0) if value is None else value
+    if int(kind) == 2:
+        return filled(types, of, value or {})
+    (inner, inner_of), length = of
+    if int(inner) == 1:
+        numbers = np.dtype(inner_of[0] if inner_of[0] != "string" else "O")
+        return np.zeros(length, numbers) if value is None else np.asarray(value, numbers)
+    return [filled(types, inner_of, each) for each in (value if value is not None else [{}] * length)]
+
+
+def log_of(path: Path, name: str, rows: list[dict]) -> Path:
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    found = {}
+    for of, text in DEFINITIONS.items():
+        found.update(get_types_from_msg(text, of))
+    types.register(found)
+    with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/power", name, typestore=types)
+        for i, row in enumerate(rows):
+            stamp_ns = 1_700_000_000_000_000_000 + i * STEP_NS
+            header = {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}}
+            message = filled(types, name, {"header": header, **row})
+            writer.write(connection, stamp_ns, types.serialize_cdr(message, name))
+    return path
+
+
+def power_of(path: Path, robot: str = "generic", recipe: Recipe | None = None, **options) -> PowerReadings:
+    known = profiles_of(recipe) if recipe else shipped_profiles()
+    with open_log(path) as log:
+        type_name = log.topics["/power"].type_name
+        columns = message_arrays(log.tables(["/power"])["/power"], power_lists(type_name, known.power_sources))
+    platform = known.robots[robot].platform
+    return read_power({"/power": (type_name, columns)}, known.power_sources, platform=platform, **options)
+
+
+def watt(found: PowerReadings) -> np.ndarray:
+    assert found.rails, found.warnings
+    return np.sum([rail.voltage_volt * rail.current_amp for rails in found.rails.values() for rail in rails], axis=0)
+
+
+def husarion(drivers: int, sign: int = 1) -> list[dict]:
+    return [
+        {"driver_states": [{"state": {"voltage": volt, "current": sign * amp * (k + 1)}} for k in range(drivers)]}
+        for volt, amp in zip(VOLT, AMP, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("drivers", "share"), [(1, 1), (2, 3)])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_husarions_drivers_are_summed_however_many_there_are(drivers, share, sign, tmp_path):
+    found = power_of(log_of(tmp_path / "a", "husarion_ugv_msgs/msg/RobotDriverState", husarion(drivers, sign)))
+    np.testing.assert_allclose(watt(found), VOLT * share * AMP, rtol=1e-6)
+    assert found.averaging_unknown
+    assert found.current_sign.startswith("drawn_positive" if sign > 0 else "drawn_negative")
+
+
+def test_a_driver_that_is_missing_now_and_then_is_no_smaller_current(tmp_path):
+    rows = husarion(2)
+    rows[7] = husarion(1)[7]
+    found = watt(power_of(log_of(tmp_path / "a", "husarion_ugv_msgs/msg/RobotDriverState", rows)))
+    assert np.flatnonzero(np.isnan(found)).tolist() == [7]
+
+
+def test_an_earlier_panther(tmp_path):
+    rows = [
+        {"front": {"voltage": v, "current": a}, "rear": {"voltage": v, "current": a / 2}}
+        for v, a in zip(VOLT, AMP, strict=True)
+    ]
+    found = power_of(log_of(tmp_path / "a", "panther_msgs/msg/DriverState", rows))
+    np.testing.assert_allclose(watt(found), VOLT * 1.5 * AMP, rtol=1e-6)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_unitree_go2(sign, tmp_path):
+    rows = [{"power_v": v, "power_a": sign * a} for v, a in zip(VOLT, AMP, strict=True)]
+    found = power_of(log_of(tmp_path / "a", "unitree_go/msg/LowState", rows))
+    np.testing.assert_allclose(watt(found), VOLT * AMP, rtol=1e-6)
+    assert any("computers, sensors and payload" in line for line in found.warnings)
+
+
+def test_a_sign_that_neither_type_nor_record_tells_is_asked_for(tmp_path):
+    rows = [{"power_v": v, "power_a": 4.0 * np.sin(i)} for i, v in enumerate(VOLT)]
+    path = log_of(tmp_path / "a", "unitree_go/msg/LowState", rows)
+    found = power_of(path)
+    assert found.rails == {}
+    assert 'current_sign = "drawn_positive" or "drawn_negative"' in found.warnings[0]
+    assert power_of(path, current_sign="drawn_negative").rails
+
+
+def a300(lynx: float, pack_amp: np.ndarray = AMP + 3.0) -> list[dict]:
+    return [
+        {
+            "measured_voltages": [v, *[0.0] * 8, *[v] * 4],
+            "measured_currents": [p, *[0.0] * 8, *(lynx * a * k for k in (1, 2, 3, 4))],
+        }
+        for v, a, p in zip(VOLT, AMP, pack_amp, strict=True)
+    ]
+
+
+@pytest.mark.parametrize(("lynx", "expected"), [(1.0, VOLT * 10 * AMP), (0.0, VOLT * (AMP + 3.0))])
+def test_a_husky_a300_tells_its_drives_or_else_its_pack(lynx, expected, tmp_path):
+    path = log_of(tmp_path / "a", "clearpath_platform_msgs/msg/Power", a300(lynx))
+    found = power_of(path, "husky_a300")
+    np.testing.assert_allclose(watt(found), expected, rtol=1e-6)
+    assert found.averaged
+    assert any("is taken instead" in line for line in found.warnings) == (lynx == 0.0)
+    assert any("computers and user ports" in line for line in found.warnings) == (lynx == 0.0)
+    assert "of platform A300" in power_of(path, "husky").warnings[0]
+
+
+def vesc(joule: np.ndarray, *, given_back: float = 0.0, amp: np.ndarray = AMP) -> list[dict]:
+    back = given_back * np.arange(N)
+    return [
+        {"state": {"voltage_input": v, "current_input": a, "energy_drawn": (e + b) / 3600, "energy_regen": b / 3600}}
+        for v, a, e, b in zip(VOLT, amp, joule, back, strict=True)
+    ]
+
+
+def test_a_vescs_watt_hours_are_its_power(tmp_path):
+    joule = np.concatenate(([7.0], 7.0 + np.cumsum(VOLT[1:] * AMP[1:]) * STEP_NS / 1e9))
+    path = log_of(tmp_path / "a", "vesc_msgs/msg/VescStateStamped", vesc(joule, given_back=0.1, amp=0.5 * AMP))
+    found = power_of(path)
+    np.testing.assert_allclose(watt(found)[1:], (VOLT * AMP)[1:], rtol=1e-6)
+    assert np.isnan(watt(found)[0])
+    assert found.averaged
+
+
+def test_a_vesc_that_counts_nothing_tells_its_mean_current(tmp_path):
+    found = power_of(log_of(tmp_path / "a", "vesc_msgs/msg/VescStateStamped", vesc(np.zeros(N))))
+    np.testing.assert_allclose(watt(found), VOLT * AMP, rtol=1e-6)
+    assert any("the current is 0 A on all" in line and "taken instead" in line for line in found.warnings)
+
+
+def test_a_counter_that_is_reset_is_said_and_tells_nothing_across_it(tmp_path):
+    joule = 12.0 * np.arange(N)
+    joule[30:] -= joule[30]
+    found = power_of(log_of(tmp_path / "a", "vesc_msgs/msg/VescStateStamped", vesc(joule)))
+    assert np.flatnonzero(np.isnan(watt(found))).tolist() == [0, 30]
+    np.testing.assert_allclose(np.delete(watt(found), [0, 30]), 240.0, rtol=1e-6)
+    assert any("was reset 1 times" in line for line in found.warnings)
+
+
+SCOUT = PowerSource("scout_msgs/msg/ScoutStatus", "battery_voltage", "actuator_states[].current", sign="auto")
+
+
+def test_what_nobody_knows_of_a_scout_is_asked_and_three_lines_answer(tmp_path):
+    rows = [{"battery_voltage": v, "actuator_states": [{"current": a / 4}] * 4} for v, a in zip(VOLT, AMP, strict=True)]
+    path = log_of(tmp_path / "a", "scout_msgs/msg/ScoutStatus", rows)
+    refused = power_of(path)
+    assert refused.rails == {}
+    assert "flows in the motor's phases" in refused.warnings[0]
+    np.testing.assert_allclose(watt(power_of(path, recipe=Recipe(power_sources=[SCOUT]))), VOLT * AMP, rtol=1e-6)
+
+
+def test_a_list_named_without_its_brackets_is_asked_for(tmp_path):
+    rows = a300(1.0)
+    path = log_of(tmp_path / "a", "clearpath_platform_msgs/msg/Power", rows)
+    mine = PowerSource("clearpath_platform_msgs/msg/Power", "measured_voltages[0]", "measured_currents")
+    said = power_of(path, recipe=Recipe(power_sources=[mine])).warnings[0]
+    assert "measured_currents is a list; wanted measured_currents[0] for one of its values" in said
