@@ -28,7 +28,7 @@ from tcpipe.fusion.measurements import (
     Positions,
 )
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
-from tcpipe.fusion.trajectory import Trajectory
+from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, product, quat_from_rpy, rotate
 
 Floats = NDArray[np.float64]
@@ -52,6 +52,7 @@ _BLOCK_S = 10.0
 _CLIMB_S = 4.0
 _LEAST_TILT_STD_RAD = 0.004
 _STATED_TILT_STD_RAD = 0.0175
+_LEAST_WAY_M = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -315,7 +316,29 @@ def rearmed(gnss: Positions, error_m: Floats) -> Positions:
 
 
 def with_antenna_doubt(found: Trajectory, covariance_m2: Floats) -> Trajectory:
-    """Return the trajectory with what is not known of the arm in its position: it turns with the robot, and lasts."""
-    rotation = matrix_from_quat(found.quat_xyzw)
+    """Return the trajectory with what is not known of the arm: it turns with the robot, so that turns make it an error of ways and speeds."""
+    rotation, rate = matrix_from_quat(found.quat_xyzw), found.angular_velocity_radps
     doubt_m2 = np.einsum("kij,jl,kil->ki", rotation, covariance_m2, rotation)
-    return replace(found, position_std_m=np.sqrt(found.position_std_m**2 + doubt_m2))
+    ahead = np.column_stack((np.zeros(rate.shape[0]), -rate[:, 2], rate[:, 1]))  # of w x l
+    speed_m2ps2 = np.einsum("ki,ij,kj->k", ahead, covariance_m2, ahead)
+    return replace(
+        found,
+        position_std_m=np.sqrt(found.position_std_m**2 + doubt_m2),
+        forward_velocity_std_mps=np.sqrt(found.forward_velocity_std_mps**2 + speed_m2ps2),
+        displacement_std_m=np.hypot(found.displacement_std_m, _swung_std_m(found, rotation, covariance_m2)),
+    )
+
+
+def _swung_std_m(found: Trajectory, rotation: Floats, covariance_m2: Floats) -> Floats:
+    """Return how far an arm's error goes round along the robot's way within each of `DISPLACEMENT_LAGS_S` [m], shape (N, 4)."""
+    swung_m2 = np.zeros((rotation.shape[0], len(DISPLACEMENT_LAGS_S)))
+    period_s = median_period_ns(found.stamp_ns) * 1e-9
+    for column, lag_s in enumerate(DISPLACEMENT_LAGS_S):
+        rows = round(lag_s / period_s)
+        if not 0 < rows < rotation.shape[0]:
+            continue
+        way = (found.position_enu_m[rows:] - found.position_enu_m[:-rows])[:, :2]
+        along = way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _LEAST_WAY_M)
+        beside = np.einsum("ki,kij->kj", along, (rotation[rows:] - rotation[:-rows])[:, :2])
+        swung_m2[:-rows, column] = np.einsum("ki,ij,kj->k", beside, covariance_m2, beside)
+    return np.sqrt(swung_m2)

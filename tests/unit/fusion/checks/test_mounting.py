@@ -166,6 +166,28 @@ def test_what_is_not_known_of_an_arm_turns_with_the_robot(track):
     assert doubted.position_std_m[:, 1] == pytest.approx(np.hypot(0.01, 0.3))
 
 
+def test_an_arms_error_that_goes_round_with_the_robot_is_an_error_of_ways_and_speeds_along_them(track):
+    """An antenna known to 0.1 m sideways on a circle: the chord is off by both ends' difference, 2 sin(half the turn), along itself."""
+    turn_radps, speed_mps = 0.5, 1.0
+    at_s = (track.stamp_ns - track.stamp_ns[0]) * 1e-9
+    yaw, radius_m, zero = turn_radps * at_s, speed_mps / turn_radps, np.zeros(at_s.size)
+    round_ = replace(
+        track,
+        position_enu_m=radius_m * np.column_stack((np.sin(yaw), -np.cos(yaw), zero)),
+        quat_xyzw=Rotation.from_euler("z", yaw).as_quat(),
+        velocity_enu_mps=speed_mps * np.column_stack((np.cos(yaw), np.sin(yaw), zero)),
+        angular_velocity_radps=np.column_stack((zero, zero, zero + turn_radps)),
+        displacement_std_m=np.zeros_like(track.displacement_std_m),
+        forward_velocity_std_mps=zero,
+    )
+    doubted = with_antenna_doubt(round_, np.diag([0.0, 0.01, 0.0]))
+    assert doubted.forward_velocity_std_mps == pytest.approx(np.full(at_s.size, 0.1 * turn_radps))
+    expected = 0.1 * 2.0 * np.sin(turn_radps * np.array([0.5, 1.0, 2.0, 4.0]) / 2.0)
+    assert doubted.displacement_std_m[:-100] == pytest.approx(np.tile(expected, (at_s.size - 100, 1)), rel=1e-6)
+    ahead = with_antenna_doubt(round_, np.diag([0.01, 0.0, 0.0]))
+    assert ahead.displacement_std_m == pytest.approx(0.0, abs=1e-9)
+
+
 def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
     assert antenna_doubt(None, None, (0.0, 0.0, 1.0)) is None
     tilt = Tilt(np.zeros(2), np.array([0.02, 0.01]))
