@@ -316,7 +316,7 @@ def rearmed(gnss: Positions, error_m: Floats) -> Positions:
 
 
 def with_antenna_doubt(found: Trajectory, covariance_m2: Floats) -> Trajectory:
-    """Return the trajectory with what is not known of the arm: it turns with the robot, so that turns make it an error of ways and speeds."""
+    """Return the trajectory with what is not known of the arm: it turns with the robot, so that ways and speeds err where it turns."""
     rotation, rate = matrix_from_quat(found.quat_xyzw), found.angular_velocity_radps
     doubt_m2 = np.einsum("kij,jl,kil->ki", rotation, covariance_m2, rotation)
     ahead = np.column_stack((np.zeros(rate.shape[0]), -rate[:, 2], rate[:, 1]))  # of w x l

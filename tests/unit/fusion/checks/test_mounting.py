@@ -174,7 +174,7 @@ def test_an_arms_error_that_goes_round_with_the_robot_is_an_error_of_ways_and_sp
     round_ = replace(
         track,
         position_enu_m=radius_m * np.column_stack((np.sin(yaw), -np.cos(yaw), zero)),
-        quat_xyzw=Rotation.from_euler("z", yaw).as_quat(),
+        quat_xyzw=Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]).as_quat(),
         velocity_enu_mps=speed_mps * np.column_stack((np.cos(yaw), np.sin(yaw), zero)),
         angular_velocity_radps=np.column_stack((zero, zero, zero + turn_radps)),
         displacement_std_m=np.zeros_like(track.displacement_std_m),
