@@ -155,6 +155,8 @@ def _counted(measurements: Measurements, errors: FixErrors | None, *, doubted: b
         return measurements
     gnss = measurements.gnss
     variance = errors.white_m2 if doubted else np.maximum(errors.white_m2, gnss.variance_m2)
+    if gnss.unclaimed is not None:
+        variance = np.where(gnss.unclaimed[:, None], errors.white_m2, variance)
     if errors.of_metres:  # odometry knows better for half a minute: so often they count
         together = max(1.0, _LASTS_S * 1e9 / median_period_ns(gnss.stamp_ns))
         lasting_m2 = np.median(errors.lasting_m2[:, 0])

@@ -4,7 +4,8 @@ A receiver's covariance is one number for both. Their difference is what matters
 (a float solution's ambiguities, satellite-based corrections, multipath) moves a track with it. Fixes are laid, over twenty seconds, on the
 path that odometry and gyroscope draw, by rotation, scale and the bend of a gyroscope's bias. Second differences of what is left are the
 white part. Where it is a quarter of the claimed variance or less, the rest of the claim lasts; where it is far more, it counts instead.
-What is left itself, where it is far more than claimed, is an error that lasts and was not claimed.
+What is left itself, where it is far more than claimed, is an error that lasts and was not claimed. Where a receiver claims nothing, the
+scatter is the white part, and nothing lasts but where the fixes bend off the path by more than an odometry does in twenty seconds.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ _FAR_MORE = 6.0
 _UNCLAIMED = 3.0
 _DRAWN_HOLDS_M = 0.15
 _SHARE_SEEN = 6.0
+_BENDS_M, _LEAST_M = 0.09, 0.01
 _FLOAT_M = 0.5
 _LASTS_S, _METRES_LAST_S = 45.0, 120.0
 _LARGE_M = 0.03
@@ -70,6 +72,10 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
     little = scatter < _LITTLE * claimed
     white[little] = np.maximum(scatter, 0.01 * claimed)[little]
     lasting[little] = (claimed - white)[little]
+    if drawn is not None and gnss.unclaimed is not None:
+        unclaimed = gnss.unclaimed & np.isfinite(scatter).all(1)
+        white[unclaimed] = np.maximum(scatter, _LEAST_M**2)[unclaimed]
+        lasting[unclaimed] = _bends(gnss, np.abs(left) ** 2)[unclaimed]
     if drawn is not None:
         much = scatter > _FAR_MORE * claimed
         white[much] = scatter[much]
@@ -79,6 +85,13 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
             lasting[:] = np.maximum(lasting, _SHARE_SEEN**2 * wander_m2)
     lasts_s = np.where(lasting[:, 0] > _FLOAT_M**2, _METRES_LAST_S, _LASTS_S)
     return FixErrors(white, lasting, lasts_s)
+
+
+def _bends(gnss: Positions, left_m2: Floats) -> Floats:
+    """Return what lasts of fixes that claim nothing: where they bend off the drawn path by more than an odometry does, shape (N, 3)."""
+    wander_m2 = _rolling_median(gnss, left_m2, _BLOCK_S) / _SQUARES_OF_TWO
+    seen = np.where(wander_m2 > _BENDS_M**2, _SHARE_SEEN**2 * wander_m2, 0.0)
+    return np.asarray(seen[:, None] * np.array([1.0, 1.0, 4.0]))
 
 
 def _drawn(measurements: Measurements, gnss: Positions) -> NDArray[np.complex128] | None:
@@ -129,9 +142,9 @@ def _second_differences(values: NDArray[np.complex128] | Floats) -> Floats:
     return squared
 
 
-def _rolling_median(gnss: Positions, values: Floats) -> Floats:
+def _rolling_median(gnss: Positions, values: Floats, window_s: float = _WINDOW_S) -> Floats:
     """Return the median of the known values over some seconds around each fix, shape (N,); where none is known, that of all."""
-    count = max(_FEWEST, round(_WINDOW_S * 1e9 / median_period_ns(gnss.stamp_ns)))
+    count = max(_FEWEST, round(window_s * 1e9 / median_period_ns(gnss.stamp_ns)))
     known = np.flatnonzero(np.isfinite(values))
     if known.size < count:
         return np.full(values.size, np.nan)

@@ -34,12 +34,14 @@ class Positions:
     position_enu_m : [m], shape (N, 3), antenna in the ENU plane of the datum.
     variance_m2 : [m²], shape (N, 3), east, north, up; floored, never unknown.
     lever_arm_m : [m], position of the antenna in base_link.
+    unclaimed : shape (N,), where the receiver claims none and the variance is the recipe's; None where it always claims one.
     """
 
     stamp_ns: NDArray[np.int64]
     position_enu_m: NDArray[np.float64]
     variance_m2: NDArray[np.float64]
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
+    unclaimed: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True, slots=True)

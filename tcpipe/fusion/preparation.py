@@ -85,10 +85,11 @@ def positions(
     usable, repeated = _usable(stamp_ns, _is_fix(lon, lat, alt))
     variance = np.stack([columns[f"{axis}_var_m2"] for axis in ("east", "north", "up")], -1)[usable]
     default = np.square(default_std_m * np.array([1.0, 1.0, 2.0]))
+    unclaimed = np.asarray(~_known(variance[:, :2]).all(1))
     variance, replaced = _variances(variance, default, floor_std_m**2)
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
-    return Positions(stamp_ns[usable], fixes, variance, lever_arm_m), prepared
+    return Positions(stamp_ns[usable], fixes, variance, lever_arm_m, unclaimed if unclaimed.any() else None), prepared
 
 
 def body_velocities(
@@ -249,11 +250,16 @@ def _usable(stamp_ns: NDArray[np.int64], good: NDArray[np.bool_]) -> tuple[NDArr
     return rows[first], int(rows.size - first.size)
 
 
+def _known(variance: NDArray[np.float64]) -> NDArray[np.bool_]:
+    known: NDArray[np.bool_] = np.isfinite(variance) & (variance > 0)
+    return known
+
+
 def _variances(
     variance: NDArray[np.float64], default: NDArray[np.float64], floor: float
 ) -> tuple[NDArray[np.float64], int]:
     """Return usable variances (N, k) and how many rows had one replaced."""
-    known = np.isfinite(variance) & (variance > 0)
+    known = _known(variance)
     filled = np.clip(np.where(known, variance, default), floor, _NO_TRUST)
     return filled, int((~known).any(1).sum())
 

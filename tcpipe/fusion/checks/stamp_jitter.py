@@ -8,6 +8,8 @@ that slip does not count). What this residual spreads beyond the claimed noise, 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -78,7 +80,7 @@ def with_jitter(gnss: Positions, odometry: BodyVelocities, jitter_s: NDArray[np.
     speed = np.interp(seconds(gnss.stamp_ns, zero), seconds(odometry.stamp_ns, zero), speed)
     variance = gnss.variance_m2.copy()
     variance[:, :2] += ((2 * speed * jitter_s) ** 2)[:, None]
-    return Positions(gnss.stamp_ns, gnss.position_enu_m, variance, gnss.lever_arm_m)
+    return replace(gnss, variance_m2=variance)
 
 
 def _windows(values: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -203,6 +203,22 @@ def test_a_noisy_minute_counts_as_noisy_there_alone():
     assert not errors.matters
 
 
+def test_fixes_that_claim_nothing_are_as_good_as_they_scatter():
+    measurements = drive.measure(truth(), 1)
+    unknown = np.ones(measurements.gnss.stamp_ns.size, bool)
+    fixes = replace(measurements.gnss, variance_m2=np.full_like(measurements.gnss.variance_m2, 0.05**2))
+    silent = replace(fixes, unclaimed=unknown)
+    errors = find_fix_errors(replace(measurements, gnss=silent))
+    assert np.sqrt(np.median(errors.white_m2[:, 0])) == pytest.approx(0.015, rel=0.15)
+    assert not errors.matters
+    # A receiver that says five centimetres means them.
+    assert np.sqrt(np.median(find_fix_errors(replace(measurements, gnss=fixes)).lasting_m2[:, 0])) > 0.04
+    t = (silent.stamp_ns - drive.ZERO_NS) * 1e-9
+    wave = 0.5 * np.sin(t[:, None] / 4.0) * ((t > 60) & (t < 110))[:, None] * [1.0, 0.0, 0.0]
+    bent = find_fix_errors(replace(measurements, gnss=replace(silent, position_enu_m=silent.position_enu_m + wave)))
+    assert np.sqrt(np.median(bent.lasting_m2[(t > 65) & (t < 105), 0])) > 0.5
+
+
 def test_without_gnss_the_track_starts_at_the_origin_and_keeps_its_shape():
     found = smoothed(gnss=False)
     assert np.linalg.norm(found.position_enu_m[0]) < 0.01
