@@ -26,7 +26,7 @@ HuskyPower = Literal["battery", "drivers"]
 class RailReadings:
     """A rail's readings, NaN where a row carries none: voltage [V] and current [A], shape (N,).
 
-    Of a counter of energy the current is a first one, by the times of the log.
+    Of a counter of energy the current is a first one, by times that nobody has judged yet.
     """
 
     name: str
@@ -171,12 +171,21 @@ def _rail(columns: Columns, source: PowerSource, topic: str) -> RailReadings:
     if source.energy:
         parts = [(of.sign * source.energy_scale, _values(columns, of)) for of in fields_of(source.energy)]
         counter = counted(parts, wraps=source.counter_wraps)
-        stamps = np.asarray(columns["log_time_ns"], np.int64)
-        return RailReadings(name, voltage, counter.mean_amp(stamps, voltage), counter)
+        return RailReadings(name, voltage, counter.mean_amp(_first_stamps(columns), voltage), counter)
     current = source.current_scale * _summed(columns, fields_of(source.current))
     if source.wraps_amp is not None:
         current = np.where(current > source.wraps_amp / 2, current - source.wraps_amp, current)
     return RailReadings(name, voltage, current)
+
+
+def _first_stamps(columns: Columns) -> NDArray[np.int64]:
+    """Return the header's stamps where all are set, else the log's times [ns]: messages are written down in bursts."""
+    if "header.stamp.sec" in columns:
+        stamps = np.asarray(columns["header.stamp.sec"], np.int64) * 1_000_000_000
+        stamps += np.asarray(columns["header.stamp.nanosec"], np.int64)
+        if stamps.all():
+            return stamps
+    return np.asarray(columns["log_time_ns"], np.int64)
 
 
 def _summed(columns: Columns, fields: Sequence[FieldPath]) -> Floats:

@@ -83,5 +83,5 @@ def currents_of(
     if rail.counter is not None:
         energy, resets = (columns[name] for name in counter_of(rail.name))
         breaks = resets + times["epoch"] * (1 + np.max(resets, initial=0))
-        current = Counter(energy, breaks).mean_amp(times["stamp_ns"], voltage)
+        current = np.where(np.isnan(current), np.nan, Counter(energy, breaks).mean_amp(times["stamp_ns"], voltage))
     return voltage, current
