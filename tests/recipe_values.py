@@ -14,7 +14,7 @@ from tcpipe.robots.profiles import PowerSource
 
 def keys() -> list[str]:
     """Return every key of the recipe, by dots."""
-    default, found = Recipe(), ["robot", "robots", "power_sources"]
+    default, found = Recipe(), ["robot", "robots", "power_sources", "tables"]
     for section in fields(default):
         of = getattr(default, section.name)
         found += [f"{section.name}.{name}" for name in kinds_of(type(of))] if is_dataclass(of) else []
@@ -46,7 +46,7 @@ def _values(kind: Any, bounds: tuple[Any, ...] = ()) -> Iterator[Any]:
     elif origin is dict:
         yield from ({role: value} for role in get_args(of[0]) or ("scout",) for value in _values(of[1]))
     elif origin is list:
-        yield from ([value] for value in (_values(of[0]) if is_dataclass(of[0]) else ["/another"]))
+        yield from ([value] for value in (_values(of[0]) if of[0] is not str else ["/another"]))
     elif origin is tuple:
         yield from zip(*(list(_values(each)) for each in of), strict=True)
     elif is_dataclass(kind):

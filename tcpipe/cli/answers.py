@@ -28,6 +28,7 @@ def answers() -> dict[str, type]:
     from tcpipe.pipeline.known_trouble import Accepted
     from tcpipe.pipeline.log_inspection import InspectedLog
     from tcpipe.pipeline.maps import AddedMap
+    from tcpipe.pipeline.table_proposal import InspectedTables
     from tcpipe.pipeline.verify import Verified
     from tcpipe.planning.cost_map import CostMapCard, CostMapResult
     from tcpipe.planning.path_files import PathResult, TableTotals
@@ -57,6 +58,7 @@ def answers() -> dict[str, type]:
         "inspect-map.answer": InspectedMap,
         "inspect-run.answer": InspectedRun,
         "inspect-store.answer": InspectedStore,
+        "inspect-tables.answer": InspectedTables,
         "plan-path.answer": PlanResult,
         "predict-path.answer": PathResult,
         "reproduce.answer": Reproduction,

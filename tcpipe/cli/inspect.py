@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
     from tcpipe.pipeline.log_inspection import InspectedLog, InspectedTopic
+    from tcpipe.pipeline.table_proposal import InspectedTables
 
 
 @click.command(short_help="What is in a log, map, dataset or store")
@@ -44,6 +45,10 @@ def _exit_code(logs: Sequence[InspectedLog]) -> int:
     if all(failed):
         return 1
     return 3 if any(failed) or any(log.damage for log in logs) else 0
+
+
+_COLUMNS = 14
+"""So many columns of a table are named."""
 
 
 def _print_logs(found: InspectedLogs) -> None:
@@ -198,6 +203,26 @@ def _print_run(found: InspectedRun) -> None:
                 say(f"{kind}: {line}")
 
 
+def _print_tables(found: InspectedTables) -> None:
+    say(f"{found.path}: {len(found.columns) + len(found.problems)} tables that no recipe maps")
+    say("")
+    _print_table(["table", "columns"], [[file, _listed(names)] for file, names in found.columns.items()])
+    for line in found.problems.values():
+        say(line)
+    say("")
+    say(
+        "a recipe for it, by what the columns are called; look at units and stamps:"
+        if found.recipe
+        else "no column says what it is"
+    )
+    for line in found.recipe.splitlines():
+        say(line)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:_COLUMNS]) + (f" and {len(names) - _COLUMNS} more" if len(names) > _COLUMNS else "")
+
+
 def _text(value: object) -> str:
     return "" if value is None else f"{value:.2f}" if isinstance(value, float) else str(value)
 
@@ -211,6 +236,7 @@ def _print_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
 _PRINTERS: dict[str, Callable[..., None]] = {
     "log": _print_log,
     "logs": _print_logs,
+    "tables": _print_tables,
     "map": _print_map,
     "dataset": _print_dataset,
     "run": _print_run,

@@ -13,13 +13,13 @@ from tcpipe.errors import RecipeError
 from tcpipe.formats.json_files import Json, digest, plain
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.formats.toml_text import parse_toml
-from tcpipe.recipe import IngestSections, Recipe
+from tcpipe.recipe import IngestSections, Recipe, TableMapping
 from tcpipe.recipe.checking import as_toml, from_values, kinds_of, range_of
 from tcpipe.robots.profiles import PowerSource, Robot
 
 FILE_NAME = "tcpipe.toml"
 _MOST_BYTES = 1_000_000
-_OWN_TABLES = ("robots", "power_sources")
+_OWN_TABLES = ("robots", "power_sources", "tables")
 
 
 def find_recipe(explicit: Path | None, directory: Path) -> Path | None:
@@ -106,6 +106,9 @@ def _toml_lines(recipe: Recipe, schema: Mapping[str, Any]) -> Iterator[str]:
     sources: Sequence[PowerSource | None] = recipe.power_sources or [None]
     for source in sources:
         yield from _table_lines("[[power_sources]]", source, PowerSource(""), schema)
+    tables: Mapping[str, TableMapping | None] = recipe.tables or {"ROLE": None}
+    for name, table in tables.items():
+        yield from _table_lines(f"[tables.{as_toml(name) if table else name}]", table, TableMapping(), schema)
 
 
 def _table_lines(head: str, here: Any, default: Any, schema: Mapping[str, Any]) -> Iterator[str]:

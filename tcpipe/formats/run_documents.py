@@ -61,6 +61,7 @@ class Counts:
     visual_odometry_messages: int | None = field(default=None, metadata=LEFT_OUT)
     power_messages: int | None = field(default=None, metadata=LEFT_OUT)
     command_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    pose_messages: int | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,7 +57,7 @@ def read_messages(columns: Columns, role: str, type_name: str) -> Readings:
     ----------
     columns : ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances as shape (N, k); frames and sentences as
         arrays of str.
-    role : gnss, imu, wheel_odometry, visual_odometry or command (power is read by `tcpipe.power.readings`).
+    role : gnss, imu, wheel_odometry, visual_odometry, command or pose (power is read by `tcpipe.power.readings`).
     type_name : ``package/msg/Name``.
     """
     return _READERS[role, type_name]({name: _possible(name, values) for name, values in columns.items()})
@@ -76,9 +76,12 @@ def _possible(name: str, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def frames(columns: Columns, type_name: str) -> dict[str, int]:
-    """Return the frames that a topic's measurements are given in, with their counts, most frequent first; leading slashes stripped."""
+    """Return the frames that a topic's measurements are given in, with their counts, most frequent first; leading slashes stripped.
+
+    A pose names only the frame it is in, not whose pose it is: none.
+    """
     name = "child_frame_id" if type_name == roles.ODOMETRY else "header.frame_id"
-    if name not in columns:
+    if name not in columns or type_name in (roles.POSE_STAMPED, roles.POSE_WITH_COVARIANCE_STAMPED):
         return {}
     texts, counts = np.unique(columns[name].astype(str), return_counts=True)
     found: dict[str, int] = {}
@@ -363,12 +366,24 @@ def _read_command(columns: Columns) -> Readings:
     return _kept(columns, values, {"not_finite": ~np.isfinite(forward + yaw_rate)})
 
 
+def _read_pose(columns: Columns) -> Readings:
+    prefix = "pose.pose.position" if "pose.pose.position.x" in columns else "pose.position"
+    place, variances = _vector(columns, prefix), _variances(columns, "pose.covariance", 0, 7, 14)
+    unknown = np.full(len(place), np.nan)
+    values: dict[str, NDArray[Any]] = {f"{axis}_m": place[:, i] for i, axis in enumerate("xyz")}
+    values |= dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), unknown)
+    values |= {f"{axis}_var_m2": variances[:, i] for i, axis in enumerate(("east", "north", "up"))}
+    notes = {"without_covariance": int(np.count_nonzero(np.isnan(variances[:, 0])))}
+    return _kept(columns, values, {"not_finite": ~np.isfinite(place.sum(-1))}, notes=notes)
+
+
 _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
     ("gnss", roles.NAV_SAT_FIX): _read_nav_sat_fix,
     ("gnss", roles.NMEA_SENTENCE): _read_nmea,
     ("imu", roles.IMU): _read_imu,
     ("command", roles.TWIST): _read_command,
     ("command", roles.TWIST_STAMPED): _read_command,
+    **{("pose", type_name): _read_pose for type_name in roles.ROLE_TYPES["pose"]},
     **{
         (role, type_name): read
         for role in ("wheel_odometry", "visual_odometry")
@@ -403,6 +418,8 @@ _FIELDS: dict[str, tuple[str, ...]] = {
         *_fields_of("twist.twist.linear.", "twist.twist.angular.", "pose.pose.position."),
         *_quat_of("pose.pose.orientation"),
     ),
+    roles.POSE_WITH_COVARIANCE_STAMPED: (*_STAMP, *_fields_of("pose.pose.position.")),
+    roles.POSE_STAMPED: (*_STAMP, *_fields_of("pose.position.")),
     roles.TWIST: _fields_of("linear.", "angular."),
     roles.TWIST_STAMPED: (*_STAMP, *_fields_of("twist.linear.", "twist.angular.")),
     roles.TWIST_WITH_COVARIANCE_STAMPED: (*_STAMP, *_fields_of("twist.twist.linear.", "twist.twist.angular.")),

@@ -8,7 +8,7 @@ no rule tells apart, nobody guesses. What is left out, and what cannot be decode
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
@@ -27,6 +27,8 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 TWIST = "geometry_msgs/msg/Twist"
 TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 TWIST_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/TwistWithCovarianceStamped"
+POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
+POSE_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 _MEASURED_TWISTS = (ODOMETRY, TWIST_WITH_COVARIANCE_STAMPED, TWIST_STAMPED)
@@ -38,10 +40,11 @@ ROLE_TYPES: dict[str, tuple[str, ...]] = {
     "visual_odometry": _MEASURED_TWISTS,
     "power": FLOAT_TYPES,
     "command": (TWIST_STAMPED, TWIST),
+    "pose": (POSE_WITH_COVARIANCE_STAMPED, ODOMETRY, POSE_STAMPED),
 }
 """Message types that can play each role, best first; power has those of the profiles before these."""
 
-MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss")
+MOTION_ROLES = ("wheel_odometry", "visual_odometry", "gnss", "pose")
 """Roles of which a log needs one."""
 
 
@@ -113,6 +116,8 @@ def assign_roles(
     *,
     known: Profiles,
     namespace: str | None = None,
+    mapped: Collection[str] = (),
+    pose_from: Collection[str] = (),
 ) -> RoleAssignment:
     """Return which topic plays which role, and why.
 
@@ -125,6 +130,8 @@ def assign_roles(
     robot : profile name, where the user gave one.
     known : robots, and message types that carry power.
     namespace : recipe key ``read.namespace``; topics elsewhere play no role unless they are chosen by name.
+    mapped : roles whose fields the recipe maps (``read.fields``): a chosen topic may be of any type.
+    pose_from : recipe key ``read.pose_from``.
 
     Raises
     ------
@@ -142,14 +149,18 @@ def assign_roles(
         decided.problems.append(
             f"recipe read.namespace: no topic lies below {namespace}; the log holds {_listing(every.values())}"
         )
-    _take_chosen(decided, listed, wanted)
+    _take_chosen(decided, listed, wanted, mapped)
     taken = {name for role in decided.roles.values() for name in role.topics}
     free = [topic for topic in listed.values() if topic.name not in taken and _is_usable(decided, topic, ignored)]
+    settled = dict.fromkeys(wanted, "the recipe chooses what plays {role}")
+    if "pose" in decided.roles:
+        _let_stand_in(decided, settled, pose_from)
     found = {
         role: candidates
-        for role, candidates in _candidates(decided, free, wanted)
-        if role not in decided.roles and role not in wanted
+        for role, candidates in _candidates(decided, free, settled)
+        if role not in decided.roles and role not in settled
     }
+    poses = found.pop("pose", [])
     robots = namespaces_of_robots({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
     if robots:
         decided.problems += _which_robot(robots)
@@ -157,6 +168,7 @@ def assign_roles(
     else:
         for role, candidates in found.items():
             _decide(decided, role, candidates)
+    _decide_pose(decided, poses, taken="gnss" in {*decided.roles, *decided.undecided} or "pose" in wanted)
     problems = decided.problems + (_without_motion(decided, list(listed.values())) or _questions(decided))
     return RoleAssignment(
         name,
@@ -188,7 +200,33 @@ def _which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     ]
 
 
-def _take_chosen(decided: _Decisions, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]]) -> None:
+def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_from: Collection[str]) -> None:
+    """Keep what the pose stands in for, and what it was made from, out of what is fused."""
+    pose = decided.roles["pose"].topics[0]
+    for role in ("gnss", *pose_from):
+        if role in decided.roles:
+            decided.problems.append(
+                f"recipe read.topics names {decided.roles[role].topics[0]} as {role} and {pose} as pose: the pose stands in for it; "
+                f"drop one of both"
+            )
+        settled.setdefault(role, f"the pose of {pose} stands in for it")
+
+
+def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> None:
+    """Let a pose made elsewhere play, where its name clearly says so, there is one such, and nothing else tells a position."""
+    best = [] if taken else _best("pose", candidates) if candidates else []
+    for _, why, topic in candidates:
+        if [topic] == [of for _, of in best]:
+            decided.roles["pose"] = PlayedRole("pose", (topic.name,), topic.type_name, f"{why}, and there is no GNSS")
+        elif topic.type_name == ODOMETRY:
+            decided.pass_over("wheel_odometry", topic, f"{why} that it is another estimator's output, not a sensor")
+        else:
+            decided.left_out[topic.name] = f"{why} that it is another estimator's output"
+
+
+def _take_chosen(
+    decided: _Decisions, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]], mapped: Collection[str]
+) -> None:
     for role, names in chosen.items():
         if role not in ROLE_TYPES:
             decided.problems.append(f"recipe read.topics: there is no role {role!r}; there are {', '.join(ROLE_TYPES)}")
@@ -203,7 +241,7 @@ def _take_chosen(decided: _Decisions, topics: Mapping[str, Topic], chosen: Mappi
                 f"it holds {_listing(topics.values(), decided.types[role])}"
             )
         for name in wanted:
-            if topics[name].type_name not in decided.types[role]:
+            if topics[name].type_name not in decided.types[role] and role not in mapped:
                 wanted_types = " or ".join(decided.types[role])
                 decided.problems.append(
                     f"recipe read.topics.{role}: {name} is {topics[name].type_name}; wanted {wanted_types}"
@@ -236,6 +274,8 @@ _FUSED = re.compile(
     r"filtered|fused|fusion|ekf|ukf|kalman|icp|truth|groundtruth|gazebo|amcl|locali[sz]|loam|lio|lidar|laser|scan|"
     r"cartographer|hector|slam$|slam_toolbox|map$|mapping|global|world|gt$"
 )
+_SLAM = re.compile(r"icp$|slam|loam|lego_?loam|(fast)?_?lio|liosam|cartographer|hector$|kiss$")
+"""Poses from a laser, matched scan by scan: what is told by nothing else in the log."""
 _OF_GNSS = re.compile(r"gps|gnss|navsat|fix$|utm|ublox|novatel|septentrio|rtk")
 _VISUAL = re.compile(
     r"zed|visual|vo$|vio$|svo|rtabmap|orb$|orbslam|stereo|camera|cam$|realsense|t265|rgbd|vins|mono|okvis|vslam"
@@ -262,7 +302,7 @@ Ranked = list[tuple[tuple[int, ...], str, Topic]]
 
 
 def _candidates(
-    decided: _Decisions, topics: Sequence[Topic], chosen: Mapping[str, Sequence[str]]
+    decided: _Decisions, topics: Sequence[Topic], settled: Mapping[str, str]
 ) -> Iterable[tuple[str, Ranked]]:
     """Yield each role with its ranked candidates; what can be no candidate is left out with its reason."""
     found: dict[str, Ranked] = {role: [] for role in ROLE_TYPES}
@@ -274,13 +314,13 @@ def _candidates(
         if role is None:
             decided.left_out[topic.name] = why
             usual = next(role for role, types in decided.types.items() if topic.type_name in types)
-            if usual not in chosen:
+            if usual not in (*settled, "pose"):
                 decided.pass_over(usual, topic, why)
-        elif role in chosen:
-            decided.left_out[topic.name] = f"the recipe chooses what plays {role}"
+        elif role in settled and role != "pose":
+            decided.left_out[topic.name] = settled[role].format(role=role)
         else:
             found[role].append((rank, why, topic))
-    if "power" not in chosen:
+    if "power" not in settled:
         found["power"] += _bare_power(decided, bare)
     return found.items()
 
@@ -303,6 +343,8 @@ def _sort_imu(topic: Topic) -> Sorted:
 
 def _sort_odometry(topic: Topic) -> Sorted:
     name = topic.name
+    if topic.type_name == ODOMETRY and _says(_SLAM, name) and not _says(_VISUAL, name):
+        return _sort_pose(topic)
     kind = ROLE_TYPES["wheel_odometry"].index(topic.type_name)
     if topic.type_name == TWIST_STAMPED and _says(_COMMAND, name):
         return _sort_command(topic)
@@ -315,6 +357,16 @@ def _sort_odometry(topic: Topic) -> Sorted:
     if topic.type_name != ODOMETRY and not explicit and not _says(_WHEEL, name):
         return None, (), "its name does not say what it measures"
     return "wheel_odometry", (int(not explicit), kind), "its name says wheels" if explicit else ""
+
+
+def _sort_pose(topic: Topic) -> Sorted:
+    if word := _says(_SLAM, topic.name):
+        return "pose", (ROLE_TYPES["pose"].index(topic.type_name),), f"its name ({word}) says"
+    return (
+        None,
+        (),
+        "a pose is taken where the recipe names it, or its name says icp, slam, loam, lio, cartographer or hector",
+    )
 
 
 def _sort_command(topic: Topic) -> Sorted:
@@ -365,6 +417,7 @@ _SORTERS: dict[str, Callable[[Topic], Sorted]] = {
     **dict.fromkeys(ROLE_TYPES["gnss"], _sort_gnss),
     **dict.fromkeys(ROLE_TYPES["command"], _sort_command),
     **dict.fromkeys(ROLE_TYPES["imu"], _sort_imu),
+    **dict.fromkeys((POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED), _sort_pose),
     **dict.fromkeys(_MEASURED_TWISTS, _sort_odometry),
 }
 
@@ -478,7 +531,7 @@ def _is_motion(type_name: str) -> bool:
 
 def _warnings(decided: _Decisions, topics: Iterable[Topic]) -> Iterable[str]:
     there = decided.roles.keys() | decided.undecided
-    if "gnss" not in there:
+    if "gnss" not in there and "pose" not in there:
         yield "no topic plays gnss: the track lies in a local frame and cannot be placed on a map"
     if "power" not in there:
         yield "no topic plays power: there will be a track but no energy"

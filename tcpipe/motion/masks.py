@@ -146,6 +146,23 @@ def below_limit(rows: MotionRows, *, limit_mps: float, window_s: float) -> Mask:
     return np.isfinite(rows.commanded_mps) & (speed < limit_mps) & (settled < limit_mps)
 
 
+def top_command(
+    rows: MotionRows, *, moving_above_mps: float, share_of_top: float, window_s: float
+) -> tuple[float, float]:
+    """Return the speed [m/s] that a moving run was commanded at most (but for a hundredth of the time), and the share of it held there.
+
+    A row is held at the top where the mean command around it is at least ``share_of_top`` of it: a joystick jitters. 0, 0 without commands.
+    """
+    part, command = _known_command(rows)
+    half = rows.count(window_s / 2)
+    settled = window_mean(np.abs(command), part, before=half, after=half)
+    moving = np.isfinite(rows.commanded_mps) & (np.abs(rows.velocity_mps) > moving_above_mps)
+    if not moving.any():
+        return 0.0, 0.0
+    top = float(np.quantile(settled[moving], 0.99))
+    return top, float(np.mean(settled[moving] >= share_of_top * top))
+
+
 def _known_command(rows: MotionRows) -> tuple[NDArray[np.int64], Floats]:
     """Return pieces that end also where the command becomes known or unknown, and the command with 0 for unknown."""
     known = np.isfinite(rows.commanded_mps)

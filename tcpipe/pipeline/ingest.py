@@ -41,7 +41,7 @@ R = TypeVar("R")
 
 logger = logging.getLogger("tcpipe")
 
-_NO_LOGS = "no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them"
+_NO_LOGS = "no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
 
 
 @dataclass(frozen=True, slots=True)
@@ -128,7 +128,7 @@ def ingest(
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
     with _place_for_stand_ins(logs := list(logs)) as staging, _gone_if_empty(Path(store)):
-        found = find_sources(logs, as_one=as_one, staging=Path(staging))
+        found = find_sources(logs, as_one=as_one, staging=Path(staging), tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(store, create=True)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from tcpipe import __version__
-from tcpipe.formats.logs.joined import JoinedLog
-from tcpipe.formats.logs.log_file import Log
+from tcpipe.formats.logs.joined import AnyLog
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson, TopicCount
 from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, Streams, Track
 
 
-def run_json_of(task: IngestTask, log: Log | JoinedLog, streams: Streams, sha256: str) -> RunJson:
+def run_json_of(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) -> RunJson:
     """Return what is known of a log that was read; its damage, remarks and tags are to be added."""
     return RunJson(
         source=LogOrigin(task.source.origins, sha256, log.size_bytes),

@@ -9,8 +9,7 @@ from functools import partial
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
-from tcpipe.formats.logs.joined import JoinedLog, open_logs
-from tcpipe.formats.logs.log_file import Log
+from tcpipe.formats.logs.joined import AnyLog, open_logs
 from tcpipe.formats.recipe_toml import ingest_key, read_key
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.run_documents import RunJson
@@ -80,10 +79,10 @@ def _finished(store: Store, run_id: str, task: IngestTask) -> RunDirectory | Non
     return None
 
 
-def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, Log | JoinedLog]:
+def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, AnyLog]:
     """Return the task with the log's files on this machine, and the log, both until ``stack`` ends."""
     source = stack.enter_context(on_this_machine(task.source))
-    log = open_logs(source.paths, message_definitions=task.message_definitions)
+    log = open_logs(source.paths, message_definitions=task.message_definitions, tables=task.recipe.tables)
     stack.enter_context(log)
     return replace(task, source=source), log
 
@@ -118,7 +117,7 @@ def _twin(store: Store, run_id: str, source: LogSource) -> str | None:
 
 
 def _streams(
-    store: Store, run_id: str, log: Log | JoinedLog, task: IngestTask
+    store: Store, run_id: str, log: AnyLog, task: IngestTask
 ) -> tuple[Streams, tuple[str, ...], tuple[str, ...]]:
     """Return L1, from the store when it was made with the same read settings, the log's damage, and remarks on it."""
     from tcpipe.stages.read import read_run  # noqa: PLC0415
@@ -129,7 +128,7 @@ def _streams(
     cached = store.read_streams(run_id, key=key) if same and not task.force else None
     if cached is not None and known is not None:
         return cached, known.damage, known.remarks
-    streams = read_run(log, task.recipe.read, robot=task.robot, known=profiles_of(task.recipe))
+    streams = read_run(log, task.recipe.read_of(log.topics), robot=task.robot, known=profiles_of(task.recipe))
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
     store.write_streams(run_id, streams, key=key)

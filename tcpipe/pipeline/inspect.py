@@ -10,10 +10,13 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats.json_files import recast
-from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below, open_log
+from tcpipe.formats.logs.joined import opened
+from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below
+from tcpipe.formats.logs.table_folders import table_files, table_folders
 from tcpipe.formats.object_storage import copied, is_url
 from tcpipe.formats.run_documents import Counts, LogOrigin
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
+from tcpipe.pipeline.table_proposal import InspectedTables, proposed
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store, is_store, run_at
 
@@ -90,7 +93,9 @@ class InspectedStore:
     unfinished: tuple[str, ...]
 
 
-Inspected: TypeAlias = "InspectedLog | InspectedLogs | InspectedMap | InspectedDataset | InspectedRun | InspectedStore"
+Inspected: TypeAlias = (
+    "InspectedLog | InspectedLogs | InspectedTables | InspectedMap | InspectedDataset | InspectedRun | InspectedStore"
+)
 
 
 def inspect(
@@ -119,7 +124,9 @@ def inspect(
     ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):
         with copied(str(path), wanted=belongs_to_a_log) as copy:
-            return _named(_logs_at(copy, ask), str(copy), str(path).rstrip("/"))
+            return _named(
+                _logs_at([copy] if copy.is_file() else logs_below(copy), copy, ask), str(copy), str(path).rstrip("/")
+            )
     path = Path(path)
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or directory")
@@ -138,11 +145,21 @@ def inspect(
         from tcpipe.pipeline.inspected import InspectedMap  # noqa: PLC0415
 
         return recast(open_map(path).summary(), InspectedMap, path=str(path))
-    return _logs_at(path, ask)
+    return _logs_or_tables(path, recipe, ask)
 
 
-def _logs_at(path: Path, ask: Callable[[Path], InspectedLog]) -> InspectedLog | InspectedLogs:
-    logs = logs_below(path) if path.is_dir() else [path]
+def _logs_or_tables(
+    path: Path, recipe: Recipe, ask: Callable[[Path], InspectedLog]
+) -> InspectedLog | InspectedLogs | InspectedTables:
+    if not path.is_dir():
+        return ask(path)
+    logs = [*logs_below(path), *table_folders(path, recipe.tables)]
+    if logs or not (tables := table_files(path)):
+        return _logs_at(logs, path, ask)
+    return proposed(path, tables)
+
+
+def _logs_at(logs: list[Path], path: Path, ask: Callable[[Path], InspectedLog]) -> InspectedLog | InspectedLogs:
     if not logs:
         raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
     if len(logs) == 1:
@@ -162,7 +179,7 @@ def _named(found: InspectedLog | InspectedLogs, copy: str, url: str) -> Inspecte
 def _one(
     path: Path, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
 ) -> InspectedLog:
-    with open_log(path, message_definitions=message_definitions) as log:
+    with opened(path, message_definitions=message_definitions, tables=recipe.tables) as log:
         return inspect_log(log, recipe, robot, full=full)
 
 

@@ -5,20 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from tcpipe.cost.quality import MIN_AVERAGED_HZ, MIN_INSTANTANEOUS_HZ
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.logs.clocks import Timeline, settle_clocks
-from tcpipe.logs.roles import RoleAssignment, assign_roles
+from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.simulated_clock import CLOCK, SIMULATED_NS
 from tcpipe.logs.topics import Topic
 from tcpipe.pipeline.log_stamps import TopicStamps
 from tcpipe.power.sources import sources_of
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles
+from tcpipe.stages.read_roles import roles_by
 from tcpipe.tables.findings import ABSENT, ClockStep
+
+if TYPE_CHECKING:
+    from tcpipe.formats.logs.table_log import TableLog
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,7 +82,7 @@ class InspectedLog:
     remarks: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
 
 
-def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> InspectedLog:
+def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full: bool) -> InspectedLog:
     """Return what a log holds.
 
     Parameters
@@ -86,15 +90,8 @@ def inspect_log(log: Log, recipe: Recipe, robot: str | None, *, full: bool) -> I
     full
         Read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
     """
-    config, known = recipe.read, profiles_of(recipe)
-    cast = assign_roles(
-        log.topics.values(),
-        config.topics,
-        config.ignore_topics,
-        robot,
-        known=known,
-        namespace=config.namespace,
-    )
+    known = profiles_of(recipe)
+    cast = roles_by(recipe.read_of(log.topics), log.topics.values(), robot, known=known)
     topics, steps = tuple(_indexed(topic, cast) for topic in sorted(log.topics.values(), key=attrgetter("name"))), None
     if full:
         topics, steps = _read(log, topics)
@@ -134,7 +131,9 @@ def _indexed(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
     )
 
 
-def _read(log: Log, topics: tuple[InspectedTopic, ...]) -> tuple[tuple[InspectedTopic, ...], tuple[ClockStep, ...]]:
+def _read(
+    log: Log | TableLog, topics: tuple[InspectedTopic, ...]
+) -> tuple[tuple[InspectedTopic, ...], tuple[ClockStep, ...]]:
     """Read every message; return the topics with what that tells of them, and what the clocks did."""
     found: dict[str, TopicStamps] = {}
     for tables in log.batches(sorted(log.topics)):
@@ -176,7 +175,7 @@ def _with_stamps(
     )
 
 
-def _slow_power(log: Log, cast: RoleAssignment, recipe: Recipe, known: Profiles) -> Iterable[str]:
+def _slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, known: Profiles) -> Iterable[str]:
     """Yield a line of each power topic that comes too slowly to tell what a metre costs, with what sets its rate where that is known."""
     robot = known.robots[cast.robot]
     for name in cast.roles["power"].topics if "power" in cast.roles else ():

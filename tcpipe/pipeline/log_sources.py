@@ -13,8 +13,9 @@ from pathlib import Path
 from tcpipe.errors import LogError, TcpipeError, plain_line
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.joined import open_logs
-from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs
+from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs, logs_below
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, storage_files
+from tcpipe.formats.logs.table_folders import Mappings, table_files, table_folders
 from tcpipe.formats.object_storage import copied, is_url, stand_ins
 from tcpipe.formats.record_files import Sighting, record_name
 from tcpipe.pipeline.transience import is_transient
@@ -99,10 +100,13 @@ class FoundLogs:
     """Whether what is in the way of a path may pass: a network that is down."""
 
 
-def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> FoundLogs:
+def find_sources(
+    logs: Iterable[str | Path], *, as_one: bool, staging: Path, tables: Mappings | None = None
+) -> FoundLogs:
     """Return the logs at or below the given paths.
 
-    With ``as_one`` they are all parts of one. For what lies in object storage there are stand-ins in ``staging``.
+    With ``as_one`` they are all parts of one. For what lies in object storage there are stand-ins in ``staging``. A folder that holds one
+    of the files of ``tables`` is a log.
     """
     paths: dict[Path, tuple[Path, str]] = {}
     urls: dict[Path, str] = {}
@@ -116,7 +120,7 @@ def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> 
                 for path, url in remote.items():
                     paths.setdefault(path, (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
             else:
-                for path in find_logs(Path(entry)):
+                for path in _logs_at(Path(entry), tables or {}):
                     paths.setdefault(_real(path), (_as_named(path), _place_in(path, Path(entry))))
         except LogError as error:
             problems[str(entry)] = error.problems
@@ -135,6 +139,25 @@ def find_sources(logs: Iterable[str | Path], *, as_one: bool, staging: Path) -> 
         for group in groups
     )
     return FoundLogs(sources, problems, transient)
+
+
+def _logs_at(path: Path, tables: Mappings) -> list[Path]:
+    """Return the logs at or below a path, folders of mapped tables among them; `LogError` where there is none."""
+    folders = table_folders(path, tables) if tables and path.is_dir() else []
+    if folders:
+        return [*logs_below(path), *folders]
+    try:
+        return find_logs(path)
+    except LogError as error:
+        if tables and path.is_dir():
+            files = ", ".join(mapping.file for mapping in tables.values())
+            raise LogError(
+                *error.problems, f"{path}: nor is one of the files that the recipe's tables name: {files}"
+            ) from None
+        if path.is_dir() and (held := table_files(path)):
+            hint = f"{path}: it holds {len(held)} tables ({held[0].name}, …): map them in the recipe; tcpipe inspect proposes how"
+            raise LogError(*error.problems, hint) from None
+        raise
 
 
 def _parts_alone(paths: set[Path], *, together: bool) -> Iterator[tuple[Path, str]]:

@@ -14,6 +14,7 @@ from tcpipe.recipe.sections import (
     SampleConfig,
     SegmentConfig,
     SplitConfig,
+    TableMapping,
 )
 
 __all__ = [
@@ -30,4 +31,5 @@ __all__ = [
     "SampleConfig",
     "SegmentConfig",
     "SplitConfig",
+    "TableMapping",
 ]

@@ -8,18 +8,23 @@ A bound is where a value can mean nothing any more, or costs without end: it is 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Literal, cast, get_args
 
 from annotated_types import Ge, Le, Lt
 
+from tcpipe.logs.mapped import topic_of
 from tcpipe.recipe.checking import settle
 from tcpipe.robots.profiles import PowerSource, Robot
 from tcpipe.tables.findings import LEFT_OUT
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
-Role = Literal["gnss", "imu", "wheel_odometry", "visual_odometry", "power", "command"]
+Role = Literal["gnss", "imu", "wheel_odometry", "visual_odometry", "power", "command", "pose"]
+MappedRole = Literal["gnss", "imu", "wheel_odometry", "visual_odometry", "command", "pose"]
+"""Roles whose messages can be mapped; power has tables of its own, [[power_sources]]."""
+MadeFrom = Literal["imu", "wheel_odometry", "visual_odometry"]
 Fraction = Annotated[float, Ge(0), Le(1)]
 Deviation = Annotated[float, Ge(1e-6), Le(1e3)]
 """A standard deviation or noise: a millionth is lost beside what it is added to, a thousand weighs nothing."""
@@ -64,9 +69,15 @@ class ReadConfig:
     __pydantic_config__ = _STRICT
 
     topics: dict[Role, list[str]] = field(default_factory=dict)
-    """Topics by role (gnss, imu, wheel_odometry, visual_odometry, power, command), where they cannot be found by type and profile."""
+    """Topics by role (gnss, imu, wheel_odometry, visual_odometry, power, command, pose), where they cannot be found by type and profile."""
     ignore_topics: list[str] = field(default_factory=list)
     """Topics that play no role whatever their type."""
+    fields: dict[MappedRole, dict[str, str]] = field(default_factory=dict, metadata=LEFT_OUT)
+    """By role, where the fields of a message type of your own stand, as gnss.latitude = "pvt.lat * 1e-7"; its topic stands under topics."""
+    pose_crs: str | None = field(default=None, metadata=LEFT_OUT)
+    """Projected CRS of the pose's positions, as EPSG:2949; none leaves them in a frame of their own, which no map has."""
+    pose_from: list[MadeFrom] = field(default_factory=list, metadata=LEFT_OUT)
+    """Roles that the pose was made from (beside GNSS): they are not fused beside it, which would count them twice."""
     namespace: str | None = None
     """Of several robots in one log, the one whose topics lie below this name (for example "/husky_1"); none takes all topics."""
     placement: dict[Role, Placement] = field(default_factory=dict)
@@ -295,6 +306,28 @@ class DatasetConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class TableMapping:
+    """A table of a folder of CSV, text or Parquet files: which role it plays, which of its columns are what, in which units, and when."""
+
+    __pydantic_config__ = _STRICT
+
+    file: str = ""
+    """Its file, from the folder that is ingested."""
+    role: Role | None = None
+    """The role it plays; none takes the table's name. Of power several tables may be."""
+    columns: dict[str, str] = field(default_factory=dict)
+    """By field (latitude, linear_x, voltage, …: docs/how-to/tables.md) the column's name; column_1 and so on where there is no header."""
+    units: dict[str, str] = field(default_factory=dict)
+    """Units by field where they are not deg, m, m/s, rad/s, m/s2, V and A: "rad", "km/h", "deg/s", "g", "mV", …"""
+    stamp: str | None = None
+    """The column of stamps; none takes the first."""
+    stamp_unit: Literal["auto", "s", "ms", "us", "ns"] = "auto"
+    """What its numbers count; auto tells by their size, if they count from 1970. Text is a date and time, in UTC where it says nothing."""
+    offset_s: Offset = 0.0
+    """Added to the stamps [s]."""
+
+
+@dataclass(frozen=True, slots=True)
 class IngestSections:
     """What rules a run's files, beside its log and robot: all that its stages get, and what `recipe_id` is the hash of."""
 
@@ -305,6 +338,7 @@ class IngestSections:
     label: LabelConfig
     robots: dict[str, Robot] = field(default_factory=dict, metadata=LEFT_OUT)
     power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)
+    tables: dict[str, TableMapping] = field(default_factory=dict, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -328,6 +362,8 @@ class Recipe:
     """Robots of your own by name; one that is called as one of tcpipe's takes its place."""
     power_sources: list[PowerSource] = field(default_factory=list, metadata=LEFT_OUT)
     """What message types of your own tell of power, a table a rail; those of a type take the place of tcpipe's of that type."""
+    tables: dict[str, TableMapping] = field(default_factory=dict, metadata=LEFT_OUT)
+    """The tables of a log that is a folder of CSV, text or Parquet files, by role or by any name."""
 
     def __post_init__(self) -> None:
         settle(self, "")
@@ -336,5 +372,21 @@ class Recipe:
     def ingest(self) -> IngestSections:
         """The sections that rule a run's files."""
         return IngestSections(
-            self.read, self.fuse, self.gate, self.segment, self.label, self.robots, self.power_sources
+            self.read,
+            self.fuse,
+            self.gate,
+            self.segment,
+            self.label,
+            self.robots,
+            self.power_sources,
+            self.tables,
         )
+
+    def read_of(self, topics: Collection[str]) -> ReadConfig:
+        """Return what rules the reading of a log of these topics: of one that holds the mapped tables, they play their roles."""
+        roles: dict[Role, list[str]] = {}
+        for name, table in self.tables.items():
+            role = cast("Role", table.role or name)
+            if role in get_args(Role) and (topic := topic_of(name, role, table.columns)[0]) in topics:
+                roles.setdefault(role, []).append(topic)
+        return replace(self.read, topics={**roles, **self.read.topics}) if roles else self.read

@@ -16,6 +16,7 @@ from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.stages.fuse_mounting_findings import mounting_findings
 from tcpipe.stages.fuse_sanity import sane_inputs
+from tcpipe.stages.read_pose import pose_as_fixes
 from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -37,14 +38,19 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     FusionError
         Nothing tells motion, or the estimate breaks down.
     """
-    # 1. Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
+    # 1. A pose made elsewhere is what the fixes are.
+    #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.
+    streams, local = pose_as_fixes(streams)
     inputs, sanity = sane_inputs(prepare_inputs(streams, config), streams)
     # 2. Each stretch for itself: where it starts, filter and smoother; again where that shows other mountings, or a sensor to be alone.
     inputs, sanity, fused = fuse_agreeing(inputs, sanity, streams, config)
     if not fused.found:
         raise FusionError(_nothing(streams, inputs), *sanity.warnings)
-    table = TRACK.table(**{name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]})
-    datum = None if inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
+    columns = {name: np.concatenate([part[name] for part in fused.columns]) for name in fused.columns[0]}
+    if local:
+        columns |= {name: np.full_like(columns[name], np.nan) for name in ("lon_deg", "lat_deg", "alt_m")}
+    table = TRACK.table(**columns)
+    datum = None if local or inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
     # 3. What was left out, where sensors disagree with the track, and whether their clocks agree.
     summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
     clocks = clock_findings(streams, inputs)

@@ -10,6 +10,7 @@ from tcpipe.motion import masks
 from tcpipe.motion.pieces import Mask, MotionRows, piece_of_rows
 from tcpipe.recipe import GateConfig
 from tcpipe.stages.gate_gaps import find_gaps
+from tcpipe.stages.gate_limit import limit_warnings, speed_limit
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.findings import GateFacts
@@ -35,7 +36,8 @@ def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | No
     )
     gaps = find_gaps(track, rows, chord_m=chord_m, config=config)
     found = {DropReason.GAP: gaps.rows, **_motion(rows, config)}
-    limit_mps = config.max_velocity_mps or max_velocity_mps
+    limit = speed_limit(rows, config, max_velocity_mps=max_velocity_mps)
+    limit_mps = limit.limit_mps
     slowest = limit_mps and config.full_speed_fraction * limit_mps
     if slowest is not None and config.require_full_speed:
         found[DropReason.BELOW_LIMIT] = masks.below_limit(rows, limit_mps=slowest, window_s=config.command_window_s)
@@ -49,7 +51,7 @@ def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | No
         full_speed_mps=slowest,
     )
     gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
-    warnings = (*gaps.warnings, *_warnings(rows, dropped_by, limit_mps, config))
+    warnings = (*gaps.warnings, *limit_warnings(rows, dropped_by, limit, config))
     return GatedTrack(gated, with_findings(track.info, warnings, replace(track.info.findings.facts, gate=facts)))
 
 
@@ -90,19 +92,3 @@ def _accelerating(rows: MotionRows, halted: Mask, config: GateConfig) -> Mask:
     )
     beside = masks.ramps(rows, slope, halted, above_mps2=config.ramp_acceleration_mps2, min_s=config.min_event_s)
     return changed | (lasting & np.isnan(rows.commanded_mps)) | beside
-
-
-def _warnings(rows: MotionRows, dropped_by: Mask, limit_mps: float | None, config: GateConfig) -> tuple[str, ...]:
-    commanded, moving = np.isfinite(rows.commanded_mps), np.abs(rows.velocity_mps) > config.turning_velocity_mps
-    if not commanded.any():
-        return ("no command topic: it cannot be known whether the robot was driven at its maximum speed",)
-    if limit_mps is None and config.require_full_speed:
-        text = "the robot's maximum speed is not known, so no row is dropped as commanded below it: set gate.max_velocity_mps"
-        return (
-            f"{text} (largest command {np.nanmax(rows.commanded_mps):.2f} m/s), or gate.require_full_speed = false",
-        )
-    slow = (dropped_by & DropReason.BELOW_LIMIT) != 0
-    if slow[moving].sum() > 0.5 * moving.sum():
-        text = f"{slow[moving].mean():.0%} of the moving track was commanded below {config.full_speed_fraction} of {limit_mps} m/s"
-        return (f"{text}: set gate.max_velocity_mps if this robot is slower, or gate.require_full_speed = false",)
-    return ()

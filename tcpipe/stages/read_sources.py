@@ -9,7 +9,9 @@ from typing import Any, cast
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.errors import RoleError
 from tcpipe.logs.imu_units import imu_in_si
+from tcpipe.logs.mapped import MAPPED_TYPES, mapped_message
 from tcpipe.logs.messages import Readings, needed_fields, read_messages
 from tcpipe.logs.odometry_scale import scaled
 from tcpipe.logs.roles import RoleAssignment
@@ -43,6 +45,10 @@ def read_sources(
 ) -> tuple[list[TopicReadings], PowerReadings, list[str]]:
     """Read the tables of every topic that plays a role.
 
+    Raises
+    ------
+    RoleError : ``read.fields`` names what the messages do not hold.
+
     Returns
     -------
     sources : one a topic, in the order of the roles.
@@ -56,9 +62,8 @@ def read_sources(
         if topic not in tables:
             warnings.append(f"{role}: {topic} cannot be decoded and plays no part (see the log's damage)")
             continue
-        in_lists = power_lists(topics[topic].type_name, known.power_sources) if role == "power" else ()
-        found = message_arrays(tables[topic], in_lists)
-        needed = () if role == "power" else needed_fields(topics[topic].type_name)
+        found = _fields(tables[topic], topics[topic].type_name, role, config, known)
+        needed = () if role == "power" else needed_fields(_type_of(topics[topic], role, config))
         if missing := [name for name in needed if name not in found]:
             warnings.append(f"{role}: {topic} plays no part, its messages have no field {', '.join(missing)}")
         else:
@@ -74,7 +79,7 @@ def read_sources(
     for topic, columns in arrays.items():
         role = role_of[topic]
         if role != "power":
-            readings = read_messages(columns, role, types[topic])
+            readings = read_messages(columns, role, _type_of(topics[topic], role, config))
             if role == "imu":
                 readings = imu_in_si(readings, config.imu_units)
             elif role in config.odometry_scale:
@@ -83,3 +88,21 @@ def read_sources(
         elif topic in power.rails:
             sources.append(TopicReadings(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))
     return sources, power, warnings
+
+
+def _type_of(topic: Topic, role: Role, config: ReadConfig) -> str:
+    """Return the message type as which a topic is read: its own, or that to which the recipe maps it."""
+    return MAPPED_TYPES[role] if role in config.fields else topic.type_name
+
+
+def _fields(
+    table: pa.Table, type_name: str, role: Role, config: ReadConfig, known: Profiles
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of a topic's messages, those of a message type of the user's own as the recipe maps them."""
+    found = message_arrays(table, power_lists(type_name, known.power_sources) if role == "power" else ())
+    if role not in config.fields:
+        return found
+    mapped = mapped_message(role, found, config.fields[role])
+    if isinstance(mapped, list):
+        raise RoleError(*mapped)
+    return mapped

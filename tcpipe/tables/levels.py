@@ -204,8 +204,27 @@ COMMAND = TableSchema(
     ),
 )
 
+POSE = TableSchema(
+    "pose",
+    "L1",
+    "Positions made elsewhere (SLAM, post-processing), which stand in for GNSS.",
+    (
+        _STAMP,
+        _LOG_TIME,
+        _EPOCH,
+        *(Column(f"{axis}_m", _F64, "m", f"position, {axis}, as it was made", "pose_crs or its own") for axis in "xyz"),
+        Column("lon_deg", _F64, "deg", "longitude; null where no CRS is told", "gnss_crs", nullable=True),
+        Column("lat_deg", _F64, "deg", "latitude; null where no CRS is told", "gnss_crs", nullable=True),
+        Column("alt_m", _F64, "m", "height, as it was made; null where no CRS is told", "gnss_crs", nullable=True),
+        *(
+            Column(f"{name}_var_m2", _F64, "m2", f"variance along {axis}; null where none is given", "", nullable=True)
+            for name, axis in (("east", "x"), ("north", "y"), ("up", "z"))
+        ),
+    ),
+)
+
 STREAMS: dict[str, TableSchema] = {
-    schema.name: schema for schema in (GNSS, IMU, WHEEL_ODOMETRY, VISUAL_ODOMETRY, POWER, COMMAND)
+    schema.name: schema for schema in (GNSS, IMU, WHEEL_ODOMETRY, VISUAL_ODOMETRY, POWER, COMMAND, POSE)
 }
 """Schema of each role's table."""
 

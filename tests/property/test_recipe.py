@@ -56,7 +56,7 @@ def test_a_key_changes_the_name_of_a_run_if_and_only_if_its_section_reaches_a_st
         assert (recipe_id(other, "husky") != recipe_id(default, "husky")) == (section(key) in INGEST)
         assert (ingest_key(other) != ingest_key(default)) == (section(key) in INGEST)
         streams_differ = read_key(other, None, definitions="") != read_key(default, None, definitions="")
-        assert streams_differ == (section(key) in {"read", "robots", "power_sources"})
+        assert streams_differ == (section(key) in {"read", "robots", "power_sources", "tables"})
 
 
 def test_one_name_is_one_set_of_bytes_whatever_the_other_sections_say(log, tmp_path):

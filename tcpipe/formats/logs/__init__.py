@@ -1,9 +1,10 @@
-"""Robot logs on disk: ROS 1 bags, ROS 2 bags and MCAP, behind one face, `tcpipe.formats.logs.log_file`.
+"""Robot logs on disk: ROS 1 bags, ROS 2 bags, MCAP and folders of tables, behind one face, `tcpipe.formats.logs.log_file`'s.
 
 The way from a path to a table, each step importing only those below it::
 
     pipeline.ingest
     joined          several files of one drive as one log
+    table_log       a folder of CSV, text or Parquet tables as a log
     log_file        a log: its files, topics and tables            arrow_columns   payloads to columns, by ros_types
     rosbag2         a bag directory's files; messages that are compressed one by one
     mcap_file, bag_file, sqlite_file    a file: its index, else a walk; what is lost

@@ -12,13 +12,18 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self, TypeAlias
 
 import pyarrow as pa
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.formats.logs.rosbag2 import is_one_bag
+from tcpipe.formats.logs.table_folders import Mappings
 from tcpipe.logs.topics import Damage, Topic
+
+if TYPE_CHECKING:
+    from tcpipe.formats.logs.table_log import TableLog
 
 _PART = re.compile(r"(?P<name>.+)_(?P<number>[0-9]{1,6})\.bag(\.active)?")
 _DATE = re.compile(r"[0-9]{4}(-[0-9]{2}){5}")
@@ -30,7 +35,7 @@ _GAP_NS = 5_000_000_000
 class JoinedLog:
     """Logs behind one face: topics merged, tables in log-time order; with the static transforms of an ``earlier`` part."""
 
-    def __init__(self, logs: Sequence[Log], earlier: Log | None) -> None:
+    def __init__(self, logs: Sequence[Log | TableLog], earlier: Log | None) -> None:
         self._logs, self._earlier = logs, earlier
         self.topics = (_static_topics(earlier) if earlier else {}) | _merged_topics(logs)
 
@@ -55,7 +60,7 @@ class JoinedLog:
 
     def sha256(self) -> str:
         """Return the file's hash; of several, that of their hashes, in order. `LogError` when two files are the same recording."""
-        digests: dict[str, Log] = {}
+        digests: dict[str, Log | TableLog] = {}
         for log in self._logs:
             twin = digests.setdefault(log.sha256(), log)
             if twin is not log:
@@ -98,16 +103,38 @@ def _joined(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
         ) from None
 
 
-def open_logs(paths: Sequence[Path], *, message_definitions: Path | None = None) -> Log | JoinedLog:
-    """Open one log, or several as one; `LogError` when a topic has different types in two of them."""
+AnyLog: TypeAlias = "Log | JoinedLog | TableLog"
+"""What a run is made of."""
+
+
+def open_logs(
+    paths: Sequence[Path], *, message_definitions: Path | None = None, tables: Mappings | None = None
+) -> AnyLog:
+    """Open one log, or several as one; `LogError` when a topic has different types in two of them.
+
+    A folder that is no bag is one of tables, where ``tables`` says what they hold.
+    """
     with ExitStack() as stack:
-        logs = [stack.enter_context(open_log(path, message_definitions=message_definitions)) for path in sorted(paths)]
-        earlier = _earlier_part(logs[0]) if len(logs) == 1 and not _static_topics(logs[0]) else None
+        logs: list[Log | TableLog] = []
+        for path in sorted(paths):
+            logs.append(opened(path, message_definitions=message_definitions, tables=tables))
+            stack.callback(logs[-1].close)
+        alone = logs[0] if len(logs) == 1 else None
+        earlier = _earlier_part(alone) if isinstance(alone, Log) and not _static_topics(alone) else None
         if earlier:
             stack.enter_context(earlier)
         joined = JoinedLog(logs, earlier)
         stack.pop_all()
     return joined if earlier or len(logs) > 1 else logs[0]
+
+
+def opened(path: Path, *, message_definitions: Path | None, tables: Mappings | None) -> Log | TableLog:
+    """Open one log: a folder that is no bag is one of tables, where ``tables`` says what they hold."""
+    if tables and path.is_dir() and not is_one_bag(path):
+        from tcpipe.formats.logs.table_log import TableLog  # noqa: PLC0415  polars only where a table is read
+
+        return TableLog(path, tables)
+    return open_log(path, message_definitions=message_definitions)
 
 
 def _earlier_part(log: Log) -> Log | None:
@@ -147,7 +174,7 @@ def _part_before(log: Log) -> Log | None:
     return None
 
 
-def _merged_topics(logs: Sequence[Log]) -> dict[str, Topic]:
+def _merged_topics(logs: Sequence[Log | TableLog]) -> dict[str, Topic]:
     merged: dict[str, Topic] = {}
     for log in logs:
         for name, topic in log.topics.items():

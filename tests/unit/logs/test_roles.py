@@ -351,3 +351,53 @@ def test_a_motors_phase_currents_play_no_role_and_the_reason_is_said() -> None:
     assert found.roles["power"].topics == ("/a300_0001/platform/bms/state",)
     assert any("the current in the motor's phases" in line for line in found.warnings)
     assert found.problems == ()
+
+
+POSE, POSE_COV = "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped"
+WHEELS = ("/platform/odom", ODOMETRY)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("/icp_odom", ODOMETRY), ("/slam/pose", POSE_COV), ("/lio_sam/mapping/pose", POSE), ("/fast_lio/odom", ODOMETRY)],
+)
+def test_a_pose_that_is_called_so_stands_in_where_there_is_no_gnss(name: str, kind: str) -> None:
+    alone = assign(WHEELS, (name, kind))
+    assert played(alone) == {"wheel_odometry": ("/platform/odom",), "pose": (name,)}
+    assert alone.roles["pose"].why.endswith("and there is no GNSS")
+    assert not any("gnss" in line for line in alone.warnings)
+    beside = assign(WHEELS, (name, kind), ("/fix", FIX))
+    assert played(beside) == {"wheel_odometry": ("/platform/odom",), "gnss": ("/fix",)}
+    assert "another estimator's output" in beside.left_out[name]
+
+
+@pytest.mark.parametrize(
+    "topics",
+    [
+        [("/odometry/filtered", ODOMETRY)],
+        [("/move_base_simple/goal", POSE)],
+        [("/amcl_pose", POSE_COV)],
+        [("/icp_odom", ODOMETRY), ("/lego_loam/odom", ODOMETRY)],
+    ],
+)
+def test_other_poses_and_two_of_them_play_only_where_they_are_named(topics: list[tuple[str, str]]) -> None:
+    assert "pose" not in played(assign(WHEELS, *topics))
+    name = topics[0][0]
+    named = assign(WHEELS, *topics, ("/fix", FIX), chosen={"pose": [name]})
+    assert played(named) == {"wheel_odometry": ("/platform/odom",), "pose": (name,)}
+    assert named.left_out["/fix"] == f"the pose of {name} stands in for it"
+
+
+def test_what_a_pose_was_made_from_is_not_fused_again() -> None:
+    topics = [topic(*WHEELS), topic("/imu", IMU), topic("/odometry/filtered", ODOMETRY)]
+    chosen = {"pose": ["/odometry/filtered"]}
+    found = assign_roles(topics, chosen, pose_from=["wheel_odometry"])
+    assert played(found) == {"imu": ("/imu",), "pose": ("/odometry/filtered",)}
+    both = assign_roles([*topics, topic("/fix", FIX)], {**chosen, "gnss": ["/fix"]})
+    assert "names /fix as gnss and /odometry/filtered as pose" in both.problems[0]
+
+
+def test_a_mapped_role_is_played_by_any_type_that_the_recipe_names() -> None:
+    mine = topic("/rtk", "my_msgs/msg/Pvt")
+    assert assign_roles([mine], {"gnss": ["/rtk"]}).problems
+    assert played(assign_roles([mine], {"gnss": ["/rtk"]}, mapped=["gnss"])) == {"gnss": ("/rtk",)}

@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from unit.fusion import drive
 
 from tcpipe.errors import FusionError
-from tcpipe.geometry.datum import geodetic_from_enu
+from tcpipe.geometry.datum import enu_from_geodetic, geodetic_from_enu
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse import fuse_run
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.levels import COMMAND, GNSS, IMU, POWER, VISUAL_ODOMETRY, WHEEL_ODOMETRY, Sensor, Streams
+from tcpipe.tables.levels import COMMAND, GNSS, IMU, POSE, POWER, VISUAL_ODOMETRY, WHEEL_ODOMETRY, Sensor, Streams
 
 SITE = (15.46, 47.06, 450.0)
 MOUNTING = Rotation.from_euler("xyz", [np.pi, 0.0, np.pi / 2])
@@ -236,3 +236,40 @@ def test_the_same_streams_give_the_same_track(streams, track):
     assert again.table.equals(track.table)
     assert again.rejections.equals(track.rejections)
     assert again.info == track.info
+
+
+def with_pose(streams, columns):
+    """The streams with positions made elsewhere in the place of the fixes."""
+    fixes = streams.tables["gnss"]
+    kept = {name: fixes[name] for name in fixes.column_names if name in POSE.names()}
+    tables = {role: table for role, table in streams.tables.items() if role != "gnss"}
+    sensors = {role: of for role, of in streams.sensors.items() if role != "gnss"} | {"pose": streams.sensors["gnss"]}
+    return replace(streams, tables=tables | {"pose": POSE.table(**kept | columns)}, sensors=sensors)
+
+
+def test_a_pose_in_a_frame_of_its_own_gives_the_same_drive_and_no_place(streams, track):
+    fixes = streams.tables["gnss"]
+    datum = track.info.datum
+    place = [floats(fixes, name) for name in ("lon_deg", "lat_deg", "alt_m")]
+    enu = enu_from_geodetic(*place, datum_deg_m=(datum.lon_deg, datum.lat_deg, datum.alt_m)) + np.array(
+        [50.0, -20.0, 3.0]
+    )
+    unknown = np.full(fixes.num_rows, np.nan)
+    columns = dict(zip(("x_m", "y_m", "z_m"), enu.T, strict=True))
+    local = fuse_run(
+        with_pose(streams, columns | dict.fromkeys(("lon_deg", "lat_deg", "alt_m"), unknown)), FuseConfig(), run_id="r"
+    )
+    assert local.info.datum is None
+    assert local.table["lon_deg"].null_count == local.table.num_rows == track.table.num_rows
+    for name in ("forward_velocity_mps", "yaw_rad", "x_std_m"):
+        np.testing.assert_allclose(floats(local.table, name), floats(track.table, name), atol=1e-3)
+    moved = [np.diff(floats(table, "x_m")) for table in (local.table, track.table)]
+    np.testing.assert_allclose(*moved, atol=1e-3)
+
+
+def test_a_pose_in_a_crs_is_fused_as_the_fixes_are(streams, track):
+    place = {name: streams.tables["gnss"][name] for name in ("lon_deg", "lat_deg", "alt_m")}
+    columns = dict(zip(("x_m", "y_m", "z_m"), place.values(), strict=True)) | place
+    placed = fuse_run(with_pose(streams, columns), FuseConfig(), run_id="r")
+    assert placed.info.datum == track.info.datum
+    np.testing.assert_array_equal(floats(placed.table, "lon_deg"), floats(track.table, "lon_deg"))

@@ -61,10 +61,23 @@ def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
     assert kept[(T > 7.6) & (T < 47.4)].all()
 
 
+@pytest.mark.parametrize(("share", "limit"), [(0.7, 0.7), (0.3, 1.0)])
+def test_the_top_command_of_a_run_is_its_limit_where_most_is_driven_at_it(share, limit):
+    commanded = np.where(60 * share > T, 0.7, 0.35)
+    gated = gate(straight_track(commanded - 0.1, commanded_mps=commanded))
+    assert gated.info.findings.facts.gate.max_velocity_mps == pytest.approx(limit)
+    below = rows_of(gated, DropReason.BELOW_LIMIT)
+    assert below[60 * share + 1 < T].all()
+    assert below[60 * share - 1 > T].all() == (limit == 1.0)
+    said = gated.info.findings.warnings
+    assert any("70% of the moving track was commanded at 0.70 m/s" in line for line in said) == (limit == 0.7)
+    assert any("its top command, 0.70 m/s, was held for 30% of it" in line for line in said) == (limit == 1.0)
+
+
 def test_below_the_limit_unless_it_is_unknown_or_allowed():
     speed, commanded = np.full(len(T), 0.6), np.full(len(T), 0.7)
     track = straight_track(speed, commanded_mps=commanded)
-    assert rows_of(gate(track), DropReason.BELOW_LIMIT).all()
+    assert rows_of(gate(track, config=GateConfig(max_velocity_mps=1.0)), DropReason.BELOW_LIMIT).all()
     assert not rows_of(gate(track, config=GateConfig(require_full_speed=False)), DropReason.BELOW_LIMIT).any()
     unknown = gate(track, limit_mps=None)
     assert not rows_of(unknown, DropReason.BELOW_LIMIT).any()

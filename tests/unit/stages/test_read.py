@@ -6,10 +6,11 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pyarrow as pa
+import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tcpipe.errors import RoleError
+from tcpipe.errors import RecipeError, RoleError
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import RailReadings
@@ -157,7 +158,7 @@ def husky(**more: tuple[str, pa.Table]) -> dict[str, tuple[str, pa.Table]]:
     }
 
 
-def read(topics: Mapping[str, tuple[str, pa.Table]], robot: str | None = None, **config) -> Streams:
+def read(topics: Mapping[str, tuple[str, pa.Table]], /, robot: str | None = None, **config) -> Streams:
     return read_run(MemoryLog(topics), ReadConfig(**config), robot=robot, known=shipped_profiles())
 
 
@@ -416,3 +417,55 @@ def test_averaging_that_nobody_knows_and_no_motion_tells_is_asked(
     assert found.power_averaged == averaged
     asked = [line for line in found.findings.warnings if "nobody knows whether its values are means" in line]
     assert bool(asked) == (said is not None)
+
+
+def test_a_gnss_message_of_ones_own_is_read_by_the_fields_the_recipe_names():
+    _, table = fix()
+    lat, lon = (np.round(table[name].to_numpy() * 1e7).astype(np.int64) for name in ("latitude", "longitude"))
+    columns = {"pvt.lat": lat, "pvt.lon": lon, "pvt.height_mm": full(50, 400_000.0), "acc": full(50, 0.02)}
+    topics = husky()
+    topics["/rtk/pvt"] = "my_msgs/msg/Pvt", message_table(50, 5.0, frame="gps", **columns)
+    fields = {"latitude": "pvt.lat * 1e-7", "longitude": "pvt.lon * 1e-7", "altitude": "pvt.height_mm * 0.001"}
+    fields |= {f"{axis}_std": "acc" for axis in ("east", "north", "up")}
+    found = read(topics, topics={"gnss": ["/rtk/pvt"]}, fields={"gnss": fields})
+    wanted = read(husky())
+    assert found.sensors["gnss"].type_name == "my_msgs/msg/Pvt"
+    assert found.sensors["gnss"].xyz_m == wanted.sensors["gnss"].xyz_m
+    for name in ("stamp_ns", "lat_deg", "lon_deg", "alt_m", "east_var_m2", "fix_status"):
+        given = wanted.tables["gnss"][name].to_numpy() if name != "fix_status" else np.zeros(50)
+        np.testing.assert_allclose(found.tables["gnss"][name].to_numpy(), given, rtol=1e-12)
+    with pytest.raises(RoleError) as caught:
+        read(topics, topics={"gnss": ["/rtk/pvt"]}, fields={"gnss": {"latitude": "lat", "longitude": "pvt.lon"}})
+    assert "names lat, which its messages do not hold; they hold" in caught.value.problems[0]
+
+
+def pose(lon: np.ndarray, lat: np.ndarray) -> tuple[str, pa.Table]:
+    east, north = pyproj.Transformer.from_crs(4617, 2949, always_xy=True).transform(lon, lat)
+    columns = {
+        "pose.pose.position.x": east,
+        "pose.pose.position.y": north,
+        "pose.pose.position.z": full(len(lon), 640.0),
+    }
+    covariance = cov(len(lon), 6, 0.0004)
+    return "geometry_msgs/msg/PoseWithCovarianceStamped", message_table(
+        len(lon), 10.0, **columns, **{"pose.covariance": covariance}
+    )
+
+
+def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
+    lon, lat = -71.15 + np.arange(100) * 1e-6, 47.32 + np.arange(100) * 1e-6
+    topics = husky(**{"/slam/pose": pose(lon, lat)})
+    placed = read(topics, topics={"pose": ["/slam/pose"]}, pose_crs="EPSG:2949")
+    assert "gnss" not in placed.tables
+    assert placed.gnss_crs == "EPSG:4617"
+    np.testing.assert_allclose(placed.tables["pose"]["lon_deg"].to_numpy(), lon, atol=1e-11)
+    np.testing.assert_allclose(placed.tables["pose"]["lat_deg"].to_numpy(), lat, atol=1e-11)
+    assert placed.tables["pose"]["alt_m"].to_pylist() == [640.0] * 100
+    assert placed.tables["pose"]["east_var_m2"].to_pylist() == pytest.approx([0.0004] * 100)
+    assert any("/slam/pose stands in for GNSS" in line for line in placed.findings.warnings)
+    local = read(topics, topics={"pose": ["/slam/pose"]})
+    assert local.tables["pose"]["lon_deg"].null_count == 100
+    assert any("segments, but no samples" in line for line in local.findings.warnings)
+    for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a coordinate reference system")):
+        with pytest.raises(RecipeError, match=said):
+            read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)

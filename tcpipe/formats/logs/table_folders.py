@@ -1,0 +1,42 @@
+"""Where tables lie: the folders that the recipe maps, and the files in them; polars is loaded only where one is read."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+from tcpipe.recipe import TableMapping
+
+TABLE_SUFFIXES = (".csv", ".tsv", ".txt", ".tum", ".pos", ".parquet")
+"""What a file of a table is called."""
+
+Mappings = Mapping[str, TableMapping]
+"""The recipe's tables, by name."""
+
+
+def table_files(folder: Path) -> list[Path]:
+    """Return the tables in a folder and below it, by name; hidden ones are passed over."""
+    return sorted(Path(place) / name for place, _, names in _walked(folder) for name in names if is_table(name))
+
+
+def table_folders(path: Path, mappings: Mappings) -> list[Path]:
+    """Return the folders at or below a path that hold a mapped file, in order of their names; what lies below one is its own."""
+    wanted = [mapping.file for mapping in mappings.values() if mapping.file]
+    found = []
+    for place, folders, _ in _walked(path):
+        if any((Path(place) / file).is_file() for file in wanted):
+            found.append(Path(place))
+            folders.clear()
+    return found
+
+
+def _walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+    for place, folders, names in os.walk(folder):
+        folders[:] = sorted(name for name in folders if not name.startswith((".", "~")))
+        yield place, folders, names
+
+
+def is_table(name: str) -> bool:
+    """Return whether a file of this name is a table."""
+    return name.lower().endswith(TABLE_SUFFIXES) and not name.startswith((".", "~"))

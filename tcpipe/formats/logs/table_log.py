@@ -1,0 +1,211 @@
+"""A folder of tables as a log: each table that the recipe maps is a topic, its rows the messages that its role usually has.
+
+Behind the same face as a bag: topics, tables of messages, damage. All of it is read when it is opened; it is small beside a bag.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.table_folders import TABLE_SUFFIXES, Mappings, is_table, table_files
+from tcpipe.formats.tables import Cells, column_names, read_cells
+from tcpipe.logs.mapped import in_units, mapping_problems, message_fields, stamps_ns, topic_of, utc_from_gps_ns
+from tcpipe.logs.topics import Damage, Topic
+from tcpipe.power.sources import FLOAT_TYPES
+from tcpipe.recipe import TableMapping
+from tcpipe.tables.arrays import number_column
+
+_GPS_TIME = "GPST"
+"""What RTKLIB calls a column of GPS time."""
+_HASH_BYTES = 1 << 20
+
+
+@dataclass(frozen=True, slots=True)
+class _Read:
+    """A table that was read: its topic, messages, what is broken in it and what is to be said of it."""
+
+    topic: Topic
+    messages: pa.Table
+    damage: tuple[Damage, ...]
+    remarks: tuple[str, ...]
+
+
+class TableLog:
+    """A folder of mapped tables, read. It has no file open."""
+
+    container = "tables"
+
+    def __init__(self, path: Path, mappings: Mappings) -> None:
+        """Read the tables; `LogError` has a line for each thing in which the mapping and the folder do not agree."""
+        self.path = path
+        problems: list[str] = []
+        read: list[_Read] = []
+        for name, mapping in mappings.items():
+            found = _read_table(path, name, mapping)
+            if isinstance(found, _Read):
+                read.append(found)
+            else:
+                problems += found
+        problems += _two_clocks(read)
+        if problems:
+            raise LogError(*(f"{path}: {problem}" for problem in problems))
+        self._tables = {found.topic.name: found.messages for found in read}
+        self.topics = {found.topic.name: found.topic for found in read}
+        """Every mapped table by its topic's name."""
+        self.damage = [damage for found in read for damage in found.damage]
+        self.remarks = [remark for found in read for remark in found.remarks]
+        self._files = table_files(path)
+
+    def __enter__(self) -> Self:
+        """Return the log."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Do nothing: no file is open."""
+
+    def close(self) -> None:
+        """Do nothing: no file is open."""
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the folder's tables together, mapped or not."""
+        return sum(file.stat().st_size for file in self._files)
+
+    def sha256(self) -> str:
+        """Return the SHA-256 of all tables of the folder, mapped or not, one after the other, by name."""
+        digest = hashlib.sha256()
+        for file in self._files:
+            with file.open("rb") as stream:
+                while block := stream.read(_HASH_BYTES):
+                    digest.update(block)
+        return digest.hexdigest()
+
+    def tables(self, topics: Iterable[str]) -> dict[str, pa.Table]:
+        """Return the messages of several topics; `LogError` where one is not mapped."""
+        wanted = list(topics)
+        if unknown := [name for name in wanted if name not in self._tables]:
+            raise LogError(
+                f"{self.path}: no table is mapped to {', '.join(unknown)}; there are {', '.join(self.topics)}"
+            )
+        return {name: self._tables[name] for name in wanted}
+
+    def batches(self, topics: Iterable[str]) -> Iterator[dict[str, pa.Table]]:
+        """Yield the messages of several topics, at once."""
+        yield self.tables(topics)
+
+
+def _read_table(folder: Path, name: str, mapping: TableMapping) -> _Read | list[str]:
+    """Return a table's messages, or every problem of its mapping."""
+    where = f"recipe tables.{name}"
+    role = mapping.role or name
+    problems = list(mapping_problems(where, role, mapping.columns, mapping.units))
+    path = folder / mapping.file
+    if not is_table(mapping.file):
+        problems.append(f"{where}.file is {mapping.file!r}; wanted a name that ends in {', '.join(TABLE_SUFFIXES)}")
+    elif not path.is_file():
+        held = ", ".join(str(file.relative_to(folder)) for file in table_files(folder)[:20])
+        problems.append(f"{where}.file: there is no {mapping.file} here; there are {held or 'no tables at all'}")
+    if problems:
+        return problems
+    try:
+        names = column_names(path)
+        stamp = names[0] if mapping.stamp is None else mapping.stamp
+        if missing := [name for name in dict.fromkeys([stamp, *mapping.columns.values()]) if name not in names]:
+            return [f"{where}: {mapping.file} has no column {', '.join(missing)}; it has {', '.join(names)}"]
+        cells = read_cells(path, stamp=stamp, columns=list(mapping.columns.values()))
+    except LogError as error:
+        return [problem.removeprefix(f"{folder}/") for problem in error.problems]
+    empty = [
+        f"{where}: column {column} of {mapping.file} holds text ({text!r} in row {row}), wanted numbers"
+        for column, (_, row, text) in cells.texts.items()
+        if not np.isfinite(cells.columns[column]).any()
+    ]
+    stamp_ns = _stamps(cells, stamp, mapping)
+    if isinstance(stamp_ns, str):
+        return [*empty, f"{where}: {mapping.file}, column {stamp}: {stamp_ns}"]
+    return empty or _messages(topic_of(name, role, mapping.columns), role, mapping, cells, stamp_ns)
+
+
+def _stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.int64] | str:
+    """Return the known stamps [ns, UTC], or what is in the way of that."""
+    known = cells.stamp[cells.stamp_known]
+    if not known.size:
+        return "it holds neither numbers nor dates (wanted seconds, or text as 2025-10-14T15:41:25.7Z)"
+    found = stamps_ns(known, "ns" if cells.stamp_is_time else mapping.stamp_unit)
+    if isinstance(found, str):
+        return found
+    found = utc_from_gps_ns(found) if cells.stamp_is_time and stamp == _GPS_TIME else found
+    return found + round(mapping.offset_s * 1e9)
+
+
+def _messages(
+    read_as: tuple[str, str], role: str, mapping: TableMapping, cells: Cells, stamp_ns: NDArray[np.int64]
+) -> _Read:
+    """Return a table as the messages of its topic and type, in order of time, and what of it is lost."""
+    topic, kind = read_as
+    lost = int(np.count_nonzero(~cells.stamp_known))
+    damage = [Damage(mapping.file, "rows have no stamp that can be read", topic, lost)] if lost else []
+    damage += [
+        Damage(mapping.file, f"column {column} holds text, first {text!r} in row {row}", topic, count)
+        for column, (count, row, text) in cells.texts.items()
+    ]
+    values = {field: cells.columns[column] for field, column in mapping.columns.items()}
+    order = slice(None) if not lost else np.flatnonzero(cells.stamp_known)
+    backward = int(np.count_nonzero(np.diff(stamp_ns) < 0))
+    if backward:
+        by_time = np.argsort(stamp_ns, kind="stable")
+        order, stamp_ns = np.flatnonzero(cells.stamp_known)[by_time], stamp_ns[by_time]
+    values = in_units(role, {field: value[order] for field, value in values.items()}, mapping.units)
+    if kind in FLOAT_TYPES:
+        columns = {"data": next(iter(values.values()))}
+    else:
+        second, rest = np.divmod(stamp_ns, 1_000_000_000)
+        columns = {"header.stamp.sec": second, "header.stamp.nanosec": rest}
+        columns |= message_fields(role, values, stamp_ns.size)
+    table = pa.table(
+        {
+            "log_time_ns": number_column(stamp_ns),
+            "publish_time_ns": number_column(stamp_ns),
+            **{column: _arrow(value) for column, value in columns.items()},
+        }
+    )
+    span = (int(stamp_ns[0]), int(stamp_ns[-1]))
+    remarks = (
+        (f"{mapping.file}: {backward} stamps lie before the one above; its rows are put in order",) if backward else ()
+    )
+    found = Topic(topic, kind, stamp_ns.size, *span, "table", "")
+    return _Read(found, table, tuple(damage), (*cells.remarks, *remarks))
+
+
+def _arrow(values: NDArray[np.float64]) -> pa.Array:
+    if values.ndim == 1:
+        return number_column(values)
+    return pa.FixedSizeListArray.from_arrays(number_column(values.ravel()), values.shape[1])
+
+
+def _two_clocks(read: Iterable[_Read]) -> Iterator[str]:
+    """Yield a line for tables that have no time in common with the longest: they are on another clock, or of another drive."""
+    spans = {found.topic.name: (found.topic.start_ns or 0, found.topic.end_ns or 0) for found in read}
+    if not spans:
+        return
+    longest = max(spans, key=lambda name: spans[name][1] - spans[name][0])
+    start_ns, end_ns = spans[longest]
+    for name, (first_ns, last_ns) in spans.items():
+        if first_ns > end_ns or last_ns < start_ns:
+            apart_s = (start_ns - first_ns) / 1e9
+            yield (
+                f"{name} and {longest} have no time in common (they begin {abs(apart_s):.3f} s apart): two clocks, or two drives; "
+                f"offset_s under its table is added to its stamps ({apart_s:.3f} lets both begin together)"
+            )

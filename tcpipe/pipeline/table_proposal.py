@@ -1,0 +1,121 @@
+"""What a folder of tables could be: a recipe's tables, proposed by what the columns and files are called."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from tcpipe.errors import LogError
+from tcpipe.logs.mapped import MAPPED
+from tcpipe.recipe.checking import as_toml
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectedTables:
+    """A folder of tables that no recipe maps: what they hold, and the recipe that is proposed."""
+
+    kind: Literal["tables"] = "tables"
+    path: str
+    columns: Mapping[str, tuple[str, ...]]
+    """By file, what its columns are called."""
+    problems: Mapping[str, str]
+    """By file, why it cannot be read."""
+    recipe: str
+    """TOML; "" where no column says what it is."""
+
+
+_ANY_UNIT = re.compile(r"\s*[\[(].*|_?(deg|rad|m|mps2?|radps|volt|amp)$")
+
+
+def _axes(before: str, name: str) -> dict[str, str]:
+    return {f"{name}_{axis}": rf"(.*[_.])?({before})[_.]?{axis}" for axis in "xyz"}
+
+
+_VELOCITY = {"linear_x": r"(.*[_.])?(t?l(in(ear)?)?|v(el(ocity)?)?)[_.]?x|speed|velocity|forward_velocity|v"}
+_TURN = {"angular_z": r"(.*[_.])?(t?a(ng(ular)?)?|w|omega)[_.]?z|yaw_?rate|omega"}
+_CALLED: dict[str, dict[str, str]] = {
+    "gnss": {
+        "latitude": r"(.*[_.])?lat(itude)?",
+        "longitude": r"(.*[_.])?(lon(gitude)?|lng|long)",
+        "altitude": r"(.*[_.])?(alt(itude)?|height|h)",
+        "east_std": r"sde",
+        "north_std": r"sdn",
+        "up_std": r"sdu",
+    },
+    "imu": {
+        **_axes("w|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),
+        **_axes("a|acc(el)?|lin(ear)?_?acc(el(eration)?)?", "linear_acceleration"),
+    },
+    "command": {**_VELOCITY, **_TURN},
+    "wheel_odometry": {**_VELOCITY, **_TURN},
+    "power": {"voltage": r"(.*[_.])?volt(age)?", "current": r"(.*[_.])?(curr(ent)?|amps?)"},
+    "pose": {
+        "x": r"[tp]?x|pos(ition)?[_.]?x|east(ing)?",
+        "y": r"[tp]?y|pos(ition)?[_.]?y|north(ing)?",
+        "z": r"[tp]?z|pos(ition)?[_.]?z|up|height",
+    },
+}
+"""What columns are called that play a field of a role; the first role whose fields are all there is proposed."""
+
+_COMMAND = re.compile(r"cmd|command|joy")
+_BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
+_STAMP = re.compile(r"t|stamp|.*time(stamp)?.*|gpst|utc|date")
+
+
+def proposed(folder: Path, files: Sequence[Path]) -> InspectedTables:
+    """Return the columns of each table, why some cannot be read, and a recipe for the rest."""
+    from tcpipe.formats.tables import column_names  # noqa: PLC0415  polars only where a table is read
+
+    columns: dict[str, tuple[str, ...]] = {}
+    problems: dict[str, str] = {}
+    for file in files:
+        name = file.relative_to(folder).as_posix()
+        try:
+            columns[name] = tuple(column_names(file))
+        except LogError as error:
+            problems[name] = str(error)
+    return InspectedTables(path=str(folder), columns=columns, problems=problems, recipe="\n".join(_tables(columns)))
+
+
+def _tables(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of the recipe; of two tables for one role the second is a comment."""
+    taken: set[str] = set()
+    for file, names in columns.items():
+        role, found = _role(file, names)
+        if role is None:
+            continue
+        stamp = next((name for name in names if _STAMP.fullmatch(name.lower())), names[0])
+        alone = role == "power" and len(found) == 1
+        table = re.sub(r"\W+", "_", Path(file).stem) if alone else role
+        kind = "power of drives" if alone else "power of a battery" if role == "power" else role
+        once = role == "power" and alone and "power of a battery" not in taken
+        again = "" if once or role not in taken else "# "
+        taken |= {role, kind}
+        yield from ("", f"# {role} is taken already; one of both:") if again else ("",)
+        yield f"{again}[tables.{table}]"
+        yield from (f'{again}role = "power"',) if alone else ()
+        yield f"{again}file = {as_toml(file)}"
+        yield f"{again}columns = {{ {', '.join(f'{field} = {as_toml(name)}' for field, name in found.items())} }}"
+        yield f"{again}stamp = {as_toml(stamp)}"
+
+
+def _role(file: str, names: Sequence[str]) -> tuple[str | None, dict[str, str]]:
+    """Return the role that a table plays by its columns, and which column is which field."""
+    for role, called in _CALLED.items():
+        if (role in ("command", "wheel_odometry")) and (role == "command") != bool(_COMMAND.search(file.lower())):
+            continue
+        found: dict[str, str] = {}
+        for field, pattern in called.items():
+            match = next((n for n in names if re.fullmatch(pattern, _ANY_UNIT.sub("", n.lower()))), None)
+            if match is not None and match not in found.values():
+                found[field] = match
+        needed = [field for field, of in MAPPED[role].items() if of.needed]
+        if found and all(field in found for field in needed) and (role != "power" or len(found) == 2):
+            return role, found
+    for quantity, word in _BARE.items():
+        if word.search(Path(file).stem.lower()) and len(names) == 2:
+            return "power", {quantity: names[1]}
+    return None, {}
