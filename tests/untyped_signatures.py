@@ -15,6 +15,8 @@ Trees = dict[str, ast.Module]
 MAPPINGS = {"dict", "Mapping", "MutableMapping"}
 
 _BY_LIBRARY = {
+    "lightgbm": """learning/forest.py:forest_of learning/forest.py:_Nursery.plant learning/forest.py:_Nursery._add
+        learning/forest.py:_load_lightgbm""",
     "torch": """dataset/torch_data.py:TorchBatches.__iter__ dataset/torch_data.py:_tensors learning/losses.py:mean_loss
         learning/network.py:Normed.forward learning/network.py:BasicBlock.forward learning/network.py:ResNet18.forward
         learning/network.py:ResNet18._weights learning/network.py:device learning/network.py:on_device learning/network.py:_padded

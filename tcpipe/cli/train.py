@@ -9,9 +9,13 @@ import click
 from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRange, json_option, quiet_option
 
 
-@click.command(short_help="Train the paper's network on a dataset")
+@click.command(short_help="Train a model on a dataset")
 @click.argument("dataset", type=INPUT_DIRECTORY, metavar="DATASET")
 @click.argument("out", default="model", type=OUTPUT_DIRECTORY, metavar="[OUT]")
+@click.option(
+    "--model", default="resnet18", show_default=True, type=click.Choice(["resnet18", "table"]),
+    help="The paper's network, or boosted trees on features of patches, in seconds; they heed --loss, --weights and --label alone.",
+)  # fmt: skip
 @click.option(
     "--loss", default="nrmse", show_default=True, type=click.Choice(["nrmse", "paper_eq4"]),
     help="paper_eq4 is the paper's equation 4 as printed; nrmse makes both errors dimensionless.",
@@ -51,7 +55,8 @@ from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRan
 def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **options: Any) -> None:
     """Train ResNet-18 on DATASET's patches and labels, stop early by a fold of train, and write the model folder OUT.
 
-    Needs the extra: pip install 'tcpipe[train]'. Runs on a GPU when there is one. A training that was stopped goes on where it was.
+    Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for a table. A network runs on a GPU when there is one; its training
+    goes on where it was stopped.
     """
     from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.fitting import FitConfig

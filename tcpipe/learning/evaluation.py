@@ -121,7 +121,8 @@ def evaluate(
         return load_model(place)
 
     ablation = list(_ablation(ours, sets, config, trained))
-    energy = _energy(ours, data, sets, said, trained if config.baselines else None)
+    with_networks = config.baselines and fitting.model == "resnet18"
+    energy = _energy(ours, data, sets, said, trained if with_networks else None)
     return Evaluation(
         tcpipe_version=__version__,
         key=key,
@@ -263,6 +264,10 @@ def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
             count = int((found.class_ids == class_id).sum())
             if class_id not in {NODATA_ID, *ours.class_counts}:
                 lines.append(f"{called}: {count} samples of {name}, none in training: the model never saw this class")
+    if ours.card.training.config.model == "table":
+        lines.append(
+            "the model is a table: the networks of Wei and Isler are trained beside a network alone, and are not here"
+        )
     if dataset_checksum(data.card) != ours.card.dataset.sha256:
         lines.append(
             f"the model was trained on another dataset ({ours.card.dataset.name}, {ours.card.dataset.sha256[:12]}): "

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("tcpipe")
 
+ModelKind = Literal["resnet18", "table"]
+"""The paper's network on patches, or boosted trees on features of them."""
+
 Floats = NDArray[np.float32]
 
 _SLOWER = 0.1
@@ -36,8 +39,9 @@ _LAST = 0.8
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
-    """How a network is trained; the paper gives ResNet-18, equation 4 and the learning rate."""
+    """How a model is trained; the paper gives ResNet-18, equation 4 and the learning rate. A table takes loss, weights and label alone."""
 
+    model: ModelKind = "resnet18"
     loss: Loss = "nrmse"
     epochs: int = 100
     """At most."""
@@ -63,6 +67,8 @@ class FitConfig:
 class Task:
     """What is fitted on what."""
 
+    train: Split
+    """Both of the next."""
     fit: Split
     held: Split
     outputs: tuple[str, ...]
@@ -86,10 +92,14 @@ class Spent:
 
 @dataclass(frozen=True, slots=True)
 class Fitted:
-    """A trained network with the best weights, what its labels were divided by, and how it went."""
+    """A trained model: its best weights, what its outputs are multiplied by, and how it went."""
 
-    network: ResNet18
+    weights: Arrays
     scale: tuple[float, ...]
+    held: Split
+    """Samples that it was not trained on when it predicted them."""
+    said: NDArray[np.floating]
+    """What it predicted of them, in the labels' units, shape (N, outputs)."""
     progress: TrainingProgress
     spent: Spent
     device: str
@@ -135,7 +145,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         write_checkpoint(checkpoint, progress, _state(trainer, best))
         _say(name, progress, config, spent)
     network.set_arrays(best, str(checkpoint))
-    return Fitted(network, scale, progress, spent, device)
+    return Fitted(best, scale, task.held, predicted(network, task.held, scale), progress, spent, device)
 
 
 def _new_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors: Floats) -> tuple[Trainer, str]:
@@ -151,8 +161,7 @@ def _new_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors:
 
 def label_scale(task: Task) -> tuple[float, ...]:
     """Return the largest label of each output among all of train: what labels are divided by."""
-    labels = np.concatenate([labels_of(task.fit, task.outputs), labels_of(task.held, task.outputs)])
-    return tuple(float(value) for value in labels.max(axis=0))
+    return tuple(float(value) for value in labels_of(task.train, task.outputs).max(axis=0))
 
 
 def predicted(network: ResNet18, split: Split, scale: Sequence[float]) -> Floats:

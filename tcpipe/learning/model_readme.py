@@ -19,9 +19,14 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 
 - Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
 - Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
+{% if config.model == "table" -%}
+- Table: up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM), as many as are best where each fold of
+  train is predicted by the others; their loss {{ config.loss }} there is {{ "%.4f" | format(told.held_out_loss) }}.
+{% else -%}
 - Network: ResNet-18 of width {{ width }}; loss {{ config.loss }}, Adam {{ config.learning_rate }}, batch {{ config.batch }},
   seed {{ config.seed }}; best of {{ told.epochs }} epochs by fold {{ config.fold }} of train: {{ told.best_epoch }},
   loss {{ "%.4f" | format(told.held_out_loss) }}.
+{% endif -%}
 - Trained on {{ told.samples["fitted"] }} samples of {{ dataset.name }}, checksum {{ dataset.sha256 }}.
 - Seen: {{ classes }}; slope {{ slope }}; relief of a patch {{ relief }}. Beyond these it has no business.
 

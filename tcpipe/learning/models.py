@@ -3,8 +3,8 @@
 ::
 
     model.json         what it takes, gives, and has seen; how it was trained; checksums of the rest
-    weights.npz        every weight by its path in the network
-    residuals.parquet  labels and predictions of the fold that training was stopped by
+    weights.npz        every weight by its path in the network; the arrays of a table's trees
+    residuals.parquet  labels and predictions of the fold that training was stopped by; of a table, of all samples by the other folds
     history.csv        losses of every epoch
     MODEL.md           the same for people
 """
@@ -32,6 +32,7 @@ from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_curre
 from tcpipe.terrain.classes import ClassTable
 
 if TYPE_CHECKING:
+    from tcpipe.learning.forest import Forest
     from tcpipe.learning.network import ResNet18
 
 Floats = NDArray[np.float32]
@@ -48,10 +49,12 @@ FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
 LEAST_VELOCITY_MPS = 0.05
 """A predicted velocity is never below it, so that T = d / v stays finite: slower is standing."""
 
+_TOGETHER = 256
+
 
 @dataclass(frozen=True)
 class Model:
-    """A trained network with its card; ``name`` is the folder as it was given."""
+    """A trained network or table with its card; ``name`` is the folder as it was given."""
 
     name: str
     card: ModelCard
@@ -70,6 +73,13 @@ class Model:
         network = resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
         network.set_arrays(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
         return network
+
+    @cached_property
+    def forest(self) -> Forest:
+        """Return the trees of a table."""
+        from tcpipe.learning.forest import forest_of  # noqa: PLC0415  numba takes a second
+
+        return forest_of(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
 
     @property
     def classes(self) -> ClassTable:
@@ -145,8 +155,19 @@ class Model:
         return out
 
     def outputs(self, patches: Floats) -> Floats:
-        """Return what the network gives, in the units of its outputs, shape (N, outputs)."""
-        return self.network.predict(patches) * np.array(self.card.scale, np.float32)
+        """Return what the model gives, in the units of its outputs, shape (N, outputs)."""
+        if self.card.training.config.model == "resnet18":
+            return self.network.predict(patches) * np.array(self.card.scale, np.float32)
+        from tcpipe.learning.patch_features import patch_features  # noqa: PLC0415  where it is needed, as is the next
+
+        out = np.empty((len(patches), len(self.card.scale)), np.float32)
+        for first in range(0, len(patches), _TOGETHER):
+            features = patch_features(
+                patches[first : first + _TOGETHER],
+                channels=self.channels, class_count=self.classes.count, patch_m=self.patch_m,
+            )  # fmt: skip
+            out[first : first + _TOGETHER] = self.forest.predict(features)
+        return out
 
     @cached_property
     def _short_outputs(self) -> list[str]:

@@ -19,7 +19,7 @@ from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.checkpoint import read_checkpoint
-from tcpipe.learning.fitting import FitConfig, Fitted, Spent, Task, fit, labels_of, predicted
+from tcpipe.learning.fitting import FitConfig, Fitted, ModelKind, Spent, Task, fit, labels_of
 from tcpipe.learning.model_card import KIND, ModelCard, Seen, TrainedOn, Training, is_current
 from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import CARD, FILES, load_model, read_model_card, write_model
@@ -50,9 +50,11 @@ class TrainResult:
     path: Path
     status: str
     """``done`` or ``unchanged``."""
+    model: ModelKind
     samples: Mapping[str, int]
     """Fitted, and held out to stop by."""
     epochs: int
+    """Or trees a label, at most, and how many were best."""
     best_epoch: int
     held_out_loss: float
     device: str
@@ -65,6 +67,11 @@ class TrainResult:
         if self.status == "unchanged":
             return f"{self.path}: nothing to do: trained on the same dataset with the same options"
         fitted, held = self.samples["fitted"], self.samples["held out"]
+        if self.model == "table":
+            return (
+                f"{self.path}: {self.best_epoch} trees a label of {fitted} samples, each predicted by the other folds\n"
+                f"held-out loss {self.held_out_loss:.4f}; {self.spent.total_s:.1f} s, {100.0 * self.feeding_share:.0f} % of it for features"
+            )
         speed, share = self.spent.samples / max(self.spent.total_s, 1e-9), 100.0 * self.feeding_share
         return (
             f"{self.path}: trained on {fitted} samples, stopped by {held}; best of {self.epochs} epochs is {self.best_epoch}\n"
@@ -119,26 +126,36 @@ def train(
         _refuse_without_deviations(task, data)
     if fresh or (disposable and checkpoint.exists() and not _is_of(checkpoint, key)):
         checkpoint.unlink(missing_ok=True)
-    fitted = fit(task, rules, name=str(place), key=key, checkpoint=checkpoint)
+    fitted = _fitted(task, rules, data, name=str(place), key=key, checkpoint=checkpoint)
     card = _card(data, task, rules, fitted, key)
     history = "".join(f"{epoch},{loss!r},{held!r}\n" for epoch, loss, held in fitted.progress.history)
     write_model(
-        place, card=card, weights=fitted.network.arrays(), residuals=_residuals(task.held, fitted, task.outputs),
+        place, card=card, weights=fitted.weights, residuals=_residuals(fitted, task.outputs),
         history="epoch,loss,held_out_loss\n" + history, readme=model_readme(card),
     )  # fmt: skip
     checkpoint.unlink(missing_ok=True)
-    counts = {"fitted": len(task.fit), "held out": len(task.held)}
     progress = fitted.progress
     return TrainResult(
         place,
         "done",
-        counts,
+        rules.model,
+        card.training.samples,
         progress.epoch,
         progress.best_epoch,
         progress.best_loss,
         fitted.device,
         fitted.spent,
         fitted.spent.feeding_share,
+    )
+
+
+def _fitted(task: Task, rules: FitConfig, data: Dataset, *, name: str, key: str, checkpoint: Path) -> Fitted:
+    if rules.model == "resnet18":
+        return fit(task, rules, name=name, key=key, checkpoint=checkpoint)
+    from tcpipe.learning.table_fitting import fit_table  # noqa: PLC0415  numba loads with it
+
+    return fit_table(
+        task, rules, name=name, key=key, patch_m=data.card.patch_m, class_count=class_table(data.card).count
     )
 
 
@@ -178,7 +195,7 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
             f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} to stop by; "
             f"wanted both (there are folds {named}; a block holds 10 m of ground: drive more of it)"
         )
-    return Task(fitted, held, outputs)
+    return Task(train, fitted, held, outputs)
 
 
 def what_was_seen(split: Split) -> Seen:
@@ -274,14 +291,25 @@ def _refuse_without_deviations(task: Task, data: Dataset) -> None:
 
 def _unchanged(place: Path, told: Training) -> TrainResult:
     return TrainResult(
-        place, "unchanged", told.samples, told.epochs, told.best_epoch, told.held_out_loss, told.device, Spent(), 0.0
+        place,
+        "unchanged",
+        told.config.model,
+        told.samples,
+        told.epochs,
+        told.best_epoch,
+        told.held_out_loss,
+        told.device,
+        Spent(),
+        0.0,
     )
 
 
 def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str) -> ModelCard:
     card, form = data.card, task.fit.view.form
     return ModelCard(
-        architecture=Architecture(card.patch_px, form.depth, len(fitted.scale), config.width),
+        architecture=Architecture(
+            card.patch_px, form.depth, len(fitted.scale), 0 if config.model == "table" else config.width
+        ),
         channels=task.fit.channels,
         outputs=task.outputs,
         scale=fitted.scale,
@@ -292,7 +320,7 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         label_energy=config.label,
         robot=", ".join(card.robots),
         classes=class_table(card).classes,
-        seen=what_was_seen(task.fit),
+        seen=what_was_seen(task.train if config.model == "table" else task.fit),
         dataset=TrainedOn(card.name, dataset_checksum(card), card.data_model_version, card.splits),
         training=_told(task, config, fitted, key),
     )
@@ -309,8 +337,8 @@ def _told(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
     return Training(
         key=key,
         config=config,
-        optimizer="Adam",
-        samples={"fitted": len(task.fit), "held out": len(task.held)},
+        optimizer="LightGBM" if config.model == "table" else "Adam",
+        samples={"fitted": len(task.train if config.model == "table" else task.fit), "held out": len(fitted.held)},
         epochs=progress.epoch,
         best_epoch=progress.best_epoch,
         held_out_loss=progress.best_loss,
@@ -318,9 +346,9 @@ def _told(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
     )
 
 
-def _residuals(held: Split, fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
-    """Return labels and predictions of the held-out fold, one row a sample."""
-    said, labels = predicted(fitted.network, held, fitted.scale), labels_of(held, outputs)
+def _residuals(fitted: Fitted, outputs: tuple[str, ...]) -> pa.Table:
+    """Return labels and predictions of what was held out, one row a sample."""
+    held, said, labels = fitted.held, fitted.said, labels_of(fitted.held, outputs)
     columns = {name: held.column(name) for name in ("sample_id", "run_id", "start_ns", "terrain_class")}
     for number, name in enumerate(("power_watt", "velocity_mps") if len(outputs) > 1 else outputs):
         quantity, _, unit = name.rpartition("_")

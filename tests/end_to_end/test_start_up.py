@@ -8,7 +8,7 @@ from simulated_streams import log_of
 from tcpipe.simulation import tiny
 
 UNUSED = {
-    "pandas", "filterpy", "pydantic", "zarr", "rasterio", "matplotlib", "polars", "pyproj", "shapely", "mcap", "torch",
+    "pandas", "filterpy", "pydantic", "zarr", "rasterio", "matplotlib", "polars", "pyproj", "shapely", "mcap", "torch", "lightgbm",
     "scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.special", "scipy.stats",
 }  # fmt: skip
 PROGRAM = """

@@ -1,0 +1,75 @@
+"""A table is a model folder like any other: trained in a moment, asked, evaluated, replaced."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import DatasetError
+from tcpipe.learning.evaluation import evaluate
+from tcpipe.learning.evaluation_facts import EvaluateConfig
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.models import HISTORY, README, WEIGHTS, load_model
+from tcpipe.learning.training import Variant, train
+from tcpipe.pipeline.verify import verify
+
+pytest.importorskip("lightgbm")
+
+CONFIG = FitConfig(model="table")
+
+
+@pytest.fixture(scope="module")
+def trained(dataset, tmp_path_factory):
+    place = tmp_path_factory.mktemp("table") / "model"
+    return place, train(dataset, place, config=CONFIG)
+
+
+def test_it_predicts_what_it_was_made_of(trained, dataset):
+    place, result = trained
+    model, split = load_model(place), open_dataset(dataset)["train"]
+    assert result.samples == {"fitted": len(split), "held out": len(split)}
+    assert f"{result.best_epoch} trees a label of {len(split)} samples, each predicted by the other folds" in str(
+        result
+    )
+    said = model.predict(split.patches)
+    assert said.dtype == np.float32
+    errors = np.abs(said - split.labels).mean(axis=0)
+    assert (errors < np.abs(split.labels - split.labels.mean(axis=0)).mean(axis=0)).all()
+    assert model.predict(split.patches[3:4]) == pytest.approx(said[3:4])
+    assert sum(model.class_counts.values()) == len(split)
+    assert verify(place).problems == ()
+    assert "Table: up to" in (place / README).read_text()
+
+
+def test_every_sample_was_held_out_once(trained, dataset):
+    residuals, split = load_model(trained[0]).residuals, open_dataset(dataset)["train"]
+    assert sorted(residuals["sample_id"]) == sorted(split.column("sample_id"))
+    assert residuals["power_watt"] == pytest.approx(split.labels[:, 0])
+    said = load_model(trained[0]).predict(split.patches)[:, 0]
+    seen, unseen = (np.square(found - split.labels[:, 0]).mean() for found in (said, residuals["power_predicted_watt"]))
+    assert seen < unseen
+
+
+def test_the_same_again_is_nothing_to_do_and_the_same_bytes(trained, dataset, tmp_path):
+    assert train(dataset, trained[0], config=CONFIG).status == "unchanged"
+    train(dataset, tmp_path / "model", config=CONFIG)
+    for name in (WEIGHTS, HISTORY, "residuals.parquet"):
+        assert (tmp_path / "model" / name).read_bytes() == (trained[0] / name).read_bytes()
+
+
+def test_one_layer_one_output_and_weights(dataset, tmp_path):
+    train(dataset, tmp_path / "height", config=CONFIG, variant=Variant(channels=("height",), energy_only=True))
+    model = load_model(tmp_path / "height")
+    said = model.outputs(open_dataset(dataset)["train"].with_channels("height").patches)
+    assert said.shape[1] == 1
+    train(dataset, tmp_path / "weighed", config=replace(CONFIG, weights=True))
+    with pytest.raises(DatasetError, match="no labelled samples in split train"):
+        train(dataset, tmp_path / "none", config=CONFIG, variant=Variant(classes=(1,)))
+
+
+def test_it_is_evaluated_without_networks(trained, dataset, tmp_path):
+    found = evaluate(trained[0], dataset, tmp_path / "evaluation", EvaluateConfig(draws=1), key="key")
+    assert list(found.energy) == ["ours"]
+    assert any("the model is a table: the networks of Wei and Isler" in line for line in found.warnings)
+    assert not (tmp_path / "evaluation").exists()
