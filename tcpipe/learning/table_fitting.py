@@ -7,6 +7,7 @@ import time
 
 import numpy as np
 
+from tcpipe.dataset import Split
 from tcpipe.learning.checkpoint import TrainingProgress
 from tcpipe.learning.fitting import FitConfig, Fitted, Spent, Task, label_scale, labels_of
 from tcpipe.learning.forest import MOST_ROUNDS, grow
@@ -41,11 +42,7 @@ def fit_table(task: Task, config: FitConfig, *, name: str, key: str, patch_m: fl
 
     """
     split, scale, began = task.train, label_scale(task), time.perf_counter()
-    parts = []
-    for first in range(0, len(split), _READ_TOGETHER):
-        patches = split.batch(np.arange(first, min(first + _READ_TOGETHER, len(split))))[0]
-        parts.append(patch_features(patches, channels=task.train.channels, class_count=class_count, patch_m=patch_m))
-    features: Floats = np.concatenate(parts)
+    features = _features(split, patch_m, class_count)
     labels = labels_of(split, task.outputs).astype(np.float64)
     weighed = config.weights and split.weights.shape == labels.shape
     weights = split.weights.astype(np.float64) if weighed else np.ones_like(labels)
@@ -61,3 +58,12 @@ def fit_table(task: Task, config: FitConfig, *, name: str, key: str, patch_m: fl
     progress = TrainingProgress(key, MOST_ROUNDS, rounds, held, [(rounds, loss, held)])
     spent = Spent(time.perf_counter() - began, fed_s, len(split))
     return Fitted(grown.forest.arrays(), (1.0,) * labels.shape[1], split, grown.held_out, progress, spent, "cpu")
+
+
+def _features(split: Split, patch_m: float, class_count: int) -> Floats:
+    """Return the features of all samples, shape (N, features); patches are formed some at a time."""
+    parts = []
+    for first in range(0, len(split), _READ_TOGETHER):
+        patches = split.batch(np.arange(first, min(first + _READ_TOGETHER, len(split))))[0]
+        parts.append(patch_features(patches, channels=split.channels, class_count=class_count, patch_m=patch_m))
+    return np.concatenate(parts)
