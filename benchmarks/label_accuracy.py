@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 import pyproj
 
 from tcpipe import ingest
@@ -41,6 +42,7 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
         bias = error.sum() / np.abs(getattr(true, label)).sum()
         claimed = f"claimed deviation {std.mean():.3g} {unit}: {within[0]:.0%} of the errors within one, {within[1]:.0%} within two"
         yield f"{label}: sum |error| / sum |truth|", f"{share:.2%} (bias {bias:+.2%}); {claimed}"
+    yield from above_standing(segments, truth)
     there = truth.at(start_ns)
     lon, lat = floats(segments, "start_lon_deg"), floats(segments, "start_lat_deg")
     _, _, apart_m = pyproj.Geod(ellps="WGS84").inv(lon, lat, there.lon_deg, there.lat_deg)
@@ -56,6 +58,24 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
     driven_m = sum(run.manifest.ledger_m.values())
     yield "energy of the whole run", f"{energy / truth.energy_joule[-1] - 1:+.3%} of {truth.energy_joule[-1]:.0f} J"
     yield "odometer", f"{driven_m / truth.distance_m[-1] - 1:+.3%} of {truth.distance_m[-1]:.1f} m"
+
+
+def above_standing(segments: pa.Table, truth: Truth) -> Iterator[tuple[str, str]]:
+    """Yield the same of what is above standing; the truth's standing power is that of steps in which nothing moves."""
+    still = (truth.wheel_velocity_mps == 0.0) & (np.abs(truth.angular_velocity_radps).max(axis=1) < 1e-6)
+    standing = float(np.median(truth.power_watt[still]))
+    true = true_cost(truth, integers(segments, "start_ns"))
+    told, std = floats(segments, "standing_power_watt"), floats(segments, "standing_power_std_watt")
+    yield "standing power", f"{told[0]:.2f} W, claimed deviation {std[0]:.2f} W; truth {standing:.2f} W"
+    wanted = true.energy_joule - standing * true.duration_s
+    error = floats(segments, "energy_above_standing_joule") - wanted
+    std = floats(segments, "energy_above_standing_std_joule")
+    within = [np.mean(np.abs(error) <= k * std) for k in (1, 2)]
+    share, bias = np.abs(error).sum() / np.abs(wanted).sum(), error.sum() / np.abs(wanted).sum()
+    claimed = (
+        f"claimed deviation {std.mean():.3g} J: {within[0]:.0%} of the errors within one, {within[1]:.0%} within two"
+    )
+    yield "energy_above_standing_joule: sum |error| / sum |truth|", f"{share:.2%} (bias {bias:+.2%}); {claimed}"
 
 
 def _std_name(label: str) -> str:

@@ -43,17 +43,19 @@ def standing_power(power_watt: Floats, halt: NDArray[np.int64], *, window_rows: 
     settled = known & (halt >= 0)
     used = settled if settled.any() else known
     halts = [power_watt[used & (halt == number)] for number in np.unique(halt[used]).tolist()]
-    means = np.array([float(part.mean()) for each in halts for part in _seconds(each, window_rows)])
+    seconds = _seconds(halts, window_rows)
+    means, sizes = np.array([each.mean() for each in seconds]), np.array([each.size for each in seconds])
     watt = float(np.median(means))
     scatter = float(np.mean((means - watt) ** 2))
-    lasting = max(scatter - _noise_variance(halts) / window_rows, 0.0)
+    lasting = max(scatter - _noise_variance(halts) * float(np.mean(1.0 / sizes)), 0.0)
     levels = 1 + np.count_nonzero(np.diff(power_watt[used]))
     return StandingPower(watt, float(np.sqrt(lasting + scatter / means.size + step_watt**2 / 12.0 / levels)))
 
 
-def _seconds(power_watt: Floats, rows: int) -> list[Floats]:
-    """Return a halt in parts of so many rows; what remains is spread over them, and a shorter halt is one part."""
-    return np.array_split(power_watt, max(power_watt.size // rows, 1))
+def _seconds(halts: list[Floats], rows: int) -> list[Floats]:
+    """Return halts in parts of so many rows or somewhat more; those of less than half are left out where there are others."""
+    parts = [part for each in halts for part in np.array_split(each, max(each.size // rows, 1))]
+    return [part for part in parts if 2 * part.size >= rows] or parts
 
 
 def _noise_variance(halts: list[Floats]) -> float:

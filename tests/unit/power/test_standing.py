@@ -29,6 +29,16 @@ def test_noise_of_samples_is_not_held_against_the_robot():
     assert np.sqrt(np.mean(np.square(told))) == pytest.approx(np.std(wrong), rel=0.15)
 
 
+def test_short_halts_are_noisier_and_do_not_count_as_change():
+    rng, told = np.random.default_rng(2), []
+    sizes = np.array([60, 12, 5, 51, 4, 71, 3, 15, 6, 38])
+    for _ in range(100):
+        halt = np.repeat(np.arange(sizes.size), sizes)
+        power = 14.0 + rng.normal(0.0, 3.0, halt.size)
+        told.append(standing_power(power, halt, window_rows=20, step_watt=0.0).std_watt)
+    assert np.median(told) < 0.45  # 3 W of 265 rows are 0.2 W
+
+
 def test_a_mean_is_finer_than_the_step_of_the_record():
     rng = np.random.default_rng(1)
     power, halt = halts(*[14.0] * 20)
