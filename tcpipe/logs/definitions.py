@@ -245,6 +245,27 @@ int8[2] bq_ntc
 int8[2] mcu_ntc
 uint16[15] cell_vol
 """,
+    "unitree_go/msg/SportModeState": """\
+TimeSpec stamp
+uint32 error_code
+IMUState imu_state
+uint8 mode
+float32 progress
+uint8 gait_type
+float32 foot_raise_height
+float32[3] position
+float32 body_height
+float32[3] velocity
+float32 yaw_speed
+float32[4] range_obstacle
+int16[4] foot_force
+float32[12] foot_position_body
+float32[12] foot_speed_body
+""",
+    "unitree_go/msg/TimeSpec": """\
+int32 sec
+uint32 nanosec
+""",
     "vesc_msgs/msg/VescStateStamped": """\
 std_msgs/Header header
 VescState state

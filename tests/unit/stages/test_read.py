@@ -469,3 +469,20 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a coordinate reference system")):
         with pytest.raises(RecipeError, match=said):
             read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)
+
+
+def test_a_go2s_speed_is_mapped_and_its_power_known() -> None:
+    """The worked example of the how-to: neither message has a header."""
+    speed = pa.FixedSizeListArray.from_arrays(pa.array(np.tile([0.8, 0.0, 0.0], 500)), 3)
+    state = message_table(500, 50.0, frame=None, velocity=speed, yaw_speed=full(500, 0.1))
+    low = message_table(500, 50.0, frame=None, power_v=full(500, 28.0), power_a=-6.0 + np.cos(np.arange(500)))
+    topics = {
+        "/lowstate": ("unitree_go/msg/LowState", low),
+        "/sportmodestate": ("unitree_go/msg/SportModeState", state),
+    }
+    fields = {"wheel_odometry": {"linear_x": "velocity[0]", "angular_z": "yaw_speed"}}
+    found = read(topics, topics={"wheel_odometry": ["/sportmodestate"]}, fields=fields)
+    assert set(found.tables) == {"wheel_odometry", "power"}
+    assert found.tables["wheel_odometry"]["velocity_x_mps"].to_pylist() == [0.8] * 500
+    assert min(found.tables["power"]["current_amp"].to_pylist()) > 4.9
+    assert found.sensors["power"].time_source == "log"
