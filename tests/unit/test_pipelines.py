@@ -2,10 +2,24 @@
 
 from pathlib import Path
 
+import polars as pl
+
+from tcpipe.formats.logs.table_log import TableLog
 from tcpipe.formats.recipe_toml import ingest_key, load_recipe
+from tcpipe.formats.robot_files import profiles_of
+from tcpipe.logs.topics import Topic
 from tcpipe.recipe import Recipe
+from tcpipe.stages.read_roles import roles_by
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
+VI, SIDES = ("voltage", "current"), ("left", "right")
+
+
+def played(recipe: Recipe, log: TableLog) -> set[str]:
+    """The roles that are played, all that the recipe says settled."""
+    found = roles_by(recipe.read_of(log.topics), log.topics.values(), recipe.robot, known=profiles_of(recipe))
+    assert found.problems == ()
+    return set(found.roles)
 
 
 def test_husky_is_the_default_written_out() -> None:
@@ -21,3 +35,47 @@ def test_husky_paper_is_the_paper() -> None:
     assert (paper.label.velocity, paper.label.integration) == ("fused", "right_endpoint")
     assert paper.split.holdout == "sample"
     assert (paper.sample.patch_m, paper.sample.patch_px, paper.segment.chord_m) == (1.0, 40, 1.0)
+
+
+def test_fomo_and_drive_map_the_columns_that_their_publishers_write(tmp_path: Path) -> None:
+    fomo, drive = (load_recipe(PIPELINES / f"{name}.toml") for name in ("fomo", "drive"))
+    names = {
+        "odom.csv": "t,px,py,pz,qx,qy,qz,qw,tlx,tly,tlz,tax,tay,taz,tax,tay,taz",  # fomo-sdk, odom.rs
+        "metadata/cmd_velocity.csv": "timestamp,lx,ly,lz,ax,ay,az",
+        **{f"metadata/{what}_{side}.csv": "timestamp,value" for what in VI for side in SIDES},
+    }
+    (tmp_path / "metadata").mkdir()
+    for file, head in names.items():
+        rows = "".join(f"{1760456485000000 + k * 100000}{',0.5' * 13}\n" for k in range(20))
+        (tmp_path / file).write_text(f"{head}\n{rows}")
+    (tmp_path / "gt.txt").write_text(
+        "".join(f"{1760456485 + k / 10} 255855.3 5242729.3 643.6 0 0 0 1\n" for k in range(20))
+    )
+    assert played(fomo, TableLog(tmp_path, fomo.tables)) == {"pose", "wheel_odometry", "command", "power"}
+    logged = ["cmd_vel_x", "cmd_vel_omega", *(f"icp_pos_{axis}" for axis in "xyz"), *(f"imu_{axis}" for axis in "xyz")]
+    logged += [f"imu_acceleration_{axis}" for axis in "xyz"] + [f"{side}_wheel_{what}" for what in VI for side in SIDES]
+    times = [str(1721335359000000000 + k * 50_000_000) for k in range(20)]
+    frame = pl.DataFrame({"ros_time": times} | {name: ["0.5"] * 20 for name in logged})
+    for file in ("icp", "frame"):
+        frame.write_parquet(tmp_path / f"{file}.parquet")
+    assert played(drive, TableLog(tmp_path, drive.tables)) == {"pose", "imu", "command", "power"}
+
+
+def test_rellis_plays_its_roles_by_the_topics_of_its_readme() -> None:
+    recipe = load_recipe(PIPELINES / "rellis-3d.toml")
+    sensors = {
+        "/imu/data": "Imu", "/imu/data_raw": "Imu", "/os1_cloud_node/imu": "Imu", "/vectornav/IMU": "Imu", "/vectornav/GPS": "NavSatFix",
+    }  # fmt: skip
+    kinds = {name: f"sensor_msgs/msg/{kind}" for name, kind in sensors.items()}
+    odometry = ("/odometry/filtered", "/vectornav/Odom", "/warthog_velocity_controller/odom")
+    kinds |= dict.fromkeys(odometry, "nav_msgs/msg/Odometry")
+    kinds |= {f"/{side}_drive/status/battery_{what}": "std_msgs/msg/Float64" for what in VI for side in SIDES}
+    kinds |= {
+        "/mcu/status": "warthog_msgs/msg/Status",
+        "/warthog_velocity_controller/cmd_vel": "geometry_msgs/msg/Twist",
+    }
+    topics = [Topic(name, kind, 600, 0, 60_000_000_000, "ros1", "") for name, kind in kinds.items()]
+    found = roles_by(recipe.read, topics, recipe.robot, known=profiles_of(recipe))
+    assert found.problems == ()
+    assert set(found.roles) == {"gnss", "imu", "wheel_odometry", "command", "power"}
+    assert len(found.roles["power"].topics) == 4
