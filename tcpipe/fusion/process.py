@@ -23,6 +23,7 @@ _WHEEL_SCALE_TIME_S = 60.0
 _WHEEL_TURN_SCALE_STD, _VISUAL_TURN_SCALE_STD = 0.2, 0.03
 _TURN_SCALE_TIME_S = 60.0
 SLOPE_RAD = 0.1  # of ground, where nothing shows it
+ROLL_AS_TURN_RAD = 0.06  # of a body whose turns the course alone tells, beyond what the filter knows
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
 GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
 _ACCELERATION_WINDOW_S = 0.6
@@ -52,6 +53,12 @@ def glides(measurements: Measurements) -> bool:
     """
     alone = measurements.imu is None and not measurements.odometries()
     return alone and measurements.gnss is not None and _fix_velocity_std_mps(measurements.gnss) > _SHOWS_COURSE_MPS
+
+
+def turns_by_course(measurements: Measurements) -> bool:
+    """Return whether the course over ground is all that tells how the robot turns."""
+    told = measurements.imu is not None or turn_sources(measurements)
+    return not told and measurements.gnss is not None and not glides(measurements)
 
 
 def _fix_velocity_std_mps(gnss: Positions) -> float:

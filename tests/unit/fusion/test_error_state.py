@@ -13,8 +13,9 @@ from tcpipe.fusion.error_state import run_error_state
 from tcpipe.fusion.fix_errors import find_fix_errors
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
-from tcpipe.fusion.process import WHEEL_SCALE_STD
+from tcpipe.fusion.process import ROLL_AS_TURN_RAD, WHEEL_SCALE_STD
 from tcpipe.fusion.standing import standing_intervals
+from tcpipe.geometry.rotation import matrix_from_quat
 
 PERIOD_NS = 50_000_000
 
@@ -268,6 +269,13 @@ def test_a_speed_without_a_yaw_rate_goes_where_the_fixes_go():
     assert figures["xy"] < 0.3
     assert figures["forward"] < 0.1
     assert figures["nees_position"] < 4.0
+    # The course takes a roll for a turn: across the way nobody knows where below its antenna the robot is.
+    rotation = matrix_from_quat(found.quat_xyzw)
+    across = np.sqrt(np.sum((rotation[:, :2, 1] * found.position_std_m[:, :2]) ** 2, axis=1))
+    assert (
+        across
+        > ROLL_AS_TURN_RAD * abs(measurements.gnss.lever_arm_m[2]) * (1.0 - rotation[:, 2, 1] ** 2) / np.sqrt(2.0)
+    ).all()
 
 
 def test_noisy_fixes_alone_say_that_they_hardly_tell_a_speed():

@@ -10,7 +10,7 @@ from unit.fusion.test_error_state import fuse, truth
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.preparation import inertial
-from tcpipe.fusion.process import process_noise, shake_density, turn_scale_std
+from tcpipe.fusion.process import process_noise, shake_density, turn_scale_std, turns_by_course
 from tcpipe.fusion.signals import slopes, white_noise
 
 
@@ -73,6 +73,15 @@ def test_a_turn_rate_of_an_odometry_has_a_scale_to_be_found():
     assert found.facts.turn_scale == pytest.approx(0.75, abs=0.03)  # these wheels say 0.8 of a turn: w (1 + 0.25)
     assert found.facts.gyro_bias_radps is None
     assert drive.errors(truth(), found)["yaw_deg"] < 1.5
+
+
+def test_the_course_tells_turns_only_where_no_other_sensor_does():
+    wheels = measured(imu=False, visual=False)
+    nothing = np.full_like(wheels.wheels.yaw_rate_radps, np.nan)
+    speed_only = replace(wheels, wheels=replace(wheels.wheels, yaw_rate_radps=nothing, yaw_rate_var=nothing))
+    assert turns_by_course(speed_only)
+    assert turns_by_course(measured(imu=False, visual=False, wheels=False))
+    assert not any(turns_by_course(m) for m in (wheels, measured(), replace(speed_only, gnss=None)))
 
 
 def test_positions_alone_do_not_tell_which_way_the_robot_looks():
