@@ -1,68 +1,132 @@
-"""What rolling resistance and grade alone explain of a run's power: a baseline beside each label, and the labels that it cannot explain.
+"""What physics explains of a robot's power: standing, rolling, grade and turning, fitted to its labels, and how much each takes.
 
 On a slope that rises by tan(s) a robot of weight m g at horizontal speed v does the mechanical work
 
     m g v (c + tan(s))                                  (rolling resistance m g c cos(s), grade m g sin(s), along the surface)
 
-a second. The drive needs 1 / efficiency of that, and gives back a share of it where it is negative (the slope drives the wheels)::
+a second, and a skid-steered one drags its wheels sideways with a torque that hardly depends on how fast it turns. The drive needs
+1 / efficiency of both, and gives back a share of what is negative (the slope drives the wheels)::
 
-    P = P0 + N v g(c + tan(s)),   g(x) = x for x > 0, k x for x < 0
+    P = P0 + g(F v + N v tan(s) + M |yaw rate|),   g(x) = x for x > 0, k x for x < 0
 
-P0 is what the drive draws while the robot stands. N = m g / efficiency [N], c and k are fitted by Gauss-Newton steps with Huber's
-weights (Huber 1964; k = 1.345), so that a minority of odd metres bends nothing. Terrain classes and turning are left to the residual.
+P0 is what is drawn while the robot stands, N = m g / efficiency [N], F = N c [N] and M [W per rad/s] are of a terrain class, or of all
+ground where classes are not known. All are sizes, none negative. They are fitted to the force P / v with Huber's weights (Huber 1964; k
+= 1.345), so that a minority of odd metres bends nothing. Their deviations count that neighbours err alike (White's sandwich over
+blocks of consecutive segments; Cameron and Miller, J. Human Resources 50, 2015).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.power.least_squares import non_negative
+
 Floats = NDArray[np.float64]
 
-_FEWEST = 20  # segments to fit on
+FEWEST = 20  # segments to fit on, and of a class to have coefficients of its own
 _LEAST_SLOPE = 0.02  # standard deviation of the rises: on flatter ground weight and rolling cannot be told apart
+_LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling cannot be told apart
+_SURE, _SUREST_WATT = (
+    0.02,
+    0.5,
+)  # standard deviation of what halts tell of standing: looser, it takes over what rolling does
 _FEWEST_DOWNHILL = 10  # segments that drive the robot: fewer tell no recovery
-_STEPS = 50  # of Gauss-Newton at most
+_STEPS = 100  # of reweighting at most
 _HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)
 _NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal variate
 _OUTLIER = 4.0  # robust standard deviations
 _FINEST = 0.02  # of the power: no such model is better
-_PLAUSIBLE_RESISTANCE = (0.0, 1.5)  # coefficient of rolling resistance: tracks in deep sand stay below
-_START = 0.15  # of that coefficient: a skid-steered robot on grass
+_PLAUSIBLE_RESISTANCE = 1.5  # coefficient of rolling resistance: tracks in deep sand stay below
+_BLOCK, _FEWEST_BLOCKS = 20, 20  # consecutive segments that may err alike, and how many such blocks there are at least
+_MOST_ROWS = 20_000  # that are fitted, evenly taken of more: coefficients are sure to a few per mille by then
+
+ALL = "all"
+"""The ground of a fit that knows no classes, and of classes with too few segments."""
+
+
+@dataclass(frozen=True, slots=True)
+class Metres:
+    """Labelled metres, all of shape (M,), in the order of driving.
+
+    Attributes
+    ----------
+    power_watt, velocity_mps, rise : labels [W], horizontal speeds [m/s], tan of the slopes.
+    turn_rate_radps : mean of |yaw rate| [rad/s].
+    terrain : names of their classes.
+    """
+
+    power_watt: Floats
+    velocity_mps: Floats
+    rise: Floats
+    turn_rate_radps: Floats
+    terrain: NDArray[np.str_]
+
+    def take(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Metres:
+        """Return some of them."""
+        return Metres(*(getattr(self, name)[rows] for name in self.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
 class Physics:
-    """The fit of a run.
+    """A fit.
 
     Attributes
     ----------
-    standing_watt : P0 [W]; 0 where the robot never stood.
-    drive_newton : N, weight over the drive's efficiency [N]; 0 where the slopes do not vary: then ``rolling_newton`` is all.
-    rolling_newton : N c [N].
+    terms : what each coefficient is of: (standing, rolling, grade or turning; terrain class or `ALL`), J of them.
+    value : P0 [W], F [N], N [N], M [W per rad/s], shape (J,).
+    covariance : of the values, shape (J, J); 0 where a coefficient stands at zero.
     recovered : k, share of downhill work that comes back; 0 where nothing was driven down steeply enough to tell.
     residual_watt : robust standard deviation of what is left [W], at least 2 % of the power.
     segments : how many segments it is fitted on.
     """
 
-    standing_watt: float
-    drive_newton: float
-    rolling_newton: float
+    terms: tuple[tuple[str, str], ...]
+    value: Floats
+    covariance: Floats
     recovered: float
     residual_watt: float
     segments: int
 
-    @property
-    def rolling_resistance(self) -> float | None:
-        """The coefficient c, or None where the slopes do not vary."""
-        return self.rolling_newton / self.drive_newton if self.drive_newton > 0 else None
+    def of(self, term: str, terrain: str = ALL) -> tuple[float, float] | None:
+        """Return a coefficient and its standard deviation, that of all ground where the class has none; None where there is neither."""
+        for at, known in enumerate(self.terms):
+            if known == (term, terrain):
+                return float(self.value[at]), float(np.sqrt(self.covariance[at, at]))
+        return None if terrain == ALL else self.of(term)
 
-    def power_watt(self, *, velocity_mps: Floats, rise: Floats) -> Floats:
-        """Return the predicted power [W] at horizontal speeds [m/s] and rises tan(s), shape (M,)."""
-        force = self.rolling_newton + self.drive_newton * rise
-        return self.standing_watt + velocity_mps * np.where(force > 0, force, self.recovered * force)
+    def rolling_resistance(self, terrain: str = ALL) -> tuple[float, float] | None:
+        """Return c = F / N of a class with its standard deviation; None where the slopes do not vary."""
+        places = [self.terms.index(key) for key in (("rolling", terrain), ("grade", ALL)) if key in self.terms]
+        if len(places) < 2 or self.value[places[1]] <= 0.0:
+            return None
+        rolling, grade = self.value[places].tolist()
+        slope = np.array([1.0 / grade, -rolling / grade**2])
+        return rolling / grade, float(np.sqrt(slope @ self.covariance[np.ix_(places, places)] @ slope))
+
+    def parts_watt(self, metres: Metres) -> Floats:
+        """Return what each coefficient adds to the predicted power [W], shape (M, J)."""
+        design = _design(metres, self.terms)
+        standing = np.array([term == "standing" for term, _ in self.terms])
+        driven = (design[:, ~standing] @ self.value[~standing]) > 0.0
+        gain = np.where(standing[None, :] | driven[:, None], 1.0, self.recovered)
+        return np.asarray(design * gain * self.value)
+
+    def power_watt(self, metres: Metres) -> Floats:
+        """Return the predicted power [W], shape (M,)."""
+        return np.asarray(self.parts_watt(metres).sum(axis=1))
+
+    def is_plausible(self) -> bool:
+        """Return whether a robot can be so: it rolls, no heavier than tracks in deep sand, and climbing costs it something."""
+        rolling = [at for at, (term, _) in enumerate(self.terms) if term == "rolling"]
+        resistances = [self.rolling_resistance(self.terms[at][1]) for at in rolling]
+        climb = self.of("grade")
+        return bool(self.value[rolling].max() > 0.0 and (climb is None or climb[0] > 0.0)) and all(
+            of is None or of[0] < _PLAUSIBLE_RESISTANCE for of in resistances
+        )
 
     def is_outlier(self, residual_watt: Floats) -> NDArray[np.bool_]:
         """Return which residuals [W] are beyond four robust standard deviations; NaN is none."""
@@ -70,50 +134,120 @@ class Physics:
         return found
 
 
-def fit_physics(*, power_watt: Floats, velocity_mps: Floats, rise: Floats, standing_watt: float) -> Physics | None:
-    """Fit rolling resistance and grade to a run's labels; None for fewer than 20 or where no such robot can be.
+def fit_physics(metres: Metres, *, standing_watt: float | None = None, turning: bool = True) -> Physics | None:
+    """Fit the terms to labels; None for fewer than 20.
 
     Parameters
     ----------
-    power_watt, velocity_mps, rise : labels [W], horizontal speeds [m/s] and tan of the slopes, shape (M,); rows with NaN are left out.
-    standing_watt : power while standing [W]; 0 where unknown.
+    metres : rows with NaN are left out; without any turn rate there is no term for it.
+    standing_watt : power while standing, measured at halts; None fits it where the speeds vary enough.
+    turning : whether turning is a term.
     """
-    known = np.isfinite(power_watt + velocity_mps + rise)
-    if known.sum() < _FEWEST:
+    turning = turning and bool(np.isfinite(metres.turn_rate_radps).any())
+    known = metres.power_watt + metres.velocity_mps + metres.rise + (metres.turn_rate_radps if turning else 0.0)
+    rows = np.flatnonzero(np.isfinite(known) & (metres.velocity_mps > 0.0))
+    if rows.size < FEWEST:
         return None
-    force = (power_watt[known] - standing_watt) / velocity_mps[known]
-    slope = rise[known]
-    flat = float(np.std(slope)) < _LEAST_SLOPE
-    parameters = np.array([float(np.median(force)), 0.0, 0.0]) if flat else _fitted(force, slope)
-    rolling, drive, recovered = parameters.tolist()
-    low, high = _PLAUSIBLE_RESISTANCE
-    if rolling <= 0 or drive < 0 or (drive > 0 and not low < rolling / drive < high):
-        return None
-    bare = Physics(standing_watt, drive, rolling, recovered, 0.0, int(known.sum()))
-    off = power_watt[known] - bare.power_watt(velocity_mps=velocity_mps[known], rise=slope)
+    used = metres.take(rows[:: -(-rows.size // _MOST_ROWS)])
+    terms = _terms(used, standing_watt=standing_watt, turning=turning)
+    found = _fitted(used, terms, standing_watt)
+    told = found.of("standing")
+    if (
+        standing_watt is None and told is not None and told[0] < 2.0 * told[1]
+    ):  # nobody saw it stand, and nothing tells it from rolling
+        found = _fitted(used, [term for term in terms if term[0] != "standing"], None)
+    off = used.power_watt - found.power_watt(used)
     spread = _NORMAL * float(np.median(np.abs(off - np.median(off))))
-    spread = max(spread, _FINEST * float(np.median(np.abs(power_watt[known]))))
-    return Physics(standing_watt, drive, rolling, recovered, spread, int(known.sum()))
+    return replace(
+        found, residual_watt=max(spread, _FINEST * float(np.median(np.abs(used.power_watt)))), segments=rows.size
+    )
 
 
-def _fitted(force: Floats, rise: Floats) -> Floats:
-    """Return (N c, N, k) by iteratively reweighted Gauss-Newton steps on the force P / v."""
-    level = float(np.median(force))
-    x = np.array([level, level / _START, 0.5])
-    for _ in range(_STEPS):
-        traction = x[0] + x[1] * rise
-        driven = traction > 0
-        gain = np.where(driven, 1.0, x[2])
-        off = force - gain * traction
+def _terms(metres: Metres, *, standing_watt: float | None, turning: bool) -> list[tuple[str, str]]:
+    """Return the coefficients that these metres can tell."""
+    names, counts = np.unique(metres.terrain, return_counts=True)
+    own = [str(name) for name, count in zip(names, counts, strict=True) if count >= FEWEST and name != ALL]
+    classes = own if len(own) == len(names) else [*own, ALL]
+    spread = float(np.std(metres.velocity_mps)) > _LEAST_SPEED * float(np.median(metres.velocity_mps))
+    terms = [("standing", ALL)] if standing_watt is not None or spread else []
+    terms += [("rolling", name) for name in classes]
+    terms += [("grade", ALL)] if float(np.std(metres.rise)) >= _LEAST_SLOPE else []
+    return terms + ([("turning", name) for name in classes] if turning else [])
+
+
+def _design(metres: Metres, terms: Sequence[tuple[str, str]]) -> Floats:
+    """Return what each coefficient is multiplied with, shape (M, J)."""
+    of = {
+        "standing": np.ones_like(metres.velocity_mps),
+        "rolling": metres.velocity_mps,
+        "grade": metres.velocity_mps * metres.rise,
+        "turning": metres.turn_rate_radps,
+    }
+    own = {term: [name for kind, name in terms if kind == term and name != ALL] for term in of}
+    columns = [
+        of[term] * (metres.terrain == name if name != ALL else ~np.isin(metres.terrain, own[term]))
+        for term, name in terms
+    ]
+    return np.column_stack(columns)
+
+
+def _fitted(metres: Metres, terms: Sequence[tuple[str, str]], standing_watt: float | None) -> Physics:
+    """Return the coefficients by iteratively reweighted least squares on the force P / v; what is measured at halts is one row more."""
+    is_standing = np.array([term == "standing" for term, _ in terms])
+    design = _design(metres, terms) / metres.velocity_mps[:, None]
+    force = metres.power_watt / metres.velocity_mps
+    value, recovered = np.zeros(len(terms)), 0.5
+    prior = None if standing_watt is None else is_standing / max(_SURE * standing_watt, _SUREST_WATT)
+    made, off, weight, scale = design, force, np.ones_like(force), 1.0
+    for step in range(_STEPS):
+        traction = design[:, ~is_standing] @ value[~is_standing]
+        driven = (traction > 0.0) | (step == 0)
+        recovered = _recovered(traction, force - design[:, is_standing] @ value[is_standing], weight, ~driven)
+        made = np.where(is_standing[None, :] | driven[:, None], design, recovered * design)
+        off = force - made @ value
         scale = max(_NORMAL * float(np.median(np.abs(off))), 1e-9)
         weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(off), 1e-12))
-        columns = [gain, gain * rise]
-        if (~driven).sum() >= _FEWEST_DOWNHILL:
-            columns.append(np.where(driven, 0.0, traction))
-        design = np.column_stack(columns) * np.sqrt(weight)[:, None]
-        step = np.linalg.lstsq(design, off * np.sqrt(weight), rcond=None)[0]
-        x[: step.size] += step
-        x[2] = min(max(x[2], 0.0), 1.0) if step.size == 3 else 0.0
-        if np.abs(step[:2]).max() < 1e-9 * max(level, 1.0):
+        by, seen = made * np.sqrt(weight)[:, None] / scale, force * np.sqrt(weight) / scale
+        if prior is not None and standing_watt is not None:
+            by, seen = np.vstack([by, prior]), np.append(seen, prior.max() * standing_watt)
+        q, r = np.linalg.qr(by)
+        before, value = value, _sizes(r, q.T @ seen)
+        if np.abs(value - before).max() < 1e-7 * np.abs(value).max():
             break
-    return x
+    covariance = _covariance(made, off, weight, scale, free=value > 0.0, prior=prior)
+    return Physics(tuple(terms), value, covariance, recovered, 0.0, len(force))
+
+
+def _sizes(made: Floats, seen: Floats) -> Floats:
+    """Return what fits best with no size below zero: mostly no bound holds, and the plain solution is it."""
+    plain = np.asarray(np.linalg.lstsq(made, seen, rcond=None)[0], np.float64)
+    return plain if (plain >= 0.0).all() else non_negative(made, seen)
+
+
+def _recovered(traction: Floats, force: Floats, weight: Floats, down: NDArray[np.bool_]) -> float:
+    """Return which share of the work downhill comes back; 0 where too little is driven down to tell."""
+    if down.sum() < _FEWEST_DOWNHILL:
+        return 0.0
+    work = weight[down] * traction[down]
+    return float(np.clip((work @ force[down]) / (work @ traction[down]), 0.0, 1.0))
+
+
+def _covariance(
+    made: Floats, off: Floats, weight: Floats, scale: float, *, free: NDArray[np.bool_], prior: Floats | None
+) -> Floats:
+    """Return the covariance of the coefficients, shape (J, J), by what blocks of consecutive rows leave over."""
+    rows = made[:, free] / scale
+    length = max(1, min(_BLOCK, len(rows) // _FEWEST_BLOCKS))
+    starts = np.arange(0, len(rows), length)
+    left = np.add.reduceat(rows * (weight * off / scale)[:, None], starts, axis=0)
+    few = len(starts) / max(
+        len(starts) - rows.shape[1], 1.0
+    )  # of the scatter between blocks, the coefficients took up their share
+    bread, meat = (rows * weight[:, None]).T @ rows, left.T @ left * few
+    if prior is not None:
+        told = np.outer(prior[free], prior[free])
+        bread, meat = bread + told, meat + told
+    inverse = np.linalg.pinv(bread, hermitian=True)
+    out = np.zeros((len(free), len(free)))
+    out[np.ix_(free, free)] = inverse @ meat @ inverse
+    return out

@@ -16,7 +16,7 @@ from tcpipe.motion.removal import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.holdouts import Holdout
-from tcpipe.tables.findings import LEFT_OUT, EnergyBudget
+from tcpipe.tables.findings import LEFT_OUT, EnergyBudget, PhysicsFit
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe dataset"
@@ -256,6 +256,8 @@ class DatasetCard:
     """How many samples carry a quality flag; None in cards of before data model 1.2."""
     findings: tuple[RunFinding, ...] = ()
     """What ingest found of the runs, by cause."""
+    physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
+    """By robot, what standing, rolling, grade and turning take of its power on each class; without robots for which nothing fits."""
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""

@@ -25,6 +25,7 @@ from tcpipe.report.figures import (
 )
 from tcpipe.report.overview import Bounds, joint_bounds_m, read_overview
 from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.physics import physics_sections
 from tcpipe.report.quality import quality_sections
 from tcpipe.tables.bits import Quality, name_of
 
@@ -67,6 +68,7 @@ def dataset_report(directory: Path) -> str:
             *_label_sections(card, samples),
             *quality_sections(_quality_counts(samples), "samples"),
             *_finding_sections(card),
+            *physics_sections(dict(card.physics)),
             *budget_sections(card.energy_budget),
             Section(
                 "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card.ledger_m)

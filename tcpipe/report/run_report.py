@@ -16,6 +16,7 @@ from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import DROPPED, KEPT, histograms, ledger_bars, over_distance, path_on_map
 from tcpipe.report.overview import map_overview
 from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.physics import physics_sections
 from tcpipe.report.quality import quality_sections
 from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.store import RunDirectory, Store
@@ -149,18 +150,20 @@ def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under
 
 
 def _physics_sections(segments: pa.Table, physics: PhysicsFacts | None) -> list[Section]:
-    """Return what rolling resistance and grade leave unexplained; nothing where they could not be fitted."""
+    """Return what a metre costs by physics, and what that leaves unexplained; nothing where it could not be fitted."""
     if physics is None or not physics.fitted:
         return []
     left = _column(segments, "power_watt").astype(float) - _column(segments, "physics_power_watt").astype(float)
-    resistance = physics.rolling_resistance
-    grade = "" if resistance is None else f", rolling resistance {resistance:.3f}"
     text = (
-        f"Power minus what rolling resistance and grade alone, fitted on this run, predict ({physics.segments} segments{grade}): "
-        f"terrain, turning and errors. {physics.outliers} segments are further than four standard deviations of "
+        f"Power minus what standing, rolling, grade and turning, fitted on this run, predict ({physics.segments} segments): "
+        f"terrain and errors. {physics.outliers} segments are further than four standard deviations of "
         f"{physics.residual_watt:.0f} W."
     )
-    return [Section("What physics leaves unexplained", text, histograms({"w - physics [W]": left}))]
+    fits = {} if physics.fit is None else {"The robot": physics.fit}
+    return [
+        *physics_sections(fits),
+        Section("What physics leaves unexplained", text, histograms({"w - physics [W]": left})),
+    ]
 
 
 def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: PhysicsFacts | None) -> list[Section]:

@@ -58,6 +58,8 @@ class SimulatedRobot:
     """Ground properties are averaged over it."""
     scrub_torque_nm: float = 190.0
     """Turning in place."""
+    scrub_half_radius_m: float = 0.4
+    """Radius of the turn at which the torque is half of that; infinite: the torque is the same on every curve."""
     drive_efficiency: float = 0.72
     regeneration_efficiency: float = 0.55
     drivetrain_loss_newton: float = 0.0
@@ -110,7 +112,7 @@ class SimulatedRobot:
             + self.mass_kg * acceleration_mps2
         )
         radius_m = np.abs(wheel_velocity_mps) / np.maximum(np.abs(yaw_rate_radps), 1e-6)
-        scrub = self.scrub_torque_nm * np.abs(yaw_rate_radps) / (1.0 + radius_m / 0.4)
+        scrub = self.scrub_torque_nm * np.abs(yaw_rate_radps) / (1.0 + radius_m / self.scrub_half_radius_m)
         return force * wheel_velocity_mps + scrub
 
     def propulsion_watt(self, wheel_power_watt: Float, wheel_velocity_mps: Float) -> Float:

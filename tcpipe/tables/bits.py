@@ -54,7 +54,7 @@ class Quality(IntFlag):
     CLOCK_DOUBTFUL = 1 << 8
     """A clock of the segment's run stepped, drifts or seems off (an IMU's by more than 0.15 s), or the recorder's time had to be used."""
     PHYSICS_OUTLIER = 1 << 9
-    """The power is more than four robust standard deviations from what rolling resistance and grade, fitted on the run, predict."""
+    """The power is more than four robust standard deviations from what physics, fitted on the run, predicts."""
     NOT_AT_LIMIT = 1 << 10
     """Commanded on average below `full_speed_fraction` of the robot's maximum: the speed is not the terrain's limit."""
     SENSORS_DISAGREE = 1 << 11

@@ -333,8 +333,48 @@ class EnergyBudget:
 
 
 @dataclass(frozen=True, slots=True)
+class PhysicsTerm:
+    """A coefficient of P = standing + rolling v + grade v tan(s) + turning |yaw rate|, and its standard deviation."""
+
+    term: str
+    """``standing``, ``rolling``, ``grade`` or ``turning``."""
+    terrain: str
+    """The class of terrain, or ``all``."""
+    value: float
+    std: float
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class PhysicsScore:
+    """How well energies a metre are predicted on fifths of the drive that were held out: share of their variance, mean relative error."""
+
+    r2: float
+    mape: float
+
+
+@dataclass(frozen=True, slots=True)
+class PhysicsFit:
+    """What standing, rolling, grade and turning take of a robot's power (`tcpipe.cost.physics`)."""
+
+    segments: int
+    terms: tuple[PhysicsTerm, ...]
+    rolling_resistance: Mapping[str, tuple[float, float]]
+    """Coefficient by class, with its standard deviation; empty where the slopes do not vary."""
+    recovered_downhill: float
+    residual_watt: float
+    energy_share: Mapping[str, float]
+    """Share of all energy by term; grade takes nearly none where as much is driven up as down."""
+    held_out: PhysicsScore | None
+    """None where too few segments are left to fit."""
+    without_turning: PhysicsScore | None
+    gain_of_turning: tuple[float, float] | None
+    """By how much turning raises the held-out R²: 90 % interval over blocks of segments."""
+
+
+@dataclass(frozen=True, slots=True)
 class PhysicsFacts:
-    """What rolling resistance and grade explain (`tcpipe.cost.physics`); where they could not be fitted, what is drawn while standing."""
+    """What physics explains of a run (`tcpipe.cost.physics`); where it could not be fitted, what is drawn while standing."""
 
     fitted: bool
     standing_watt: float | None
@@ -345,6 +385,7 @@ class PhysicsFacts:
     residual_watt: float | None = field(default=None, metadata=LEFT_OUT)
     segments: int | None = field(default=None, metadata=LEFT_OUT)
     outliers: int | None = field(default=None, metadata=LEFT_OUT)
+    fit: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

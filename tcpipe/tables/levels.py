@@ -363,7 +363,7 @@ _LABEL_COLUMNS = (
         "physics_power_watt",
         _F64,
         "W",
-        "power by rolling resistance and grade alone, fitted on the run; null without power or fit",
+        "power by standing, rolling, grade and turning alone, fitted on the run; null without power or fit",
         nullable=True,
     ),
     Column("power_samples", pa.int32(), "1", "power samples inside the segment"),

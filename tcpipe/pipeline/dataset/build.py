@@ -48,6 +48,7 @@ from tcpipe.pipeline.dataset.card import (
 from tcpipe.pipeline.dataset.content import Content, gather_content
 from tcpipe.pipeline.dataset.findings import doubt_in_words, findings_in_words
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
+from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
 from tcpipe.pipeline.dataset.runs import gone_runs
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.pipeline.dataset.splitting import empty_splits
@@ -299,7 +300,7 @@ def _build(
     patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
     write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches, samples=content.samples.schema))
     card = dataset_card(
-        read_samples(directory, CARD_COLUMNS),
+        read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS)),
         recipe,
         inputs,
         content,

@@ -32,6 +32,7 @@ from tcpipe.formats.seals import Checksum
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.findings import doubtful, findings_of_runs
 from tcpipe.pipeline.dataset.inputs import Inputs
+from tcpipe.pipeline.dataset.physics import physics_by_robot
 from tcpipe.pipeline.dataset.splitting import Drawn, regions_to_json
 from tcpipe.recipe import Recipe
 from tcpipe.splits.assignment import SPLITS
@@ -72,7 +73,7 @@ def dataset_card(
     shards: Sequence[Shard],
     checksums: Mapping[str, Checksum],
 ) -> DatasetCard:
-    """Return the card; ``samples`` has the `CARD_COLUMNS` of every sample."""
+    """Return the card; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
     about, drawn, classes = recipe.dataset, content.drawn, content.sources[0].classes
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
@@ -109,6 +110,7 @@ def dataset_card(
         problems=inputs.problems,
         warnings=content.warnings,
         findings=findings_of_runs(runs),
+        physics=physics_by_robot(samples),
         covariates=content.covariates,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),

@@ -1,0 +1,38 @@
+"""What is held out is predicted by the rest; turning is worth what a drive without it lacks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from skid_steered import STANDING_WATT, made
+
+from tcpipe.cost.held_out import physics_of
+
+
+def test_shares_and_scores_of_an_exact_robot():
+    metres = made(7, 500)
+    fit = physics_of(metres, standing_watt=STANDING_WATT)
+    assert sum(fit.energy_share.values()) == pytest.approx(1.0, abs=1e-4)
+    energy = metres.power_watt / metres.velocity_mps
+    assert fit.energy_share["standing"] == pytest.approx((14.0 / metres.velocity_mps).sum() / energy.sum(), rel=1e-3)
+    assert fit.held_out.r2 == pytest.approx(1.0, abs=1e-6)
+    assert fit.held_out.mape < 1e-2
+    assert fit.without_turning.r2 < 0.99
+    low, high = fit.gain_of_turning
+    assert low < 1.0 - fit.without_turning.r2 < high
+
+
+def test_where_turning_costs_nothing_it_is_worth_nothing():
+    metres = made(8, 500, noise_watt=15.0)
+    fit = physics_of(
+        replace(metres, turn_rate_radps=np.random.default_rng(1).uniform(0, 0.4, 500)), standing_watt=STANDING_WATT
+    )
+    low, high = fit.gain_of_turning
+    assert low < 0.01
+    assert abs(high) < 0.05
+
+
+def test_no_metres_no_fit():
+    metres = made(9, 19)
+    assert physics_of(metres, standing_watt=STANDING_WATT) is None
+    assert physics_of(metres.take(np.arange(0)), standing_watt=STANDING_WATT) is None
