@@ -94,7 +94,7 @@ def of_log(log: Path) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--metres", type=float, default=2200.0)
+    parser.add_argument("--metres", type=float, default=1100.0)
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--saturating", action="store_true")
     parser.add_argument("--log", type=Path, nargs="*", default=[])

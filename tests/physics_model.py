@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from tcpipe.tables.findings import PhysicsFit
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
 CLASSES_SEEN = (4, 5, 6, 7)
@@ -64,6 +65,7 @@ class PhysicsModel:
         default_factory=lambda: {"slope_rad": (-0.5, 0.5), "cross_slope_rad": (-0.5, 0.5), "relief_m": (0.0, 1.0)}
     )
     residuals: dict = field(default_factory=made_residuals)
+    physics: PhysicsFit | None = None
 
     def predict(self, patches):
         height = patches[..., self.channels.index("height")].astype(np.float64)

@@ -105,6 +105,14 @@ map_option = click.option(
 )
 """``--map``: the map to look at."""
 
+physics_option = click.option(
+    "--physics",
+    type=INPUT_DIRECTORY,
+    metavar="DATASET",
+    help="Dataset whose card says what turning costs the robot (default: the one that MODEL was trained on).",
+)
+"""``--physics``: whose physics costs the turns of a path."""
+
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _MOST_SHARDS = 100_000
 

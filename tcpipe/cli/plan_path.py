@@ -7,7 +7,16 @@ from typing import Literal
 
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_FILE, FloatRange, LonLat, json_option, quiet_option, store_option
+from tcpipe.cli.options import (
+    INPUT_DIRECTORY,
+    OUTPUT_FILE,
+    FloatRange,
+    LonLat,
+    json_option,
+    physics_option,
+    quiet_option,
+    store_option,
+)
 
 
 @click.command("plan-path", short_help="The path of least energy, time or distance")
@@ -44,6 +53,7 @@ from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_FILE, FloatRange, LonLat,
     help="Side of a cell; that of --cost-map rules.",
 )
 @click.option("--allow-unseen", is_flag=True, help="Also cross ground unlike any that the model was trained on.")
+@physics_option
 @store_option
 @json_option
 @quiet_option
@@ -59,6 +69,7 @@ def plan_path(
     cost_map: str | None,
     step_m: float,
     allow_unseen: bool,
+    physics: str | None,
     store: str,
     as_json: bool,
     quiet: bool,
@@ -68,7 +79,7 @@ def plan_path(
     Exit code 3: some of the path has no cost, because --step is large.
     """
     from tcpipe.cli.output import progress, say_result
-    from tcpipe.learning.models import load_model
+    from tcpipe.learning.models import chosen_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.plan_files import PlanRequest, plan
 
@@ -76,6 +87,6 @@ def plan_path(
     with progress("plan-path", 1, quiet=quiet) as shown:
         source = chosen_map(store, map_name)
         drawn = Path(picture) if picture else None
-        result = plan(load_model(model), source, request, out=Path(out), picture=drawn, step=shown.count)
+        result = plan(chosen_model(model, physics), source, request, out=Path(out), picture=drawn, step=shown.count)
     say_result(result, as_json=as_json)
     return result.exit_code

@@ -12,6 +12,7 @@ from tcpipe.cli.options import (
     OUTPUT_FILE,
     json_option,
     map_option,
+    physics_option,
     quiet_option,
     store_option,
 )
@@ -29,11 +30,20 @@ from tcpipe.cli.options import (
 )
 @map_option
 @click.option("--out", type=OUTPUT_FILE, metavar="FILE", help="Write the table of pieces: .csv, .parquet or .json.")
+@physics_option
 @store_option
 @json_option
 @quiet_option
 def predict_path(
-    model: str, *, path_file: str, map_name: str | None, out: str | None, store: str, as_json: bool, quiet: bool
+    model: str,
+    *,
+    path_file: str,
+    map_name: str | None,
+    out: str | None,
+    physics: str | None,
+    store: str,
+    as_json: bool,
+    quiet: bool,
 ) -> int:
     """Cut a path into pieces of a metre and predict the time and energy of each and of all, with intervals.
 
@@ -41,12 +51,12 @@ def predict_path(
     traversable) are marked and counted. Exit code 3: some pieces have no cost.
     """
     from tcpipe.cli.output import progress, say_result
-    from tcpipe.learning.models import load_model
+    from tcpipe.learning.models import chosen_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.path_files import predict_path as run
 
     with progress("predict-path", 1, quiet=quiet):
         source = chosen_map(store, map_name)
-        result = run(load_model(model), source, Path(path_file), Path(out) if out else None)
+        result = run(chosen_model(model, physics), source, Path(path_file), Path(out) if out else None)
     say_result(result, as_json=as_json)
     return result.exit_code

@@ -61,8 +61,15 @@ def physics_of(metres: Metres, *, standing_watt: float | None) -> PhysicsFit | N
         energy_share=share,
         held_out=None if scored is None else _score(scored),
         without_turning=None if without is None else _score(without),
+        usual_turn_radpm=_usual_turn(known),
         gain_of_turning=_gain(scored, without),
     )
+
+
+def _usual_turn(metres: Metres) -> float:
+    """Return how far a metre turns in the mean [rad/m]; 0 where no rate is known."""
+    turned = metres.turn_rate_radps / metres.velocity_mps
+    return float(turned[np.isfinite(turned)].mean()) if np.isfinite(turned).any() else 0.0
 
 
 def _held_out(metres: Metres, standing_watt: float | None, *, turning: bool) -> _HeldOut | None:

@@ -30,10 +30,8 @@ Floats = NDArray[np.float64]
 FEWEST = 20  # segments to fit on, and of a class to have coefficients of its own
 _LEAST_SLOPE = 0.02  # standard deviation of the rises: on flatter ground weight and rolling cannot be told apart
 _LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling cannot be told apart
-_SURE, _SUREST_WATT = (
-    0.02,
-    0.5,
-)  # standard deviation of what halts tell of standing: looser, it takes over what rolling does
+_SURE = 0.005  # standard deviation of what halts tell of standing, of itself: looser, it takes over what rolling does
+_SUREST_WATT = 0.1  # and no less than this
 _FEWEST_DOWNHILL = 10  # segments that drive the robot: fewer tell no recovery
 _STEPS = 100  # of reweighting at most
 _HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)

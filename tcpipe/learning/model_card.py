@@ -10,6 +10,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.seals import Checksum
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
+from tcpipe.tables.findings import LEFT_OUT, PhysicsFit
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe model"
@@ -82,6 +83,8 @@ class ModelCard:
     robot: str
     classes: tuple[TerrainClass, ...]
     seen: Seen
+    physics: PhysicsFit | None = field(default=None, metadata=LEFT_OUT)
+    """Of the robot, by the dataset: the planner takes what turns cost from it."""
     dataset: TrainedOn
     training: Training
     checksums: Mapping[str, Checksum] = field(default_factory=dict)

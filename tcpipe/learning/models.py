@@ -23,12 +23,14 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import atomic_directory, write_text
+from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import digest, typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.seals import broken_checksums, file_checksums, read_sealed, sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.architecture import check_trainable
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
+from tcpipe.tables.findings import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
 if TYPE_CHECKING:
@@ -127,6 +129,11 @@ class Model:
         return self.card.robot
 
     @property
+    def physics(self) -> PhysicsFit | None:
+        """What standing, rolling, grade and turning cost the robot."""
+        return self.card.physics
+
+    @property
     def class_counts(self) -> Mapping[int, int]:
         """Training samples by terrain class."""
         return self.card.seen.class_counts
@@ -207,6 +214,23 @@ def load_model(path: str | Path) -> Model:
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
     return Model(str(path), card, place, card_checksum(card), residuals)
+
+
+def chosen_model(path: str, physics: str | None) -> Model:
+    """Return a model as `load_model`, with the physics of a dataset where one is given."""
+    model = load_model(path)
+    return model if physics is None else with_physics(model, Path(physics))
+
+
+def with_physics(model: Model, dataset: Path) -> Model:
+    """Return the model with the physics of its robot that a dataset's card holds, instead of its own; `ModelError` if it holds none."""
+    card = read_card(dataset)
+    if model.robot not in card.physics:
+        raise ModelError(
+            f"{dataset}: its card has no physics of robot {model.robot}; there is that of {', '.join(card.physics) or 'none'}"
+        )
+    own = replace(model.card, physics=card.physics[model.robot])
+    return replace(model, card=own, checksum=digest([model.checksum, own.physics]))
 
 
 def read_model_card(place: Path) -> ModelCard:

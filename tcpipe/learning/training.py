@@ -321,6 +321,7 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         robot=", ".join(card.robots),
         classes=class_table(card).classes,
         seen=what_was_seen(task.train if config.model == "table" else task.fit),
+        physics=card.physics.get(card.robots[0]) if len(card.robots) == 1 else None,
         dataset=TrainedOn(card.name, dataset_checksum(card), card.data_model_version, card.splits),
         training=_told(task, config, fitted, key),
     )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from tcpipe.dataset.tensor import TensorForm
 from tcpipe.errors import ModelError
+from tcpipe.tables.findings import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 from tcpipe.terrain.layers import PAPER_LAYERS, paper_layers
 from tcpipe.terrain.sampling import Patches
@@ -83,6 +84,10 @@ class CostModel(Protocol):
     @property
     def seen(self) -> Mapping[str, tuple[float, float]]:
         """Smallest and largest ``slope_rad``, ``cross_slope_rad`` [rad] and ``relief_m`` [m] of the training patches."""
+
+    @property
+    def physics(self) -> PhysicsFit | None:
+        """What turning costs the robot, beside all else; None where no physics could be fitted."""
 
     @property
     def residuals(self) -> Mapping[str, NDArray[np.generic]]:

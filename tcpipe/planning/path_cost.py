@@ -17,6 +17,7 @@ from tcpipe.planning.intervals import COVERAGE, errors_of
 from tcpipe.planning.path_table import PIECES
 from tcpipe.planning.pieces import Pieces, cut_path, ground_scale
 from tcpipe.planning.reasons import Reason, counts_of, names_of
+from tcpipe.planning.turning import turning_of, turns_between
 from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
 from tcpipe.terrain.patches import corners_on, footprints
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
@@ -36,6 +37,10 @@ class PathTotals:
     pieces_without_cost: int
     duration_s: float
     energy_joule: float
+    turn_rad: float = 0.0
+    """How far it turns, both ways counted."""
+    turn_energy_joule: float | None = None
+    """Of the energy, what turns cost beyond those of the segments that the model knows; None where its robot's physics is not known."""
     duration_interval_s: tuple[float, float] | None
     """None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
@@ -110,9 +115,11 @@ def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: s
 
 def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts) -> PathCost:
     bits, class_id, errors = said.reasons, said.terrain_class, errors_of(model.residuals)
-    duration = pieces.arc_m / said.velocity_mps
-    energy = said.power_watt * duration
-    nothing = np.full(len(bits), np.nan)
+    duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
+    turn_rad, turning = turns_between(pieces.start_xy_m, pieces.end_xy_m), turning_of(model.physics, model.classes)
+    turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
+    energy = said.power_watt * duration + np.nan_to_num(turn_joule)
+    turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)
     (fast, slow), (least, most), sums = (nothing, nothing), (nothing, nothing), None
     if errors is not None:
         fast, slow = errors["duration"].of_pieces(duration, class_id)
@@ -130,6 +137,8 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts)
         duration_s=duration,
         duration_low_s=fast,
         duration_high_s=slow,
+        turn_rad=turn_rad,
+        turn_energy_joule=turn_joule,
         energy_joule=energy,
         energy_low_joule=least,
         energy_high_joule=most,
@@ -143,6 +152,8 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts)
         pieces_without_cost=without_cost,
         duration_s=float(np.nansum(duration)),
         energy_joule=float(np.nansum(energy)),
+        turn_rad=float(turn_rad.sum()),
+        turn_energy_joule=None if turning is None else float(np.nansum(turn_joule)),
         duration_interval_s=sums[0] if sums else None,
         energy_interval_joule=sums[1] if sums else None,
         reasons=counts_of(bits),

@@ -17,7 +17,7 @@ from tcpipe.planning.intervals import COVERAGE
 from tcpipe.planning.path_cost import PathTotals, cost_of_path
 from tcpipe.planning.path_table import check_ending, write_pieces
 
-VERSION = "1.0"
+VERSION = "1.1"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,7 +71,12 @@ def cost_text(of: PathTotals) -> str:
     duration = _quantity(of.duration_s, of.duration_interval_s, "s")
     energy = _quantity(of.energy_joule, of.energy_interval_joule, "J")
     part = "" if of.complete else f", without {of.pieces_without_cost} of {of.pieces} pieces"
-    return f"{of.length_m:.1f} m, {duration}, {energy}{part}"
+    turns = (
+        ""
+        if of.turn_energy_joule is None
+        else f" ({of.turn_energy_joule:.0f} J of them for {of.turn_rad:.1f} rad of turns)"
+    )
+    return f"{of.length_m:.1f} m, {duration}, {energy}{turns}{part}"
 
 
 def _quantity(value: float, interval: tuple[float, float] | None, unit: str) -> str:

@@ -24,9 +24,11 @@ from tcpipe.planning.cost_grid import BARRED
 from tcpipe.planning.courses import COURSES
 from tcpipe.planning.path_cost import PathCost, PathTotals, cost_of_path, off_map_text, projection_of
 from tcpipe.planning.reasons import names_of
-from tcpipe.planning.search import Found, least_cost_path, steps_of
+from tcpipe.planning.search import Found, Steps, least_cost_path, steps_of
 from tcpipe.planning.straight import straightened
 from tcpipe.planning.survey import Mask, Survey
+from tcpipe.planning.turning import turning_of
+from tcpipe.planning.turning_search import least_turning_path
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.point_classes import classes_at
 
@@ -53,7 +55,7 @@ class PlanTotals(PathTotals):
     objective: Objective
     """What it is the least of."""
     grid_cost: float
-    """What it costs on the grid of cells, in the objective's unit."""
+    """What it costs on the grid of cells, in the objective's unit, turns apart."""
     predicted_cells: int
     """Cells that the model was asked about."""
     negative_steps: int
@@ -202,12 +204,19 @@ class _Search:
     def _metres(self) -> Floats:
         return self.survey.frames.metres(self._cells)
 
-    def _found(self, objective: Objective, known: Mask) -> Found | None:
+    def _found(self, objective: Objective, known: Mask, class_id: NDArray[np.uint8] | None = None) -> Found | None:
+        """Return the best path over known cells; with their classes, that of least energy with its turns."""
         costs, (start, goal) = self.survey.costs, self._cells.tolist()
         open_ = costs.open_courses(allow_unseen=self.allow_unseen) & known
         if start == goal or not open_.any():
             return None
         steps = steps_of(costs, objective, open_, self._metres())
+        turning = turning_of(self.survey.model.physics, self.survey.model.classes)
+        if objective == "energy" and turning is not None and class_id is not None:
+            told = np.isfinite(steps.cost)
+            known_steps = Steps(*(getattr(steps, name)[told] for name in Steps.__slots__))
+            per_rad = turning.joule_per_rad[class_id.reshape(-1)]
+            return least_turning_path(known_steps, costs.grid.cols, start, goal, per_rad)
         return least_cost_path(steps, costs.grid.rows * costs.grid.cols, start, goal)
 
     def shortest(self) -> tuple[float, Found]:
@@ -242,7 +251,7 @@ class _Search:
         pace_s = self._ask(probes, 0.0)
         pace_s = self._ask(ellipse, pace_s)
         while True:
-            found = self._found(objective, survey.predicted)
+            found = self._found(objective, survey.predicted, class_id)
             wanted = self._could_be_better(objective, found, class_id)
             if not wanted.any():
                 if found is None:

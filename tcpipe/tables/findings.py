@@ -368,6 +368,8 @@ class PhysicsFit:
     held_out: PhysicsScore | None
     """None where too few segments are left to fit."""
     without_turning: PhysicsScore | None
+    usual_turn_radpm: float
+    """What a metre of the segments turns, both ways counted."""
     gain_of_turning: tuple[float, float] | None
     """By how much turning raises the held-out R²: 90 % interval over blocks of segments."""
 

@@ -18,6 +18,7 @@ def test_shares_and_scores_of_an_exact_robot():
     assert fit.held_out.r2 == pytest.approx(1.0, abs=1e-6)
     assert fit.held_out.mape < 1e-2
     assert fit.without_turning.r2 < 0.99
+    assert fit.usual_turn_radpm == pytest.approx((metres.turn_rate_radps / metres.velocity_mps).mean())
     low, high = fit.gain_of_turning
     assert low < 1.0 - fit.without_turning.r2 < high
 
