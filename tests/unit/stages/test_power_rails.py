@@ -5,6 +5,7 @@ import pytest
 from made_tracks import power_streams, stamps, straight_track
 
 from tcpipe.power.energy import energy_joule
+from tcpipe.power.standing import StandingPower
 from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.fuse_columns import power_columns
 from tcpipe.stages.gate import gate_track
@@ -35,7 +36,8 @@ def test_the_track_has_the_power_that_the_label_takes_at_a_segments_end(averaged
     gated = gate_track(straight_track(np.full(1200, 0.8)), GateConfig(), max_velocity_mps=1.0, chord_m=1.0)
     cut = segment_track(gated, SegmentConfig()).table
     rule = "averaged" if averaged else "exact"
-    cost, causes = segment_costs(cut, gated.table, rails_of(streams, 0), gated.info, rule=rule)
+    unknown, rails = StandingPower(np.nan, np.nan), rails_of(streams, 0)
+    cost, _, causes = segment_costs(cut, gated.table, rails, gated.info, rule=rule, standing=unknown)
     label_watt = np.sqrt(causes["position"]) / cost.duration_std_s
     assert cut.num_rows > 40
     assert label_watt == pytest.approx(track_watt(streams, integers(cut, "end_ns")))
