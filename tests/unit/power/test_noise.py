@@ -239,3 +239,16 @@ def test_nothing_is_said_of_two_samples_and_of_a_rail_without_any():
     empty = Samples(np.empty(0, np.int64), np.empty(0))
     gone = Rail("drive", empty, empty, False, empty.stamp_ns, empty.value, empty.value)
     assert energy_noise([gone], *second).std_joule().tolist() == [0.0]
+
+
+def test_noise_of_a_current_counts_by_the_voltage_in_the_middle_of_a_span():
+    t = np.arange(0, 60, 0.05)
+    stamp_ns = ZERO + np.round(t * 1e9).astype(np.int64)
+    amp = samples(stamp_ns, 6 + np.random.default_rng(11).normal(0, 0.5, len(t)))
+    spans = STARTS[[2, 38]], ENDS[[2, 38]]
+    middle_s = (spans[0] + spans[1]) / 2 * 1e-9 - ZERO * 1e-9
+    flat, steep = (
+        energy_noise([rail("drive", samples(stamp_ns, volt), amp, averaged=False)], *spans, NEVER_STILL).current
+        for volt in (np.ones(len(t)), 10.0 + 0.5 * t)
+    )
+    assert steep / flat == pytest.approx((10.0 + 0.5 * middle_s) ** 2, rel=1e-4)

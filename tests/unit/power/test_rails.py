@@ -71,3 +71,9 @@ def test_ends_are_held_whatever_the_number_of_samples():
         source = rail(range(0, 1000 * count, 1000), [30] * count, range(1, count + 1), averaged=True)
         at = np.array([-500, 1000 * count], np.int64) * MS
         assert power_watt([source], at).tolist() == [30, 30 * count]
+
+
+def test_a_gap_behind_the_first_sample_is_one():
+    source = rail([0, 5000, 5050, 5100, 5150], np.full(5, 24.0), np.ones(5))
+    at = np.array([0, 2500, 5000, 5025, 5150], np.int64) * MS
+    assert np.isnan(power_at([source], at, max_gap_ns=300 * MS)[2]).tolist() == [False, True, False, False, False]

@@ -310,6 +310,7 @@ def test_a_row_stands_for_the_time_around_it_and_beside_a_hole_for_three_periods
     found = readings._weight_s(np.array([0.0, 1.0, 2.0, 3.0, 13.0, 14.0, 15.0]))
     assert found.tolist() == [1.0, 1.0, 1.0, 3.0, 3.0, 1.0, 1.0]
     assert readings._weight_s(np.array([5.0])).tolist() == [1.0]
+    assert readings._weight_s(np.array([0.0, 0.05, 0.1, 0.15])) == pytest.approx([0.05] * 4)
 
 
 def test_a_jackals_drive_feedback_and_the_voltage_of_its_power_are_one_rail() -> None:

@@ -3,6 +3,7 @@ import pytest
 from splits_squares import squares
 
 from tcpipe.splits.audit import audit_leakage, audit_lines
+from tcpipe.splits.neighbours import nearest_m
 
 
 def audit(split, centres, run=None, start=None, **keywords):
@@ -75,3 +76,14 @@ def test_to_touch_is_not_to_share(apart_m, pairs):
 def test_two_corners_share_ground_far_from_both_centres():
     test, _ = audit(["train", "test"], [(0, 0), (1.35, 0)], course_rad=np.pi / 4)
     assert test.overlapping_pairs == 1
+
+
+@pytest.mark.parametrize("count", [7, 8, 9, 31, 33, 200])
+def test_the_nearest_square_is_found_though_many_centres_are_nearer(count):
+    """All but the last stand with an edge towards ours, a little nearer by their centres; the last reaches nearer with a corner."""
+    centres = np.column_stack((np.full(count, 3.0), np.linspace(-0.2, 0.2, count)))
+    centres[-1] = 3.1, 0.0
+    course = np.append(np.zeros(count - 1), np.pi / 4)
+    ours = squares([(0.0, 0.0)])
+    assert nearest_m(ours, squares(centres, course)) == pytest.approx([3.1 - np.sqrt(0.5) - 0.5])
+    assert nearest_m(ours, squares(centres[:-1])) == pytest.approx([2.0])

@@ -66,6 +66,12 @@ def test_blocks_are_square_cells_of_the_plane():
     assert [found.names[member] for member in found.member] == ["10:0:0", "10:1:0", "10:-1:2", "10:0:0"]
 
 
+def test_blocks_that_are_far_apart_are_told_apart():
+    cells = [(0, 1), (1, 0), (32, 0), (-32, 2), (2**20, -(2**20)), (-(2**20), 2**20)]
+    found = blocks(10.0 * np.array(cells) + 5.0, block_m=10.0)
+    assert [found.names[member] for member in found.member] == [f"10:{column}:{row}" for column, row in cells]
+
+
 def test_groups_stay_whole_and_come_near_to_the_share():
     groups = grouped([1 + i % 14 for i in range(150)])
     test = drawn(groups)
