@@ -9,6 +9,7 @@ import numpy as np
 from tcpipe.errors import FusionError
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
+from tcpipe.stages.fix_lag import with_lag_on_path
 from tcpipe.stages.fuse_agreeing import fuse_agreeing
 from tcpipe.stages.fuse_audit import audit_findings
 from tcpipe.stages.fuse_columns import rejections_table
@@ -53,7 +54,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     datum = None if local or inputs.datum_deg_m is None else Datum(*inputs.datum_deg_m, crs=streams.gnss_crs)
     # 3. What was left out, where sensors disagree with the track, and whether their clocks agree.
     summary = fuse_facts(inputs, fused.facts, rows=table.num_rows, skipped_s=fused.skipped_s)
-    clocks = clock_findings(streams, inputs)
+    clocks = with_lag_on_path(clock_findings(streams, inputs), fused, inputs, streams)
     table = with_offset_cost(table, clocks.facts)
     mounting, audit = mounting_findings(inputs, streams), audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)

@@ -38,6 +38,7 @@ ARM_STD_M = 0.5
 LATE_STD_S = 0.1
 """What is known beforehand of the lag of its stamps."""
 
+_SURELY_LATE, _LATE_S = 4.0, 0.06
 _GRAVITY_MPS2 = 9.80665
 _WINDOW_S = 40.0
 _FEWEST = 20
@@ -210,6 +211,15 @@ def solve_arm(told: Sequence[ArmEvidence | None], moved_m: Floats, *, height_std
     covariance[0, 0] += max(e.unseen_std_m for e in evidence) ** 2
     beyond = np.minimum(known / np.sqrt(np.diag(covariance)), 1.0)
     return Arm(error, covariance * np.outer(beyond, beyond))
+
+
+def lag_of(told: Sequence[ArmEvidence | None], moved_m: Floats) -> tuple[float, float] | None:
+    """Return by how much the fixes lag behind the path [s] and its deviation, where that is sure and matters; None elsewhere."""
+    arm = solve_arm(told, moved_m)
+    if arm is None:
+        return None
+    lag_s, std_s = float(arm.error[3]), float(np.sqrt(arm.covariance[3, 3]))
+    return (lag_s, std_s) if abs(lag_s) > max(_SURELY_LATE * std_s, _LATE_S) else None
 
 
 def antenna_doubt(arm: Arm | None, tilt: Tilt | None, lever_arm_m: tuple[float, float, float]) -> Floats | None:

@@ -12,6 +12,7 @@ from tcpipe.fusion.checks.mounting import (
     TiltEvidence,
     antenna_doubt,
     arm_evidence,
+    lag_of,
     levelled,
     rearmed,
     solve_arm,
@@ -82,6 +83,15 @@ def test_a_lag_is_told_from_an_antenna_further_back_by_the_changes_of_speed(trac
     arm = arm_of(track, replace(sensors, gnss=late))
     assert arm.error[3] == pytest.approx(0.1, abs=0.03)
     assert np.abs(arm.error[:2]).max() < 0.06
+
+
+def test_only_a_lag_that_is_sure_and_matters_is_believed(track, sensors):
+    late_ns = round(0.2e9)
+    late = replace(sensors.gnss, stamp_ns=sensors.gnss.stamp_ns + late_ns)
+    lag_s, std_s = lag_of([arm_evidence(track, replace(sensors, gnss=late))], NOWHERE)
+    assert lag_s == pytest.approx(0.2, abs=4 * std_s)
+    assert lag_of([arm_evidence(track, sensors)], NOWHERE) is None
+    assert lag_of([None], NOWHERE) is None
 
 
 def test_a_wrong_fix_now_and_then_and_for_a_while_moves_no_antenna(track, sensors):
