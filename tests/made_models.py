@@ -10,7 +10,6 @@ from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.model_card import ModelCard, Seen, TrainedOn, Training
 from tcpipe.learning.models import write_model
-from tcpipe.learning.network import resnet18
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 CARD = ModelCard(
@@ -36,6 +35,8 @@ CARD = ModelCard(
 
 def made_model(directory: Path, *, seed: int = 0, rows: int = 60, **changes) -> Path:
     """Write a model folder; ``changes`` replace fields of its card."""
+    from tcpipe.learning.network import resnet18  # needs torch
+
     card = replace(CARD, **changes)
     network = resnet18(card.architecture, seed=seed, start=(0.4, 0.85)[: card.architecture.outputs])
     rng = np.random.default_rng(seed)

@@ -53,7 +53,7 @@ from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRan
 @json_option
 @quiet_option
 def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **options: Any) -> None:
-    """Train ResNet-18 on DATASET's patches and labels, stop early by a fold of train, and write the model folder OUT.
+    """Train ResNet-18, stopped early by a fold of train, or a table on DATASET's patches and labels, and write the model folder OUT.
 
     Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for a table. A network runs on a GPU when there is one; its training
     goes on where it was stopped.

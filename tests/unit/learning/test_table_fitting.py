@@ -1,9 +1,12 @@
 """A table is a model folder like any other: trained in a moment, asked, evaluated, replaced."""
 
+import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from installed_command import tcpipe
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
@@ -13,6 +16,7 @@ from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.models import HISTORY, README, WEIGHTS, load_model
 from tcpipe.learning.training import Variant, train
 from tcpipe.pipeline.verify import verify
+from tcpipe.planning.cost_model import predict_patches
 
 pytest.importorskip("lightgbm")
 
@@ -66,6 +70,18 @@ def test_one_layer_one_output_and_weights(dataset, tmp_path):
     train(dataset, tmp_path / "weighed", config=replace(CONFIG, weights=True))
     with pytest.raises(DatasetError, match="no labelled samples in split train"):
         train(dataset, tmp_path / "none", config=CONFIG, variant=Variant(classes=(1,)))
+
+
+def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
+    done = tcpipe("train", dataset, "model", "--model", "table", "--json", cwd=tmp_path)
+    assert json.loads(done.stdout)["model"] == "table"
+    assert (tmp_path / "model" / WEIGHTS).read_bytes() == (trained[0] / WEIGHTS).read_bytes()
+    model, split = load_model(tmp_path / "model"), open_dataset(dataset)["train"]
+    pixels = split.layers(np.arange(20))
+    asked = np.arange(20) != 3
+    said = predict_patches(model, SimpleNamespace(pixels=pixels), asked)
+    assert np.isnan(said.power_watt[3])
+    assert said.power_watt[asked] == pytest.approx(model.predict(split.patches[:20])[asked, 0])
 
 
 def test_it_is_evaluated_without_networks(trained, dataset, tmp_path):
