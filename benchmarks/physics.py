@@ -18,6 +18,7 @@ import pyarrow as pa
 from tcpipe import ingest
 from tcpipe.cost.held_out import physics_of
 from tcpipe.cost.physics import Metres
+from tcpipe.formats.recipe_toml import load_recipe
 from tcpipe.pipeline.dataset.physics import metres_of, standing_of
 from tcpipe.report.physics import physics_in_words
 from tcpipe.simulation import Faults, scenario, simulate
@@ -83,10 +84,10 @@ def _against(name: str, value: float, std: float, true: float) -> str:
     return f"{name:26} {value:9.3f} ± {std:7.3f}   true {true:9.3f}   off {100.0 * (value / true - 1.0):+6.2f} %"
 
 
-def of_log(log: Path) -> str:
+def of_log(log: Path, recipe: Path | None) -> str:
     """Return the fit of a real log in words."""
     with tempfile.TemporaryDirectory() as directory:
-        ingest([log], store=Path(directory) / "store")
+        ingest([log], store=Path(directory) / "store", recipe=load_recipe(recipe))
         segments = Store(Path(directory) / "store").runs()[0].segments()
     found = physics_of(metres_of(segments), standing_watt=standing_of(segments))
     return f"{log.name}: no fit" if found is None else physics_in_words(log.stem, found)
@@ -98,9 +99,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=3)
     parser.add_argument("--saturating", action="store_true")
     parser.add_argument("--log", type=Path, nargs="*", default=[])
+    parser.add_argument("--recipe", type=Path)
     told = parser.parse_args()
     if told.log:
-        print(*map(of_log, told.log), sep="\n")
+        print(*(of_log(log, told.recipe) for log in told.log), sep="\n")
         return
     robot = plain_robot(half_radius_m=0.4) if told.saturating else plain_robot()
     print(*of_simulation(robot, metres=told.metres, seed=told.seed), sep="\n")

@@ -151,7 +151,7 @@ def fit_physics(metres: Metres, *, standing_watt: float | None = None, turning: 
     found = _fitted(used, terms, standing_watt)
     told = found.of("standing")
     if (
-        standing_watt is None and told is not None and told[0] < 2.0 * told[1]
+        standing_watt is None and told is not None and told[0] <= 2.0 * told[1]
     ):  # nobody saw it stand, and nothing tells it from rolling
         found = _fitted(used, [term for term in terms if term[0] != "standing"], None)
     off = used.power_watt - found.power_watt(used)
