@@ -114,7 +114,8 @@ def _toml_lines(recipe: Recipe, schema: Mapping[str, Any]) -> Iterator[str]:
 def _table_lines(head: str, here: Any, default: Any, schema: Mapping[str, Any]) -> Iterator[str]:
     """Yield a table of the recipe; one that it does not have is shown behind two #, since its keys alone would be another's."""
     definition = schema["$defs"][type(default).__name__]
-    yield from ("", f"# {definition['description']}", head if here else f"## {head}")
+    told = (f"# {line}" for line in definition["description"].splitlines() if line)
+    yield from ("", *told, head if here else f"## {head}")
     for name, kind in kinds_of(type(default)).items():
         value, usual = getattr(here or default, name), getattr(default, name)
         for line in _key_lines(definition["properties"][name], name, value, usual, range_of(kind)):

@@ -185,3 +185,9 @@ def test_a_key_of_many_parts_is_refused_before_it_takes_for_ever(tmp_path):
     path.write_text("[" + ".".join("a" * 450_000) + "]\n")
     with pytest.raises(RecipeError, match="line 1 has 449999 dots, at most 1000"):
         load_recipe(path)
+
+
+def test_the_commented_recipe_is_toml_whatever_its_docstrings_say() -> None:
+    text = commented_toml()
+    assert parse_recipe(tomllib.loads(text), where="init") == Recipe()
+    assert all(line.startswith(("#", "[")) for line in text.splitlines() if line)
