@@ -13,6 +13,7 @@ from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
+from tcpipe.tables.findings import NOTHING_FOUND, Findings, PowerSign, RunFacts
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -89,12 +90,25 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
 
 
 def add_run(
-    store, run_id, table, *, recipe=None, sha256=None, ledger_m=None, sensors=None, track=None, warnings=(), tags=None
+    store,
+    run_id,
+    table,
+    *,
+    recipe=None,
+    sha256=None,
+    ledger_m=None,
+    sensors=None,
+    track=None,
+    warnings=(),
+    tags=None,
+    includes=(),
 ):
     """Put a run with these segments, and this gated track, into the store, as ingestion would."""
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
-    info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother")
+    power = PowerSign("drawn_positive", averaged=False, includes=includes)
+    found = Findings((), RunFacts(power=power)) if includes else NOTHING_FOUND
+    info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
     identity = recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))
     ledger_m = ledger_m or {"kept": metres, "standing": 0.0, "accelerating": 2.5}

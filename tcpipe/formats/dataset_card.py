@@ -28,6 +28,8 @@ class LabelColumns:
 
     columns: tuple[str, ...]
     velocity: str
+    includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
+    """What the power of any run feeds besides the drives."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,6 +80,8 @@ class ModelCard:
     """ground or fused: which velocity v is."""
     label_energy: EnergyName = "total"
     """total or above_standing: which power w is, and so which energy E."""
+    label_includes: tuple[str, ...] = ()
+    """What the power that was measured feeds besides the drives, as the dataset's card has it."""
     robot: str
     classes: tuple[TerrainClass, ...]
     seen: Seen

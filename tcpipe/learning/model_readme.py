@@ -19,6 +19,9 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 
 - Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
 - Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
+{%- if includes %}
+  What was measured feeds {{ includes }}, too.
+{%- endif %}
 {% if config.model == "table" -%}
 - Table: up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM), as many as are best where each fold of
   train is predicted by the others; their loss {{ config.loss }} there is {{ "%.4f" | format(told.held_out_loss) }}.
@@ -49,7 +52,8 @@ def model_readme(card: ModelCard) -> str:
     return Environment(autoescape=False, undefined=StrictUndefined, keep_trailing_newline=True).from_string(_TEXT).render(  # noqa: S701  Markdown
         outputs=", ".join(card.outputs), chord=f"{card.chord_m:g}", px=card.architecture.patch_px,
         depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
-        velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words, robot=card.robot, width=card.architecture.width,
+        velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
+        includes="; ".join(map(_in_markdown, card.label_includes)), robot=card.robot, width=card.architecture.width,
         config=card.training.config, told=card.training, dataset=dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.seen.ranges["slope_rad"]),
         relief=" to ".join(f"{value:.2f} m" for value in card.seen.ranges.get("relief_m", ())) or "not looked at",

@@ -318,6 +318,7 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
         label_velocity=card.label.velocity,
         label_energy=config.label,
+        label_includes=card.label.includes,
         robot=", ".join(card.robots),
         classes=class_table(card).classes,
         seen=what_was_seen(task.train if config.model == "table" else task.fit),

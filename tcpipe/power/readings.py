@@ -47,6 +47,8 @@ class PowerReadings:
     warnings: tuple[str, ...] = ()
     current_sign: str | None = None
     """What a drawn current is counted as, and what tells it; None without power."""
+    includes: tuple[str, ...] = ()
+    """What the currents feed besides the drives."""
 
 
 def read_power(
@@ -91,12 +93,13 @@ def read_power(
     sign, told, told_by = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
         return PowerReadings(warnings=tuple(told))
-    warnings += [*told, *odd, *(f"power: {of.includes} are part of it" for of in sources if of.includes)]
+    includes = tuple(dict.fromkeys(of.includes for of in sources if of.includes))
+    warnings += [*told, *odd, *(f"power: {what} are part of it" for what in includes)]
     signed = {topic: [with_sign(rail, sign) for rail in found] for topic, found in rails.items()}
     counts = any(of.energy for of in sources)
     unknown = any(of.averaging_unknown for of in sources) and not counts
     averaged = counts or any(of.averaged for of in sources)
-    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(warnings)), told_by)
+    return PowerReadings(signed, averaged, unknown, tuple(dict.fromkeys(warnings)), told_by, includes)
 
 
 @dataclass(frozen=True, slots=True)

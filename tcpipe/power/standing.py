@@ -11,6 +11,7 @@ Floats = NDArray[np.float64]
 
 FEWEST_ROWS = 40
 """Rows of a standing robot that tell its power."""
+_QUARTERS = 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,10 +45,10 @@ def standing_power(power_watt: Floats, halt: NDArray[np.int64], *, window_rows: 
     used = settled if settled.any() else known
     halts = [power_watt[used & (halt == number)] for number in np.unique(halt[used]).tolist()]
     seconds = _seconds(halts, window_rows)
-    means, sizes = np.array([each.mean() for each in seconds]), np.array([each.size for each in seconds])
+    means = np.array([each.mean() for each in seconds])
     watt = float(np.median(means))
     scatter = float(np.mean((means - watt) ** 2))
-    lasting = max(scatter - _noise_variance(halts) * float(np.mean(1.0 / sizes)), 0.0)
+    lasting = max(scatter - _noise_variance(seconds), 0.0)
     levels = 1 + np.count_nonzero(np.diff(power_watt[used]))
     return StandingPower(watt, float(np.sqrt(lasting + scatter / means.size + step_watt**2 / 12.0 / levels)))
 
@@ -58,7 +59,11 @@ def _seconds(halts: list[Floats], rows: int) -> list[Floats]:
     return [part for part in parts if 2 * part.size >= rows] or parts
 
 
-def _noise_variance(halts: list[Floats]) -> float:
-    """Return the variance of the samples' noise [W²]: second differences of white noise have six times its variance."""
-    second = [np.diff(each, n=2) for each in halts if each.size > 2]
-    return float(np.mean(np.concatenate(second) ** 2)) / 6.0 if second else 0.0
+def _noise_variance(seconds: list[Floats]) -> float:
+    """Return the variance [W²] that noise gives the mean of a second: the means of its quarters tell, however rows hang together."""
+    found = [
+        float(np.var([quarter.mean() for quarter in np.array_split(each, _QUARTERS)], ddof=1)) / _QUARTERS
+        for each in seconds
+        if each.size >= _QUARTERS
+    ]
+    return float(np.mean(found)) if found else 0.0

@@ -51,7 +51,7 @@ def read_findings(
         epochs=len(steps) + 1,
         clock_steps=tuple(steps),
         time_offset_s=offset_s,
-        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged),
+        power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.includes),
     )
     return Findings(tuple(dict.fromkeys(warnings)), facts)
 

@@ -89,10 +89,14 @@ class ClockStep:
 
 @dataclass(frozen=True, slots=True)
 class PowerSign:
-    """Which sign a drawn current has and what tells it; whether the source averages over its message period."""
+    """Which sign a drawn current has and what tells it; whether the source averages over its message period.
+
+    ``includes``: what the currents feed besides the drives, as far as the tables of power messages know (computers, payload).
+    """
 
     current_sign: str
     averaged: bool
+    includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
 
 
 @dataclass(frozen=True, slots=True)

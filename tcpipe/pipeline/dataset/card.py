@@ -99,7 +99,7 @@ def dataset_card(
             **{name: _formula(layer) for name, layer in layers.items() if name not in LAYERS},
         },
         classes=classes.classes if has_terrain else (),
-        label=LabelColumns(("power_watt", VELOCITY_COLUMN[recipe.label.velocity]), recipe.label.velocity),
+        label=_label(recipe, inputs),
         energy_budget=pooled(run.energy_budget for run in inputs.sources),
         split=_split_rules(recipe, drawn, regions),
         ledger_m=content.ledger_m,
@@ -116,6 +116,13 @@ def dataset_card(
         shards=tuple(shards),
         checksums=checksums,
     )
+
+
+def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
+    told = (run.manifest.info.findings.facts.power for run in inputs.runs)
+    includes = tuple(sorted({what for power in told if power is not None for what in power.includes}))
+    velocity = recipe.label.velocity
+    return LabelColumns(("power_watt", VELOCITY_COLUMN[velocity]), velocity, includes)
 
 
 def _formula(layer: Layer) -> str:

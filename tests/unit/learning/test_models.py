@@ -13,6 +13,7 @@ from made_models import CARD, made_model
 
 from tcpipe.errors import ModelError, UsageError
 from tcpipe.formats.seals import write_sealed
+from tcpipe.learning.model_readme import model_readme
 from tcpipe.learning.models import WEIGHTS, load_model
 from tcpipe.pipeline.verify import verify
 
@@ -22,6 +23,15 @@ pytest.importorskip("torch")
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
     return made_model(tmp_path_factory.mktemp("made") / "model")
+
+
+def test_the_card_for_people_says_what_its_power_is():
+    text = model_readme(replace(CARD, label_energy="above_standing", label_includes=("computers", "user ports")))
+    assert (
+        "power is above what the robot draws while it stands; robot husky.\n  What was measured feeds computers; user ports, too.\n-"
+        in text
+    )
+    assert "feeds" not in model_readme(CARD)
 
 
 def _refused(place, match):

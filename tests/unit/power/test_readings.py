@@ -78,6 +78,7 @@ def test_clearpath_power_by_platform(robot: str, option: str, expected: np.ndarr
     np.testing.assert_allclose(power_watt(found), expected, rtol=1e-9)
     assert found.averaged == (robot != "husky")  # a Husky's driver asks for the state of the moment
     assert bool(found.warnings) == (robot not in ("husky", "jackal"))  # the total current feeds the computers too
+    assert [f"power: {what} are part of it" for what in found.includes] == list(found.warnings)
 
 
 def test_clearpath_power_that_does_not_fit_the_platform_is_refused() -> None:

@@ -39,6 +39,16 @@ def test_short_halts_are_noisier_and_do_not_count_as_change():
     assert np.median(told) < 0.45  # 3 W of 265 rows are 0.2 W
 
 
+def test_rows_between_two_samples_are_as_noisy_as_these():
+    rng, told = np.random.default_rng(3), []
+    for _ in range(100):
+        power, halt = halts(*[14.0] * 10)
+        noisy = power + rng.normal(0.0, 3.0, power.size)
+        between = 0.5 * (noisy + np.roll(noisy, 1))
+        told.append(standing_power(between, halt, window_rows=20, step_watt=0.0).std_watt)
+    assert np.median(told) < 0.35  # 3 W of 600 rows are 0.12 W, of a second 0.67 W
+
+
 def test_a_mean_is_finer_than_the_step_of_the_record():
     rng = np.random.default_rng(1)
     power, halt = halts(*[14.0] * 20)

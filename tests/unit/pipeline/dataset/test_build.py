@@ -161,6 +161,14 @@ def test_no_segments(store, tmp_path):
     assert "no segment in them: 3 m standing" in refused(store, tmp_path)
 
 
+def test_the_card_says_what_the_power_of_any_run_feeds(store, tmp_path):
+    add(store)
+    for run_id, y_m, what in (("b", 3.0, "user ports"), ("c", 6.0, "computers"), ("d", 9.0, "computers")):
+        add_run(store, run_id, segments(run_id, *lanes(y_m, -10.0, 10.0)), includes=(what,))
+    build(store, tmp_path)
+    assert open_dataset(tmp_path / "out").card.label.includes == ("computers", "user ports")
+
+
 def test_no_power_is_no_sample(store, tmp_path):
     add(store, powered=False)
     assert "none with power" in refused(store, tmp_path)
