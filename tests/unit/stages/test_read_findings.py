@@ -112,8 +112,11 @@ def test_a_rate_is_that_inside_epochs_and_unknown_of_one_row():
     assert read(clock=single).facts.roles["gnss"].topics["/fix"].rate_hz is None
 
 
+POWER = PowerReadings(averaged=True, warnings=("power: odd",), current_sign="drawn", includes=("computers",))
+
+
 def test_notes_that_count_nothing_are_left_out_and_powers_are_told():
-    found = read(source(notes={"zero": 0, "set_aside": 3}), power=PowerReadings({}, True, ("power: odd",), "drawn"))
+    found = read(source(notes={"zero": 0, "set_aside": 3}), power=POWER)
     assert found.facts.roles["gnss"].topics["/fix"].notes == {"set_aside": 3}
-    assert found.facts.power == PowerSign("drawn", averaged=True)
+    assert found.facts.power == PowerSign("drawn", averaged=True, includes=("computers",))
     assert found.warnings == ("power: odd",)
