@@ -5,12 +5,13 @@ import polars as pl
 import pytest
 from simulated_streams import log_of
 
-from tcpipe.errors import LogError
+from tcpipe.errors import LogError, UsageError
 from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.table_log import TableLog
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.formats.toml_text import parse_toml
+from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.recipe import Recipe, TableMapping
 from tcpipe.recipe.checking import from_values
@@ -193,3 +194,23 @@ def test_inspect_proposes_what_the_columns_are_called_and_it_can_be_read(tmp_pat
         "/voltage_left": "power",
         "/current_left": "power",
     }
+
+
+def test_a_folder_of_tables_is_ingested_as_one_log_and_what_is_in_the_way_is_said(tmp_path):
+    folder = folder_with(tmp_path, odom=odometry())
+    with pytest.raises(UsageError) as caught:
+        ingest([folder], store=tmp_path / "store", recipe=Recipe())
+    assert "it holds 1 tables (odom.csv, …): map them in the recipe" in caught.value.problems[1]
+    wrong = Recipe(tables={"gnss": TableMapping("fixes.csv")})
+    with pytest.raises(UsageError) as caught:
+        ingest([folder], store=tmp_path / "store", recipe=wrong)
+    assert "nor is one of the files that the recipe's tables name: fixes.csv" in caught.value.problems[1]
+    recipe = Recipe(tables={"wheel_odometry": WHEELS, "imu": TableMapping("odom.csv")})
+    (failed,) = ingest([tmp_path], store=tmp_path / "store", recipe=recipe).results
+    assert (failed.status, failed.log) == ("failed", str(folder))
+    assert "tables.imu.columns: imu needs angular_velocity_x" in failed.problems[0]
+    recipe = Recipe(tables={"wheel_odometry": WHEELS})
+    (done,) = ingest([tmp_path], store=tmp_path / "store", recipe=recipe).results
+    assert (done.status, done.run_id[:8]) == ("done", "session-")
+    (again,) = ingest([folder], store=tmp_path / "store", recipe=recipe).results
+    assert (again.status, again.run_id) == ("unchanged", done.run_id)
