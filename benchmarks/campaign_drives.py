@@ -71,8 +71,7 @@ class Fault:
     """What is wrong with a log, as what it changes on the way from the robot to the log; a new fault is one of these.
 
     ``sensors`` changes the sensors as they really are, ``told`` what the log says of them (places, variances), ``readings`` what
-    they measured, ``messages`` what was recorded; ``route`` names the drive, ``recorder`` what records it, ``true_ns`` leads from the
-    track's time to the truth's.
+    they measured, ``messages`` what was recorded; ``route`` names the drive, ``true_ns`` leads from the track's time to the truth's.
     """
 
     name: str
@@ -85,7 +84,6 @@ class Fault:
     may_refuse: bool = False
     """Whether a run without a segment is right: no sensor is left that could tell who is wrong, or nothing is to be labelled."""
     route: str = "hills"
-    recorder: Recorder = HUSKY
     calibrated: bool = False
     """Whether nothing is wrong at all: then deviations are to be as large as errors, and bits rare."""
     sensors: Callable[[Sensors], Sensors] = lambda sensors: sensors
@@ -184,7 +182,7 @@ def log_of(drive: Drive, sensors: Sensors, fault: Fault) -> MemoryLog:
     """Return what is recorded of a drive where a fault is."""
     real = fault.sensors(sensors).mounted(WHOLE)
     readings = fault.readings(record(drive.truth, drive.site, real, WHOLE, drive.noise), drive)
-    messages = streams(readings, fault.told(real), fault.recorder, geoid_m=drive.site.geoid_m)
+    messages = streams(readings, fault.told(real), HUSKY, geoid_m=drive.site.geoid_m)
     recorded = fault.messages(messages, drive)
     return MemoryLog([m for m in recorded if m.constants.get("transforms") != []])
 

@@ -12,10 +12,10 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from campaign_drives import HUSKY, Drive, Fault, Messages, Readings
+from campaign_drives import Drive, Fault, Messages, Readings
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation.messages import TOPICS, Recorder
+from tcpipe.simulation.messages import TOPICS
 from tcpipe.simulation.sensors import Gnss, Mounting, Power, Reading, Sensors
 
 MINUTE_S = (90.0, 150.0)
@@ -293,9 +293,8 @@ FAULTS: dict[str, Fault] = {
         Fault("clean", calibrated=True),
         Fault("RTK of 5 cm", calibrated=True, sensors=_gnss(std_m=0.05, vertical_std_m=0.08)),
         *(
-            Fault(f"power {how} at {rate_hz:g} Hz", recorder=recorder, calibrated=True, sensors=_power(rate_hz))
-            for how, recorder in (("averaged", HUSKY), ("sampled", Recorder("ros2", "husky_status")))
-            for rate_hz in (1.0, 5.0, 20.0)[: 2 if how == "averaged" else 3]
+            Fault(f"power at {rate_hz:g} Hz", calibrated=True, sensors=_power(rate_hz))
+            for rate_hz in (1.0, 5.0, 20.0)
         ),
         Fault("10 s without GNSS", ("gnss",), (100.0, 110.0), readings=_of("gnss", _holes)),
         # Fixes that lie

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 
 from tcpipe.recipe import TableMapping
@@ -23,7 +24,7 @@ def table_files(folder: Path) -> list[Path]:
 def table_folders(path: Path, mappings: Mappings) -> list[Path]:
     """Return the folders at or below a path that hold a mapped file, in order of their names; what lies below one is its own."""
     wanted = [mapping.file for mapping in mappings.values() if mapping.file]
-    found = []
+    found = list[Path]()
     for place, folders, _ in _walked(path):
         if any((Path(place) / file).is_file() for file in wanted):
             found.append(Path(place))
@@ -32,9 +33,23 @@ def table_folders(path: Path, mappings: Mappings) -> list[Path]:
 
 
 def _walked(folder: Path) -> Iterator[tuple[str, list[str], list[str]]]:
-    for place, folders, names in os.walk(folder):
-        folders[:] = sorted(name for name in folders if not name.startswith((".", "~")))
+    """Yield each folder with the names of folders in it, which the caller may take out, and of files; links to folders are not followed.
+
+    As `os.walk`, which on Python 3.11 calls itself as deep as folders are nested.
+    """
+    waiting = [str(folder)]
+    while waiting:
+        place = waiting.pop()
+        folders, names = list[str](), list[str]()
+        with suppress(OSError), os.scandir(place) as entries:
+            for entry in entries:
+                if not entry.is_dir(follow_symlinks=False):
+                    names.append(entry.name)
+                elif not entry.name.startswith((".", "~")):
+                    folders.append(entry.name)
+        folders.sort()
         yield place, folders, names
+        waiting += (f"{place}/{name}" for name in reversed(folders))
 
 
 def is_table(name: str) -> bool:
