@@ -7,10 +7,12 @@ from pathlib import Path
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import clear, write_text
+from tcpipe.formats.dataset_files import read_current_card
 from tcpipe.formats.seals import sealed_page
 from tcpipe.report.dataset_report import dataset_report
+from tcpipe.report.physics import physics_in_words
 from tcpipe.report.run_report import run_report
-from tcpipe.store import Store, is_store, run_at
+from tcpipe.store import RunDirectory, Store, is_store, run_at
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,6 +21,8 @@ class Page:
 
     path: Path
     changed: bool
+    physics: tuple[str, ...] = ()
+    """What the page says of the robots' physics, a line a robot."""
 
 
 def report(path: Path) -> list[Page]:
@@ -33,19 +37,27 @@ def report(path: Path) -> list[Page]:
 
     """
     if (path / "dataset.json").is_file():
-        return [_write(path, dataset_report(path))]
+        fits = read_current_card(path).physics
+        said = tuple(physics_in_words(robot, fit) for robot, fit in fits.items())
+        return [_write(path, dataset_report(path), said)]
     store = Store(path)
     found = (store, store.runs()) if is_store(path) else run_at(path)
     if found is None or not found[1]:
         what = "is no dataset, run or store with runs" if path.exists() else "there is no such directory"
         raise UsageError(f"{path}: {what}; give a dataset, a run of a store, or a store")
-    return [_write(run.path, run_report(found[0], run)) for run in found[1]]
+    return [_write(run.path, run_report(found[0], run), _physics_of(run)) for run in found[1]]
 
 
-def _write(directory: Path, html: str) -> Page:
+def _physics_of(run: RunDirectory) -> tuple[str, ...]:
+    label = run.manifest.info.findings.facts.label
+    fit = label.physics.fit if label is not None and label.physics is not None else None
+    return () if fit is None else (physics_in_words(run.manifest.robot, fit),)
+
+
+def _write(directory: Path, html: str, physics: tuple[str, ...]) -> Page:
     clear(directory)
     path, html = directory / "report.html", sealed_page(html)
     changed = not path.is_file() or path.read_bytes() != html.encode()
     if changed:
         write_text(path, html)
-    return Page(path, changed)
+    return Page(path, changed, physics)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tcpipe.report.page import Section
-from tcpipe.tables.findings import PhysicsFit
+from tcpipe.tables.findings import PhysicsFit, PhysicsTerm
 
 _ASIDE = {"grade": "weight over efficiency"}
 
@@ -13,7 +13,7 @@ def physics_in_words(robot: str, fit: PhysicsFit) -> str:
     grounds = list(dict.fromkeys(of.terrain for of in fit.terms if of.term in {"rolling", "turning"}))
     values = {(of.term, of.terrain): of for of in fit.terms}
     everywhere = [
-        f"{of.value:.0f} ± {of.std:.0f} {of.unit} {_ASIDE.get(of.term, of.term)}"
+        f"{_with_std(of)} {of.unit} {_ASIDE.get(of.term, of.term)}"
         for of in fit.terms
         if of.term not in {"rolling", "turning"}
     ]
@@ -24,9 +24,9 @@ def physics_in_words(robot: str, fit: PhysicsFit) -> str:
             value, std = fit.rolling_resistance[ground]
             parts.append(f"C_rr {value:.3f} ± {std:.3f}")
         elif (rolling := values.get(("rolling", ground))) is not None:
-            parts.append(f"rolling {rolling.value:.0f} ± {rolling.std:.0f} N")
+            parts.append(f"rolling {_with_std(rolling)} N")
         if (turning := values.get(("turning", ground))) is not None:
-            parts.append(f"{turning.value:.0f} ± {turning.std:.0f} W per rad/s of turning")
+            parts.append(f"{_with_std(turning)} W per rad/s of turning")
         said.append(f"on {'all ground' if ground == 'all' else ground}: {', '.join(parts)}")
     share = ", ".join(f"{name} {100.0 * part:.0f} %" for name, part in fit.energy_share.items())
     text = f"{'; '.join(said)}. Of all energy: {share} ({fit.segments} segments)."
@@ -34,11 +34,16 @@ def physics_in_words(robot: str, fit: PhysicsFit) -> str:
         text += f" On held-out fifths it explains {fit.held_out.r2:.2f} of the variance of E (R²), "
         text += f"mean error {100 * fit.held_out.mape:.0f} %"
         if fit.without_turning is not None and fit.gain_of_turning is not None:
-            low, high = fit.gain_of_turning
+            low, high = (round(gain, 2) + 0.0 for gain in fit.gain_of_turning)  # no -0.00
             without = f"{fit.without_turning.r2:.2f} and {100 * fit.without_turning.mape:.0f} %"
             text += f"; without turning {without} (R² by turning {low:+.2f} to {high:+.2f}, 90 %)"
         text += "."
     return text
+
+
+def _with_std(of: PhysicsTerm) -> str:
+    digits = 0 if of.std >= 1.0 else 1
+    return f"{of.value:.{digits}f} ± {of.std:.{digits}f}"
 
 
 def physics_sections(fits: dict[str, PhysicsFit]) -> list[Section]:

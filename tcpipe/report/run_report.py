@@ -56,7 +56,7 @@ def run_report(store: Store, run: RunDirectory) -> str:
         warnings=[*manifest.damage, *manifest.warnings],
         sections=[
             *_track_sections(store, run, track),
-            *_segment_sections(segments, ledger, label.physics if label else None),
+            *_segment_sections(segments, ledger, label.physics if label else None, manifest.robot),
             *budget_sections(run.energy_budget),
             *sensor_sections(known, manifest, run.rejections()),
         ],
@@ -149,7 +149,7 @@ def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under
     return None, lost
 
 
-def _physics_sections(segments: pa.Table, physics: PhysicsFacts | None) -> list[Section]:
+def _physics_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> list[Section]:
     """Return what a metre costs by physics, and what that leaves unexplained; nothing where it could not be fitted."""
     if physics is None or not physics.fitted:
         return []
@@ -159,14 +159,16 @@ def _physics_sections(segments: pa.Table, physics: PhysicsFacts | None) -> list[
         f"terrain and errors. {physics.outliers} segments are further than four standard deviations of "
         f"{physics.residual_watt:.0f} W."
     )
-    fits = {} if physics.fit is None else {"The robot": physics.fit}
+    fits = {} if physics.fit is None else {robot: physics.fit}
     return [
         *physics_sections(fits),
         Section("What physics leaves unexplained", text, histograms({"w - physics [W]": left})),
     ]
 
 
-def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: PhysicsFacts | None) -> list[Section]:
+def _segment_sections(
+    segments: pa.Table, ledger: Mapping[str, float], physics: PhysicsFacts | None, robot: str
+) -> list[Section]:
     sections = [
         Section("Where every metre went", "Kept and dropped add up to the odometer.", ledger_bars(ledger)),
     ]
@@ -174,7 +176,7 @@ def _segment_sections(segments: pa.Table, ledger: Mapping[str, float], physics: 
         labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
         data = {label: _column(segments, name).astype(float) for label, name in labels.items()}
         sections.append(Section("Labels", "One value a segment.", histograms(data)))
-        sections += _physics_sections(segments, physics)
+        sections += _physics_sections(segments, physics, robot)
         quality = _bits(segments, "quality")
         sections += quality_sections(
             {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}, "segments"

@@ -28,6 +28,7 @@ TEXTS = {
     "crs",
     "start",
     "goal",
+    "holdout",
     "strays",
     "shard",
     "min_age_s",
