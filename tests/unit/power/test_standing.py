@@ -15,7 +15,12 @@ def test_halts_that_differ_tell_how_unsure_it_is():
     power, halt = halts(80.0, 90.0, 100.0)
     found = standing_power(power, halt, window_rows=20, step_watt=0.0)
     assert found.watt == 90.0
-    assert found.std_watt == pytest.approx(np.sqrt(200 / 3 * (1 + 1 / 9)))
+    assert found.std_watt == pytest.approx(np.sqrt(200 / 3 * (1 + 1 / 9) + (0.1 * 90.0 / 9) ** 2))
+
+
+def test_one_second_does_not_tell_what_another_would():
+    found = standing_power(np.full(40, 390.0), np.zeros(40, int), window_rows=40, step_watt=0.0)
+    assert (found.watt, found.std_watt) == (390.0, pytest.approx(39.0))
 
 
 def test_noise_of_samples_is_not_held_against_the_robot():
@@ -61,7 +66,7 @@ def test_a_mean_is_finer_than_the_step_of_the_record():
 
 def test_a_record_that_stays_on_one_level_is_unsure_by_its_step():
     power, halt = halts(14.0, 14.0)
-    assert standing_power(power, halt, window_rows=20, step_watt=1.2).std_watt == pytest.approx(1.2 / np.sqrt(12))
+    assert standing_power(power, halt, window_rows=20, step_watt=1.2).std_watt == pytest.approx(np.hypot(1.2 / np.sqrt(12), 1.4 / 6))
 
 
 def test_motors_at_the_edges_of_a_halt_are_left_out_where_anything_else_is_known():
