@@ -66,7 +66,9 @@ def test_a_mean_is_finer_than_the_step_of_the_record():
 
 def test_a_record_that_stays_on_one_level_is_unsure_by_its_step():
     power, halt = halts(14.0, 14.0)
-    assert standing_power(power, halt, window_rows=20, step_watt=1.2).std_watt == pytest.approx(np.hypot(1.2 / np.sqrt(12), 1.4 / 6))
+    assert standing_power(power, halt, window_rows=20, step_watt=1.2).std_watt == pytest.approx(
+        np.hypot(1.2 / np.sqrt(12), 1.4 / 6)
+    )
 
 
 def test_motors_at_the_edges_of_a_halt_are_left_out_where_anything_else_is_known():
