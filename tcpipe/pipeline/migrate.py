@@ -6,8 +6,9 @@ migration that was killed is gone on with by calling it again, and one that is d
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -21,23 +22,8 @@ from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 Document = Mapping[str, Any]
 
 
-def _to_1_1(document: Document) -> Document:
-    """Layers beside the paper's three, and their keys in a card, are all that is new: there are none in what is older."""
-    return {**document, "data_model_version": "1.1"}
-
-
-def _to_1_2(document: Document) -> Document:
-    """Return a document of 1.1 as one of 1.2: a quality bit and what the audit found are added, and say nothing where they are absent."""
-    return {**document, "data_model_version": "1.2"}
-
-
-def _to_1_3(document: Document) -> Document:
-    """Return a document of 1.2 as one of 1.3: columns are added, and a column that is absent is read as null."""
-    return {**document, "data_model_version": "1.3"}
-
-
-_STEPS: Mapping[str, Callable[[Document], Document]] = {"1.0": _to_1_1, "1.1": _to_1_2, "1.2": _to_1_3}
-"""By version that is left."""
+_STEPS: Mapping[str, str] = dict(pairwise(READ_VERSIONS))
+"""The version after each. Whatever came with one says nothing where it is absent, so nothing but the number changes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,7 +98,7 @@ def _brought(place: Path) -> bool:
             raise StoreError(
                 f"{place}: of data model {version}, this version knows {', '.join(READ_VERSIONS)}; left as it is"
             )
-        document = _STEPS[version](document)
+        document = {**document, "data_model_version": _STEPS[version]}
     if document is not found:
         write_sealed(place, document)
     return document is not found
