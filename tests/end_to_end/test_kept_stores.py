@@ -123,7 +123,7 @@ def test_what_is_damaged_or_not_known_is_left_and_named(kept):
     assert "not as it was written" in damaged.problems[0]
     write_sealed(manifest, {**json.loads(text), "data_model_version": "3.0"})
     newer = contents(kept / "store")
-    assert "of data model 3.0, this version knows 1.0, 1.1, 1.2, 1.3" in migrate(kept / "store").problems[0]
+    assert "of data model 3.0, this version knows 1.0, 1.1, 1.2, 1.3, 1.4" in migrate(kept / "store").problems[0]
     assert contents(kept / "store") == newer
     with pytest.raises(UsageError, match="is no store, map"):
         migrate(kept / "site")
