@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.seals import Checksum, file_checksum
+from tcpipe.logs.mapped import stamps_ns
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
-_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1000, "ns": 1}
+_UNITS = ("s", "ms", "us", "ns")
 _TIME_NAMES = ("time", "stamp", "timestamp", "datetime", "date", "date_time", "time_utc", "utc")
-_YEARS_NS = (946_684_800 * 10**9, 4_102_444_800 * 10**9)  # 2000 to 2100
 _NO_VALUE = ["", "NA", "N/A", "n/a", "NaN", "nan", "null", "NULL", "None"]
 _STAMP, _FOUND, _ROW = "tcpipe stamp", "tcpipe found", "tcpipe row"
 _MOSTLY = 0.5
@@ -143,7 +143,7 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
         if wanted not in table.columns:
             raise DatasetError(f"{path}: no column {wanted!r} ([covariates] time_column); there are {there}")
         return wanted
-    endings = ("", *(f"_{unit}" for unit in _NS))
+    endings = ("", *(f"_{unit}" for unit in _UNITS))
     found = [name for name in table.columns if name.lower() in {f"{of}{end}" for of in _TIME_NAMES for end in endings}]
     if len(found) != 1:
         said = (
@@ -160,8 +160,7 @@ def _stamps_ns(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
     if column.dtype.is_temporal() and column.dtype not in {pl.Time, pl.Duration}:
         return column.cast(pl.Datetime("ns", getattr(column.dtype, "time_zone", None))).cast(pl.Int64)
     if column.dtype.is_numeric():
-        per = _NS[_unit_of(path, column, unit)]
-        return column * per if column.dtype.is_integer() else (column.fill_nan(None) * per).round().cast(pl.Int64)
+        return _counted_ns(path, column, unit)
     if column.dtype != pl.String:
         raise DatasetError(f"{path}: {column.name} is {column.dtype}; wanted stamps: numbers, or text in ISO 8601")
     return pl.Series([_iso_ns(path, column.name, text) for text in column], dtype=pl.Int64)
@@ -178,20 +177,16 @@ def _iso_ns(path: Path, name: str, text: str | None) -> int | None:
     return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
 
 
-def _unit_of(path: Path, column: pl.Series, unit: TimeUnit) -> str:
-    """Return the unit that rules: the one asked for, that of the name, or the only one by which all stamps lie in this century."""
-    if unit != "auto":
-        return unit
+def _counted_ns(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
+    """Return stamps that are numbers [ns], in the unit that is asked for, the one at the end of the name, or the one of their size."""
     ending = column.name.lower().rsplit("_", 1)[-1]
-    if ending in _NS:
-        return ending
-    low, high = float(column.min() or 0), float(column.max() or 0)  # type: ignore[arg-type]
-    fits = [name for name, per in _NS.items() if _YEARS_NS[0] <= low * per and high * per <= _YEARS_NS[1]]
-    if len(fits) != 1:
-        raise DatasetError(
-            f"{path}: {column.name} from {low:g} to {high:g} is in no unit a time of this century; say which: [covariates] time_unit"
-        )
-    return fits[0]
+    numbers = column if column.dtype.is_integer() else column.set(~column.is_finite(), None)
+    stamps = stamps_ns(numbers.drop_nulls().to_numpy(), ending if unit == "auto" and ending in _UNITS else unit)
+    if isinstance(stamps, str):
+        raise DatasetError(f"{path}: {column.name}: {stamps} ([covariates] time_unit)")
+    made = np.zeros(len(numbers), np.int64)
+    made[numbers.is_not_null().to_numpy()] = stamps
+    return pl.Series(made).set(numbers.is_null(), None)
 
 
 def _values(path: Path, table: pl.DataFrame) -> tuple[list[pl.Series], list[str]]:

@@ -190,7 +190,7 @@ def stamps_ns(values: NDArray[Any], unit: str) -> NDArray[np.int64] | str:
         middle = float(np.median(values)) if values.size else 0.0
         fitting = [name for name, ns in _NS_OF.items() if _YEARS_S[0] < middle * ns / 1e9 < _YEARS_S[1]]
         if not fitting:
-            return f"its stamps ({middle:.12g}) do not count from 1970; say what they count: stamp_unit = one of {', '.join(_NS_OF)}"
+            return f"its stamps ({middle:.12g}) do not count from 1970; say what they count, one of {', '.join(_NS_OF)}"
         unit = fitting[0]
     factor = _NS_OF[unit]
     if np.issubdtype(values.dtype, np.integer):

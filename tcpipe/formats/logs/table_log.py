@@ -145,7 +145,7 @@ def _stamps(cells: Cells, stamp: str, mapping: TableMapping) -> NDArray[np.int64
         return "it holds neither numbers nor dates (wanted seconds, or text as 2025-10-14T15:41:25.7Z)"
     found = stamps_ns(known, "ns" if cells.stamp_is_time else mapping.stamp_unit)
     if isinstance(found, str):
-        return found
+        return f"{found} (stamp_unit)"
     found = utc_from_gps_ns(found) if cells.stamp_is_time and stamp == _GPS_TIME else found
     return found + round(mapping.offset_s * 1e9)
 
