@@ -16,6 +16,7 @@ from tcpipe.dataset.energies import ENERGIES, Energy
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.learning.baselines import compared
 from tcpipe.learning.evaluation_facts import (
     SPLITS,
     AblationRow,
@@ -123,6 +124,7 @@ def evaluate(
     ablation = list(_ablation(ours, sets, config, trained))
     with_networks = config.baselines and fitting.model == "resnet18"
     energy = _energy(ours, data, sets, said, trained if with_networks else None)
+    baselines, lacking = compared(ours, data, sets, said, seed=config.seed)
     return Evaluation(
         tcpipe_version=__version__,
         key=key,
@@ -133,8 +135,9 @@ def evaluate(
         ablation=tuple(ablation),
         energy=energy,
         time=_time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
+        baselines=tuple(baselines),
         repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
-        warnings=(*_warnings(ours, data, sets), *_left_out(data, sets, energy)),
+        warnings=(*lacking, *_warnings(ours, data, sets), *_left_out(data, sets, energy)),
         plots={name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
     )
 

@@ -10,6 +10,7 @@ from tcpipe.balance.repeats import Floor
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.learning.metrics import Errors
 from tcpipe.learning.model_card import Training
+from tcpipe.learning.ratios import Ratio
 from tcpipe.tables.findings import ABSENT
 
 KIND = "tcpipe evaluation"
@@ -92,6 +93,22 @@ class AblationRow:
         return (self.test if split == "test" else self.unseen) or {}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compared:
+    """A baseline beside the model, on the same samples: its errors, and the ratios of the model's to them."""
+
+    baseline: str
+    split: str
+    quantity: str
+    errors: Errors
+    rmse_ratio: Ratio
+    """Of the model over the baseline: below 1 the model is better."""
+    mape_ratio: Ratio
+    groups: int
+    """That the intervals were drawn from."""
+    drawn_by: Literal["runs", "blocks"]
+
+
 Plotted = TypedDict(  # a dataclass has no field called class
     "Plotted",
     {
@@ -123,6 +140,8 @@ class Evaluation:
     """Table IV: errors of E by predictor and split."""
     time: Mapping[str, Mapping[str, Errors]]
     """Table V: errors of T by predictor and split."""
+    baselines: tuple[Compared, ...] = ()
+    """Of all classes together, by split, baseline and quantity."""
     repeatability: Mapping[str, Floor | None]
     """How well each label repeats itself where ground was driven twice; None where none was."""
     warnings: tuple[str, ...]

@@ -14,6 +14,7 @@ from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import digest, read_as, read_json, write_json
 from tcpipe.formats.seals import sealed
+from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
 from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows
@@ -41,6 +42,7 @@ class EvaluationResult:
                 f"{quantity} {part.errors[quantity][ALL].mape_percent or float('nan'):.2f} %" for quantity in QUANTITIES
             )
             lines.append(f"{split}: {part.samples} samples, MAPE {', '.join(figures)}")
+        lines += verdicts(self.values.baselines)
         return plain_lines((*lines, f"open {self.path / PAGE}"))
 
 

@@ -9,9 +9,11 @@ from typing import Literal
 import numpy as np
 
 from tcpipe.learning import paper_tables as paper
+from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import EXPECTED, GRASS_ONLY, OURS, PER_CLASS
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS, Errors
+from tcpipe.learning.ratios import Ratio
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.prediction_figures import MOST_PERCENT, predictions_by_patch
 
@@ -27,7 +29,15 @@ def evaluation_page(
     found: Evaluation, *, title: str, lead: str, before: Sequence[Section] = (), warnings: Sequence[str] = ()
 ) -> str:
     """Return the HTML page of what `evaluate` found; ``before`` and ``warnings`` come first."""
-    sections = [*before, *_by_class(found), _ablation(found), _energy(found), _time(found), *_pictures(found)]
+    sections = [
+        *before,
+        _baselines(found),
+        *_by_class(found),
+        _ablation(found),
+        _energy(found),
+        _time(found),
+        *_pictures(found),
+    ]
     return render_page(
         title=title,
         lead=lead,
@@ -73,6 +83,8 @@ def _rows_compared(found: Evaluation) -> Iterator[_Row]:
         for what, by_split in by_predictor.items():
             for split, error in by_split.items():
                 yield (table, split, what, quantity, ALL), error
+    for row in found.baselines:
+        yield ("baselines", row.split, row.baseline, row.quantity, ALL), row.errors
 
 
 COLUMNS = ("table", "split", "what", "quantity", "unit", "class", "count", "rmse", "mape_percent", "mape_count")
@@ -90,6 +102,37 @@ def _paper_figure(value: float | None) -> str:
 
 def _unit(measure: str, quantity: str) -> str:
     return "%" if measure == "mape_percent" else UNITS[quantity]
+
+
+def _baselines(found: Evaluation) -> Section:
+    """Return the model beside what is simplest, with the verdict in words before it."""
+    rows = []
+    for split in found.ordered_splits:
+        for quantity in QUANTITIES:
+            ours = found.splits[split].errors[quantity][ALL]
+            rows.append(
+                (split, quantity, "the model", *(_figure(ours, measure, quantity) for measure in MEASURES), "", "")
+            )
+            for row in found.baselines:
+                if (row.split, row.quantity) == (split, quantity):
+                    figures = (_figure(row.errors, measure, quantity) for measure in MEASURES)
+                    rows.append(("", "", row.baseline, *figures, _ratio(row.rmse_ratio), _ratio(row.mape_ratio)))
+    header = ("", "", "", "RMSE", "MAPE [%]", "ratio of RMSE", "ratio of MAPE")
+    text = (
+        "Fitted on the samples that the model was fitted on, measured on the same as it. Ratios are the model's error over the "
+        "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
+        "are told the turn of each metre, too. "
+    )
+    text += ". ".join(verdicts(found.baselines))
+    if not found.baselines:
+        return Section("Beside what is simplest")
+    return Section("Beside what is simplest", text, header=header, rows=rows, figures_from=3)
+
+
+def _ratio(ratio: Ratio) -> str:
+    if ratio.value is None:
+        return "–"
+    return f"{ratio.value:.2f}" + ("" if ratio.low is None else f" ({ratio.low:.2f} to {ratio.high:.2f})")
 
 
 def _by_class(found: Evaluation) -> list[Section]:

@@ -20,6 +20,9 @@ UNITS = {"w": "W", "v": "m/s", "T": "s", "E": "J"}
 LEAST = {"w": 10.0, "v": 0.05, "T": 0.05, "E": 10.0}
 """Labels below are in no percentage: 10 W is less than a Husky's drivers take at rest."""
 
+LEAST_VELOCITY_MPS = 0.05
+"""A predicted velocity is never below it, so that T = d / v stays finite: slower is standing."""
+
 ALL = "all"
 
 Costs = Mapping[str, Array]

@@ -29,6 +29,7 @@ from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.seals import broken_checksums, file_checksums, read_sealed, sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.architecture import check_trainable
+from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.tables.findings import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
@@ -47,9 +48,6 @@ FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
     "history.csv",
     "MODEL.md",
 )
-
-LEAST_VELOCITY_MPS = 0.05
-"""A predicted velocity is never below it, so that T = d / v stays finite: slower is standing."""
 
 _TOGETHER = 256
 

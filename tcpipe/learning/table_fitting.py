@@ -42,7 +42,7 @@ def fit_table(task: Task, config: FitConfig, *, name: str, key: str, patch_m: fl
 
     """
     split, scale, began = task.train, label_scale(task), time.perf_counter()
-    features = _features(split, patch_m, class_count)
+    features = features_of(split, patch_m, class_count)
     labels = labels_of(split, task.outputs).astype(np.float64)
     weighed = config.weights and split.weights.shape == labels.shape
     weights = split.weights.astype(np.float64) if weighed else np.ones_like(labels)
@@ -60,7 +60,7 @@ def fit_table(task: Task, config: FitConfig, *, name: str, key: str, patch_m: fl
     return Fitted(grown.forest.arrays(), (1.0,) * labels.shape[1], split, grown.held_out, progress, spent, "cpu")
 
 
-def _features(split: Split, patch_m: float, class_count: int) -> Floats:
+def features_of(split: Split, patch_m: float, class_count: int) -> Floats:
     """Return the features of all samples, shape (N, features); patches are formed some at a time."""
     parts = []
     for first in range(0, len(split), _READ_TOGETHER):

@@ -1,0 +1,197 @@
+"""The simplest that could do as well: what any model is shown beside, fitted on the samples that it was fitted on."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.dataset import Dataset, Split
+from tcpipe.dataset.beside import beside_of
+from tcpipe.errors import ModelError
+from tcpipe.learning.curves import Curves, Form, fit_curves
+from tcpipe.learning.evaluation_facts import SPLITS, Compared
+from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Array, Costs, costs, errors
+from tcpipe.learning.models import Model
+from tcpipe.learning.physics_model import fit_physics_model, standing_of
+from tcpipe.learning.predictions import Measured
+from tcpipe.learning.ratios import ratio_of_errors
+
+logger = logging.getLogger("tcpipe")
+
+CURVES: Mapping[Form, str] = {
+    "mean": "mean per class",
+    "linear": "class and slope, linear",
+    "spline": "class and slope, spline",
+}
+PHYSICS, TREES = "physics", "gradient boosting"
+SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
+
+_FEWEST_RUNS = 10
+"""Runs of a split that are drawn as wholes; of fewer, blocks of ground are."""
+
+Predictor = Callable[[Split], Array]
+"""Power [W] and velocity [m/s] of the samples of a split, shape (N, 2)."""
+
+
+def compared(
+    ours: Model, data: Dataset, sets: Mapping[str, Measured], said: Mapping[str, Costs], *, seed: int
+) -> tuple[list[Compared], list[str]]:
+    """Return the errors of every baseline on the very samples of a model's, with the ratios of the model's to them; and what lacks.
+
+    Parameters
+    ----------
+    ours, data
+        The model, and the dataset whose training samples the baselines are fitted on.
+    sets, said
+        What was measured, and what the model says of it, by split.
+    seed
+        Of the bootstrap.
+
+    """
+    kind = ours.card.training.config.model
+    own = {"table": TREES, "physics": PHYSICS}.get(kind)
+    train = _fitted_on(data["train"], ours)
+    if not len(train):
+        return [], ["no baselines: the dataset has no labelled samples in split train to fit them on"]
+    predictors, lacking = _baselines(train, ours, [name for name in SIMPLEST_FIRST if name != own])
+    logger.info("baselines: %s, fitted on %d samples", ", ".join(predictors), len(train))
+    found: list[Compared] = []
+    for split, part in sets.items():
+        drawn_by, groups = _groups(part.split, data.card.recipe.split.block_m)
+        for name, predict in predictors.items():
+            power, velocity = predict(part.split).T
+            theirs = costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), ours.chord_m)
+            found += _of_quantities(name, split, part, said[split], theirs, drawn_by, groups, seed)
+    return found, lacking
+
+
+def _fitted_on(train: Split, ours: Model) -> Split:
+    """Return the samples that a model of this kind is fitted on: without the fold that stops a network, unless there is no other."""
+    labelled = train.take(np.isfinite(train.labels).all(axis=1))
+    if ours.card.training.config.model != "resnet18":
+        return labelled
+    fitted, _ = labelled.fold(ours.card.training.config.fold)
+    return fitted if len(fitted) else labelled
+
+
+def _baselines(train: Split, ours: Model, wanted: Sequence[str]) -> tuple[dict[str, Predictor], list[str]]:
+    """Return the baselines by name, and a line for each that cannot be fitted."""
+    found, lacking = dict(_curves(train)), []
+    for name, fit in ((PHYSICS, _physics), (TREES, _trees)):
+        if name in wanted:
+            try:
+                found[name] = fit(train, ours)
+            except ModelError as error:
+                lacking.append(f"no baseline '{name}': {error.problems[0]}")
+    return found, lacking
+
+
+def _curves(train: Split) -> Iterator[tuple[str, Predictor]]:
+    labels, beside = train.labels.astype(np.float64), beside_of(train)
+    for form, name in CURVES.items():
+        curves = fit_curves(form, beside.slope_rad, beside.class_id, labels)
+
+        def predict(split: Split, curves: Curves = curves) -> Array:
+            there = beside_of(split)
+            return curves.predict(there.slope_rad, there.class_id)
+
+        yield name, predict
+
+
+def _physics(train: Split, ours: Model) -> Predictor:
+    del ours
+    fitted = fit_physics_model(beside_of(train), train.labels.astype(np.float64), standing_watt=standing_of(train))
+    return lambda split: fitted.predict(beside_of(split))
+
+
+def _trees(train: Split, ours: Model) -> Predictor:
+    """Return trees over features of all layers, and of the turn."""
+    from tcpipe.learning.forest import grow  # noqa: PLC0415  numba loads with it, and with the next
+    from tcpipe.learning.table_fitting import features_of  # noqa: PLC0415
+
+    folds, labels = train.column("fold"), train.labels.astype(np.float64)
+    if len(np.unique(folds)) < 2:
+        raise ModelError(
+            f"{len(train)} training samples are in one fold, wanted two or more to tell how many trees are best"
+        )
+
+    def features(split: Split) -> Array:
+        return np.column_stack(
+            [features_of(split, ours.patch_m, ours.classes.count), np.nan_to_num(beside_of(split).turn_radpm)]
+        )
+
+    forest = grow(features(train), labels, np.ones_like(labels), folds).forest
+    return lambda split: forest.predict(features(split))
+
+
+def _groups(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:
+    """Return what errs alike: runs where there are enough, else blocks of ground."""
+    runs = split.column("run_id").astype(np.str_)
+    if len(np.unique(runs)) >= _FEWEST_RUNS:
+        return "runs", runs
+    middle = (split.column(f"{end}_{axis}_m").astype(np.float64) for axis in "xy" for end in ("start", "end"))
+    x0, x1, y0, y1 = middle
+    places = np.floor(np.column_stack([x0 + x1, y0 + y1]) / (2.0 * block_m))
+    return "blocks", np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def _of_quantities(  # noqa: PLR0917
+    name: str, split: str, part: Measured, ours: Costs, theirs: Costs,
+    drawn_by: Literal["runs", "blocks"], groups: NDArray[np.generic], seed: int,
+) -> Iterator[Compared]:  # fmt: skip
+    for quantity, measured in part.costs.items():
+        large = measured >= LEAST[quantity]
+        off, other = (np.abs(costs_of[quantity] - measured) for costs_of in (ours, theirs))
+        over = np.where(large, measured, 1.0)
+        yield Compared(
+            baseline=name, split=split, quantity=quantity,
+            errors=errors(theirs[quantity], measured, LEAST[quantity]),
+            rmse_ratio=ratio_of_errors(off**2, other**2, groups, power=0.5, seed=seed),
+            mape_ratio=ratio_of_errors(off[large] / over[large], other[large] / over[large], groups[large], power=1.0, seed=seed),
+            groups=len(np.unique(groups)), drawn_by=drawn_by,
+        )  # fmt: skip
+
+
+def verdicts(found: Sequence[Compared]) -> list[str]:
+    """Return in words, for energy and time of each split, whether the model is better than the simplest, and by how much."""
+    lines = []
+    for split in SPLITS:
+        for quantity, called in (("E", "energy E"), ("T", "time T")):
+            rows = [
+                row
+                for row in found
+                if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None
+            ]
+            if rows:
+                lines.append(f"{split}, {called}: {_verdict(rows)}")
+    return lines
+
+
+def _verdict(rows: Sequence[Compared]) -> str:
+    best = min(rows, key=lambda row: row.errors.rmse or 0.0)
+    ratio = best.rmse_ratio
+    if ratio.low is None or ratio.high is None:
+        return (
+            f"best baseline is '{best.baseline}', RMSE of the model {ratio.value:.2f} of its; "
+            f"{best.groups} {best.drawn_by} are too few to say how sure that is"
+        )
+    sure = (
+        f"RMSE {ratio.value:.2f} of its, 95 %: {ratio.low:.2f} to {ratio.high:.2f} over {best.groups} {best.drawn_by}"
+    )
+    if ratio.high < 1.0:
+        by = 100.0 * (1.0 - (ratio.value or 0.0))
+        return f"the model is better than every baseline, than the best, '{best.baseline}', by {by:.0f} % ({sure})"
+    equal = next(
+        name for name in SIMPLEST_FIRST for row in rows
+        if row.baseline == name and not (row.rmse_ratio.high is not None and row.rmse_ratio.high < 1.0)
+    )  # fmt: skip
+    simplest = (
+        "" if equal == best.baseline else f"; already '{equal}' is no worse than the model, as far as can be told"
+    )
+    if ratio.low > 1.0:
+        return f"'{best.baseline}' is better than the model by {100.0 * (1.0 - 1.0 / (ratio.value or 1.0)):.0f} % ({sure}){simplest}"
+    return f"the model and '{best.baseline}' cannot be told apart ({sure}){simplest}"

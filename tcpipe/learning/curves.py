@@ -1,0 +1,85 @@
+"""Curves over the slope, one a terrain class: the fewest numbers that a model of a metre's cost can do with.
+
+A curve is a sum of few functions of the slope; its numbers are found by least squares, in closed form. Where a class has few samples its
+curve lies near that of all ground: the difference counts as if as many samples as it has numbers had told that there is none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Form: TypeAlias = Literal["mean", "linear", "spline"]
+
+_KNOTS: dict[Form, tuple[float, ...]] = {
+    "mean": (), "linear": (1 / 3, 2 / 3), "spline": (0.05, 0.23, 0.41, 0.59, 0.77, 0.95),
+}  # fmt: skip
+"""Quantiles of the slopes: a straight line in each third, of four numbers, and six knots, of six.
+
+Those of the spline are Harrell's (Regression Modeling Strategies, 2015, 2.4.6)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curves:
+    """What least squares found, as arrays."""
+
+    form: Form
+    knots_rad: Floats
+    pooled: Floats
+    """Of all ground, and of classes that are not known, shape (J, outputs)."""
+    class_id: NDArray[np.int64]
+    own: Floats
+    """Of each of these classes, shape (classes, J, outputs)."""
+
+    def predict(self, slope_rad: Floats, class_id: NDArray[np.int64]) -> Floats:
+        """Return outputs, shape (N, outputs), of metres of ground."""
+        made = _functions(self.form, self.knots_rad, slope_rad)
+        out = made @ self.pooled
+        for known, numbers in zip(self.class_id.tolist(), self.own, strict=True):
+            out[class_id == known] = made[class_id == known] @ numbers
+        return out
+
+
+def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats) -> Curves:
+    """Fit a curve of every class.
+
+    Parameters
+    ----------
+    form
+        ``mean``: one number; ``linear``: straight in each third of the slopes; ``spline``: natural cubic.
+    slope_rad, class_id
+        Of the samples, finite, shape (N,), N at least 1.
+    labels
+        Finite, shape (N, outputs).
+
+    """
+    knots = np.unique(np.quantile(slope_rad, _KNOTS[form])) if _KNOTS[form] else np.empty(0)
+    made = _functions(form, knots, slope_rad)
+    pooled = np.asarray(np.linalg.lstsq(made, labels, rcond=None)[0], np.float64)
+    drawn = made.T @ made * (made.shape[1] / len(made))
+    classes = np.unique(class_id[class_id > 0])
+    own = np.empty((len(classes), *pooled.shape))
+    for at, known in enumerate(classes):
+        mine, off = made[class_id == known], (labels - made @ pooled)[class_id == known]
+        own[at] = pooled + np.linalg.pinv(mine.T @ mine + drawn, hermitian=True) @ (mine.T @ off)
+    return Curves(form, knots, pooled, classes, own)
+
+
+def _functions(form: Form, knots_rad: Floats, slope_rad: Floats) -> Floats:
+    """Return the functions of a form at these slopes, shape (N, J); all of order one, so that none is lost beside another."""
+    one = np.ones_like(slope_rad)
+    if form == "mean" or not knots_rad.size:
+        return one[:, None]
+    width = max(float(np.ptp(knots_rad)), 1e-6)
+    slope, knots = (slope_rad - knots_rad[0]) / width, (knots_rad - knots_rad[0]) / width
+    beyond = np.maximum(slope[:, None] - knots, 0.0)
+    if form == "linear" or knots.size < 3:
+        return np.column_stack([one, slope, beyond])
+    cubes = beyond**3  # natural: what bends beyond the last knot is taken out (Harrell, eq. 2.25)
+    last = knots[-1] - knots[-2]
+    bent = cubes[:, :-2] - np.outer(cubes[:, -2], knots[-1] - knots[:-2]) / last
+    return np.column_stack([one, slope, bent + np.outer(cubes[:, -1], knots[-2] - knots[:-2]) / last])

@@ -1,0 +1,118 @@
+"""What a model is shown beside: fitted on its samples, measured on the same, and said in words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_models import CARD
+
+from tcpipe.dataset import Split, open_dataset
+from tcpipe.learning.baselines import SIMPLEST_FIRST, compared, verdicts
+from tcpipe.learning.evaluation_facts import Compared
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.metrics import Errors, costs
+from tcpipe.learning.models import Model
+from tcpipe.learning.predictions import measured
+from tcpipe.learning.ratios import Ratio
+
+
+@pytest.fixture(scope="module")
+def sets(dataset):
+    data = open_dataset(dataset)
+    names = {entry.id: entry.name for entry in data.card.classes}
+    return data, {name: measured(data[name], names) for name in ("test", "unseen")}
+
+
+def said_by(sets, factor=1.0):
+    """A model that says every label times a factor."""
+    return {
+        name: costs(factor * part.costs["w"], part.costs["v"], 1.0) | {"E": factor * part.costs["E"]}
+        for name, part in sets.items()
+    }
+
+
+def model_of(kind="resnet18"):
+    own = replace(CARD, training=replace(CARD.training, config=FitConfig(model=kind)))
+    return Model("made", own, None, "0")
+
+
+@pytest.fixture(scope="module")
+def found(sets):
+    pytest.importorskip("lightgbm")
+    data, parts = sets
+    return compared(model_of(), data, parts, said_by(parts, 1.1), seed=0)
+
+
+def test_the_mean_of_each_class_by_hand(found, sets):
+    data, parts = sets
+    rows, lacking = found
+    assert lacking == []
+    assert {row.baseline for row in rows} == set(SIMPLEST_FIRST)
+    fitted, test = data["train"].fold(0)[0], parts["test"]
+    power = {known: fitted.labels[fitted.column("terrain_class") == known, 0] for known in np.unique(test.class_ids)}
+    told = np.array([power[known].mean() for known in test.class_ids])
+    row = next(row for row in rows if (row.baseline, row.split, row.quantity) == ("mean per class", "test", "w"))
+    off = np.sqrt(np.mean((told - test.costs["w"]) ** 2))
+    assert row.errors.rmse == pytest.approx(off, rel=0.02)  # drawn a little to the mean of all
+    ours = np.sqrt(np.mean((0.1 * test.costs["w"]) ** 2))
+    assert row.rmse_ratio.value == pytest.approx(ours / off, rel=0.02)
+    assert row.mape_ratio.value == pytest.approx(0.1 / np.mean(np.abs(told / test.costs["w"] - 1.0)), rel=0.02)
+    assert row.errors.count == len(test.split)
+
+
+def test_two_runs_are_too_few_so_blocks_of_ground_are_drawn(found, sets):
+    rows, _ = found
+    test = sets[1]["test"].split
+    middle = np.column_stack([test.column(f"start_{of}_m") + test.column(f"end_{of}_m") for of in "xy"]) / 2.0
+    blocks = {tuple(place) for place in np.floor(middle / 10.0).tolist()}
+    row = next(row for row in rows if row.split == "test")
+    assert (row.drawn_by, row.groups) == ("blocks", len(blocks))
+
+
+def test_a_model_is_not_its_own_baseline(sets):
+    data, parts = sets
+    rows, _ = compared(model_of("table"), data, parts, said_by(parts), seed=0)
+    assert "gradient boosting" not in {row.baseline for row in rows}
+
+
+def test_what_cannot_be_fitted_is_said(sets, monkeypatch):
+    data, parts = sets
+    real = Split.column
+    monkeypatch.setattr(
+        Split, "column", lambda split, name: np.zeros(len(split)) if name == "fold" else real(split, name)
+    )
+    rows, lacking = compared(model_of(), data, parts, said_by(parts), seed=0)
+    assert any("no baseline 'gradient boosting'" in line and "in one fold" in line for line in lacking)
+    assert {row.baseline for row in rows} == set(SIMPLEST_FIRST) - {"gradient boosting"}
+    monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), np.nan, np.float32)))
+    assert compared(model_of(), data, parts, {}, seed=0)[0] == []
+
+
+def row(baseline, rmse, ratio, quantity="E"):
+    return Compared(
+        baseline=baseline, split="unseen", quantity=quantity, errors=Errors(50, rmse, 5.0, 50), rmse_ratio=ratio,
+        mape_ratio=ratio, groups=34, drawn_by="runs",
+    )  # fmt: skip
+
+
+def test_who_is_better_is_said_in_words():
+    mean, linear = (
+        row("mean per class", 9.0, Ratio(0.5, 0.4, 0.6)),
+        row("class and slope, linear", 5.0, Ratio(0.9, 0.8, 0.97)),
+    )
+    assert verdicts([mean, linear])[0] == (
+        "unseen, energy E: the model is better than every baseline, than the best, 'class and slope, linear', by 10 % "
+        "(RMSE 0.90 of its, 95 %: 0.80 to 0.97 over 34 runs)"
+    )
+    trees = row("gradient boosting", 4.0, Ratio(1.25, 1.1, 1.4))
+    assert verdicts([mean, linear, trees])[0].startswith(
+        "unseen, energy E: 'gradient boosting' is better than the model by 20 % (RMSE 1.25"
+    )
+    alike = row("class and slope, spline", 4.5, Ratio(1.02, 0.95, 1.1))
+    told = verdicts([mean, alike, trees])[0]
+    assert told.endswith("already 'class and slope, spline' is no worse than the model, as far as can be told")
+    assert verdicts([mean, alike])[0].startswith(
+        "unseen, energy E: the model and 'class and slope, spline' cannot be told apart"
+    )
+    assert "34 runs are too few" in verdicts([row("physics", 5.0, Ratio(0.5, None, None))])[0]
+    assert verdicts([row("physics", 5.0, Ratio(None, None, None))]) == []

@@ -1,0 +1,65 @@
+"""The model of physics: a robot of known coefficients is found again, with turns and unknown ground."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from tcpipe.dataset.beside import Beside
+from tcpipe.errors import ModelError
+from tcpipe.learning.physics_model import fit_physics_model, physics_model_of
+
+COUNT = 600
+
+
+def drive(seed=0, count=COUNT):
+    """A robot of 50 W, 400 N a rise, 30 or 60 N of rolling, 80 J/rad; it is slower uphill."""
+    rng = np.random.default_rng(seed)
+    class_id, slope, turn = rng.choice([4, 6], count), rng.uniform(-0.05, 0.25, count), rng.exponential(0.1, count)
+    velocity = np.where(class_id == 4, 0.8, 0.9) - 1.0 * slope
+    rolling = np.where(class_id == 4, 60.0, 30.0)
+    power = 50.0 + velocity * (rolling + 400.0 * np.tan(slope) + 80.0 * turn)
+    return Beside(class_id, slope, turn, np.full(count, np.nan)), np.column_stack([power, velocity])
+
+
+def test_a_robot_is_found_again():
+    beside, labels = drive()
+    model = fit_physics_model(beside, labels, standing_watt=50.0)
+    assert model.standing_watt == pytest.approx(50.0, rel=0.01)
+    assert model.grade_newton == pytest.approx(400.0, rel=0.01)
+    assert model.rolling_newton[[4, 6]] == pytest.approx([60.0, 30.0], rel=0.02)
+    assert model.turning_joule_per_rad[[4, 6]] == pytest.approx(80.0, rel=0.02)
+    other, told = drive(seed=1)
+    assert model.predict(other) == pytest.approx(told, rel=0.01)
+
+
+def test_what_is_not_known_is_as_usual():
+    beside, labels = drive()
+    model = fit_physics_model(beside, labels, standing_watt=50.0)
+    unknown = replace(beside, turn_radpm=np.full(COUNT, np.nan))
+    usual = replace(beside, turn_radpm=np.full(COUNT, np.median(beside.turn_radpm)))
+    assert model.predict(unknown) == pytest.approx(model.predict(usual))
+    elsewhere = model.predict(Beside(np.array([2]), np.array([0.0]), np.array([0.0]), np.array([np.nan])))[0]
+    assert 50.0 + 30.0 * 0.7 < elsewhere[0] < 50.0 + 60.0 * 1.0
+    assert 0.75 < elsewhere[1] < 0.95
+
+
+def test_without_turns_in_the_data_there_is_no_term_for_them():
+    beside, labels = drive()
+    blind = replace(beside, turn_radpm=np.full(COUNT, np.nan))
+    assert not fit_physics_model(blind, labels, standing_watt=None).turning_joule_per_rad.any()
+
+
+def test_arrays_there_and_back():
+    beside, labels = drive()
+    model = fit_physics_model(beside, labels, standing_watt=50.0)
+    again = physics_model_of(model.arrays(), "weights.npz")
+    assert again.predict(beside) == pytest.approx(model.predict(beside), abs=0.0)
+    with pytest.raises(ModelError, match="weights of another model"):
+        physics_model_of({"feature": np.zeros(3)}, "weights.npz")
+
+
+def test_too_few_samples_are_said():
+    beside, labels = drive(count=19)
+    with pytest.raises(ModelError, match="19 samples to fit physics to, wanted at least 20"):
+        fit_physics_model(beside, labels, standing_watt=None)
