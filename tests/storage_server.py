@@ -1,5 +1,6 @@
-"""An object store in a directory, over HTTP: as much of S3 as reading and listing objects takes."""
+"""An object store in a directory, over HTTP: as much of S3 as a place takes, without authentication."""
 
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,50 +8,110 @@ from email.utils import formatdate
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import parse_qs, unquote, urlsplit
-from xml.sax.saxutils import escape
+from xml.sax.saxutils import escape, unescape
 
 FORBIDDEN = "forbidden"
 """The bucket that nobody may read."""
+
+READ_ONLY = "read-only"
+OVERWRITING = "overwriting"
+"""A bucket that takes no notice of put-if-absent."""
+
+
+class _Server(ThreadingHTTPServer):
+    def __init__(self, root: Path) -> None:
+        super().__init__(("127.0.0.1", 0), _Handler)
+        self.root = root
+        self.fetched: list[str] = []
+        self.writing = threading.Lock()
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: "_Server"
+
+    def do_HEAD(self) -> None:
+        self._answer(with_body=False)
+
+    def do_GET(self) -> None:
+        self._answer(with_body=True)
+
+    def do_PUT(self) -> None:
+        data = self.rfile.read(int(self.headers["Content-Length"]))
+        bucket, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
+        path = self.server.root / bucket / name
+        if bucket == READ_ONLY:
+            self._send(403, b"<Error><Code>AccessDenied</Code></Error>")
+        elif not path.exists() or bucket == OVERWRITING or self.headers["If-None-Match"] != "*":
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with self.server.writing:
+                new = path.with_name(f".{threading.get_ident()}")
+                new.write_bytes(data)
+                new.rename(path)
+            self._send(200, b"")
+        else:
+            self._send(412, b"<Error><Code>PreconditionFailed</Code></Error>")
+
+    def do_DELETE(self) -> None:
+        (self.server.root / unquote(urlsplit(self.path).path).lstrip("/")).unlink(missing_ok=True)
+        self._send(204, b"")
+
+    def do_POST(self) -> None:
+        text = self.rfile.read(int(self.headers["Content-Length"])).decode()
+        bucket = urlsplit(self.path).path.lstrip("/")
+        names = re.findall("<Key>(.*?)</Key>", text)
+        for name in names:
+            (self.server.root / bucket / unescape(name)).unlink(missing_ok=True)
+        deleted = "".join(f"<Deleted><Key>{name}</Key></Deleted>" for name in names)
+        self._send(200, f"<DeleteResult>{deleted}</DeleteResult>".encode())
+
+    def _answer(self, *, with_body: bool) -> None:
+        parts = urlsplit(self.path)
+        bucket, _, name = unquote(parts.path).lstrip("/").partition("/")
+        if bucket == FORBIDDEN:
+            self._send(403, b"<Error><Code>AccessDenied</Code></Error>")
+        elif not name and with_body:
+            self._list(self.server.root / bucket, parse_qs(parts.query))
+        elif (self.server.root / bucket / name).is_file():
+            self.server.fetched.extend([name] if with_body else [])
+            self._send_part((self.server.root / bucket / name).read_bytes(), with_body=with_body)
+        else:
+            self._send(404, b'<?xml version="1.0"?>\n<Error><Code>NoSuchKey</Code></Error>', with_body=with_body)
+
+    def _list(self, bucket: Path, query: dict[str, list[str]]) -> None:
+        if bucket.is_dir():
+            self._send(200, _listing(bucket, query.get("prefix", [""])[0], query.get("delimiter", [""])[0]))
+        else:
+            self._send(404, b"<Error><Code>NoSuchBucket</Code></Error>")
+
+    def _send_part(self, data: bytes, *, with_body: bool) -> None:
+        wanted = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers["Range"] or "")
+        if wanted is None:
+            self._send(200, data, with_body=with_body)
+        elif (start := int(wanted[1])) >= len(data):
+            self._send(416, b"<Error><Code>InvalidRange</Code></Error>")
+        else:
+            end = min(int(wanted[2]) + 1, len(data))
+            self._send(206, data[start:end], {"Content-Range": f"bytes {start}-{end - 1}/{len(data)}"})
+
+    def _send(self, status: int, body: bytes, more: dict[str, str] | None = None, *, with_body: bool = True) -> None:
+        self.send_response(status)
+        for key, value in (more or {}).items():
+            self.send_header(key, value)
+        self.send_header("Content-Length", str(len(body)))
+        self.send_header("Last-Modified", formatdate(1_600_000_000, usegmt=True))
+        self.send_header("ETag", '"1"')
+        self.end_headers()
+        if with_body:
+            self.wfile.write(body)
+
+    def log_message(self, *_: object) -> None:
+        """Say nothing."""
 
 
 @contextmanager
 def object_store(root: Path) -> Iterator[tuple[dict[str, str], list[str]]]:
     """Serve each directory below ``root`` as a bucket; yield the environment that leads there, and the objects fetched so far."""
-    fetched: list[str] = []
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_HEAD(self) -> None:
-            self._answer(with_body=False)
-
-        def do_GET(self) -> None:
-            self._answer(with_body=True)
-
-        def _answer(self, *, with_body: bool) -> None:
-            parts = urlsplit(self.path)
-            bucket, _, name = unquote(parts.path).lstrip("/").partition("/")
-            if bucket == FORBIDDEN:
-                self._send(403, b"<Error><Code>AccessDenied</Code></Error>")
-            elif not name and with_body:
-                self._send(200, _listing(root / bucket, parse_qs(parts.query).get("prefix", [""])[0]))
-            elif (root / bucket / name).is_file():
-                fetched.extend([name] if with_body else [])
-                self._send(200, (root / bucket / name).read_bytes(), with_body=with_body)
-            else:
-                self._send(404, b'<?xml version="1.0"?>\n<Error><Code>NoSuchKey</Code></Error>', with_body=with_body)
-
-        def _send(self, status: int, body: bytes, *, with_body: bool = True) -> None:
-            self.send_response(status)
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Last-Modified", formatdate(1_600_000_000, usegmt=True))
-            self.send_header("ETag", '"1"')
-            self.end_headers()
-            if with_body:
-                self.wfile.write(body)
-
-        def log_message(self, *_: object) -> None:
-            """Say nothing."""
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    server = _Server(root)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()
     environment = {
@@ -60,19 +121,23 @@ def object_store(root: Path) -> Iterator[tuple[dict[str, str], list[str]]]:
         "NO_PROXY": "127.0.0.1",
     }
     try:
-        yield environment, fetched
+        yield environment, server.fetched
     finally:
         server.shutdown()
         thread.join()
         server.server_close()
 
 
-def _listing(bucket: Path, prefix: str) -> bytes:
-    names = sorted(str(path.relative_to(bucket)) for path in bucket.rglob("*") if path.is_file())
+def _listing(bucket: Path, prefix: str, delimiter: str) -> bytes:
+    names = sorted(path.relative_to(bucket).as_posix() for path in bucket.rglob("*") if path.is_file())
+    names = [name for name in names if name.startswith(prefix)]
+    deeper = {name for name in names if delimiter and delimiter in name[len(prefix) :]}
     contents = "".join(
         f"<Contents><Key>{escape(name)}</Key><LastModified>2020-09-13T12:26:40.000Z</LastModified>"
         f"<Size>{(bucket / name).stat().st_size}</Size></Contents>"
         for name in names
-        if name.startswith(prefix)
+        if name not in deeper
     )
+    folders = sorted({prefix + name[len(prefix) :].partition(delimiter)[0] + delimiter for name in deeper})
+    contents += "".join(f"<CommonPrefixes><Prefix>{escape(name)}</Prefix></CommonPrefixes>" for name in folders)
     return f"<ListBucketResult><IsTruncated>false</IsTruncated>{contents}</ListBucketResult>".encode()

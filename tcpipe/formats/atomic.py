@@ -110,32 +110,61 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
-def put_file(path: Path, text: str, *, staging: Path) -> bool:
-    """Write a text file where there is none; of several writers the first wins. Return whether this one did.
+def put_file(path: Path, data: bytes, *, staging: Path, over: bool = False) -> bool:
+    """Write a file where there is none, or ``over`` what is there; of several writers the first wins. Return whether this one did.
 
     ``staging`` is a directory of the same file system, above ``path``: what a killed process leaves behind lies there, and goes with the
     next call.
     """
-    with _told(path), _parents_of(path) as place, _holder_beside(Path(os.path.realpath(staging), "new")) as holder:
-        temporary = holder / "new"
-        _write_synced(os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666), text)
-        try:
-            os.link(temporary, place)
-        except FileExistsError:
+    with _told(path), _parents_of(path) as place, working_directory(staging) as directory:
+        temporary = directory / "new"
+        _write_synced(os.open(temporary, os.O_WRONLY | os.O_CREAT, 0o666), data)
+        if over:
+            temporary.replace(place)
+        elif not _linked(temporary, place, data):
             return False
-        except OSError:  # a file system without hard links: whoever creates it
-            try:
-                descriptor = os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
-            except FileExistsError:
-                return False
-            _write_synced(descriptor, text)
         _sync_directory(place.parent)
     return True
 
 
-def _write_synced(descriptor: int, text: str) -> None:
-    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
-        stream.write(text)
+def _linked(temporary: Path, place: Path, data: bytes) -> bool:
+    try:
+        os.link(temporary, place)
+    except FileExistsError:
+        return False
+    except OSError:  # a file system without hard links: whoever creates it
+        try:
+            descriptor = os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+        except FileExistsError:
+            return False
+        _write_synced(descriptor, data)
+    return True
+
+
+@contextmanager
+def working_directory(staging: Path) -> Iterator[Path]:
+    """Yield an empty directory among the temporaries in ``staging``; it goes in the end, or with the next call if this one is killed."""
+    with _holder_beside(Path(os.path.realpath(staging), "new")) as holder:
+        directory = holder / "new"
+        directory.mkdir()
+        yield directory
+
+
+def put_directory(directory: Path, path: Path) -> None:
+    """Put a directory, from a `working_directory` of the same file system, to its place by one rename; what is there goes."""
+    with _told(path), _parents_of(path) as place:
+        for above, _, files in os.walk(directory):
+            for name in files:
+                with (Path(above) / name).open("rb") as stream:
+                    os.fsync(stream.fileno())
+        with exclusive(place.parent):
+            _take_place(directory, place, before="old")
+        _sync_directory(place.parent)
+
+
+def _write_synced(descriptor: int, data: bytes) -> None:
+    with os.fdopen(descriptor, "wb") as stream:
+        stream.write(data)
         stream.flush()
         os.fsync(stream.fileno())
 
@@ -289,7 +318,7 @@ def _claimed(holder: Path, act: Callable[[], object]) -> bool:
     return False
 
 
-def _take_place(temporary: Path, place: Path) -> None:
+def _take_place(temporary: Path, place: Path, before: str = _BEFORE) -> None:
     """Rename ``temporary`` to ``place``; if something is there they change places, in one step where the system can."""
     if not place.exists():
         try:
@@ -301,12 +330,12 @@ def _take_place(temporary: Path, place: Path) -> None:
             return
     if _exchanged(temporary, place):
         return
-    before = temporary.with_name(_BEFORE)
-    place.rename(before)
+    old = temporary.with_name(before)
+    place.rename(old)
     try:
         temporary.rename(place)
     except OSError:
-        before.rename(place)
+        old.rename(place)
         raise
 
 

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
-from tcpipe.errors import LogError
+from tcpipe.errors import LogError, TcpipeError
 from tcpipe.formats.logs.log_part import no_room
 
 if TYPE_CHECKING:
@@ -27,9 +27,15 @@ _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)
 _PIECE_BYTES = 1 << 24
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
-_RETRIES: dict[str, Any] = {"max_retries": 3, "retry_timeout": timedelta(seconds=30)}
-_UNKNOWN = ("169.254.169.254", "Account must be specified")
-"""What is said where no credentials are set: a cloud machine's own are asked for, in vain."""
+_RETRIES: dict[str, Any] = {
+    "max_retries": 6,
+    "retry_timeout": timedelta(seconds=30),
+    "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2},
+}
+"""A store that does not answer is told after less than 5 s."""
+_DENIED = ("169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden")
+"""What is said where credentials are not set (a cloud machine's own are asked for, in vain), or wrong."""
+_CODE = re.compile(r"<Code>(\w+)</Code>")
 _CREDENTIALS = {
     "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for what is public; AWS_REGION; AWS_ENDPOINT_URL",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for what is public",
@@ -101,8 +107,8 @@ def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Pa
 def _laid_out(
     url: str, directory: Path, wanted: Callable[[str], bool], lay: Callable[[ObjectStore, RemoteFile, Path], None]
 ) -> Path:
-    with _told(url):
-        store, name = _opened(url)
+    with told(url):
+        store, name = connected(url)
         found = list(_found(store, name, wanted))
         if not found:
             raise LogError(f"{url}: there is no such object, and no log below it")
@@ -114,21 +120,34 @@ def _laid_out(
 
 
 @contextmanager
-def _told(url: str) -> Iterator[None]:
-    """Turn what goes wrong into one line."""
-    from obstore.exceptions import BaseError, PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
+def told(url: str, error: type[TcpipeError] = LogError, *, what: str = "read") -> Iterator[None]:
+    """Turn what goes wrong while an object is ``read`` or ``written`` into one line; that it is not there passes as `FileNotFoundError`."""
+    from obstore.exceptions import BaseError  # noqa: PLC0415
 
     try:
         yield
-    except (BaseError, OSError, ValueError) as error:
-        reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-        reason = reason.partition(": <?xml")[0]
-        reason = no_room(error) or reason
-        scheme = url.partition("://")[0].lower()
-        denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in reason for of in _UNKNOWN)
-        if denied and scheme in _CREDENTIALS:
-            reason = f"the store wants credentials; set {_CREDENTIALS[scheme]}"
-        raise LogError(f"{url}: it cannot be read ({reason})") from None
+    except (BaseError, OSError, ValueError) as found:
+        code = _CODE.search(str(found))
+        if isinstance(found, FileNotFoundError) and error is not LogError and not (code and code[1] == "NoSuchBucket"):
+            raise
+        raise error(f"{url}: it cannot be {what} ({_reason(url, found, code and code[1], what)})") from None
+
+
+def _reason(url: str, error: Exception, code: str | None, what: str) -> str:
+    """Return in words what a store, or the operating system, answered."""
+    from obstore.exceptions import PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
+
+    reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    reason = reason.partition(": <?xml")[0]
+    scheme = url.partition("://")[0].lower()
+    denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in reason for of in _DENIED)
+    if code == "NoSuchBucket":
+        return "there is no such bucket"
+    if denied and code == "AccessDenied" and what == "written":
+        return "the credentials that are set do not allow it"
+    if denied and scheme in _CREDENTIALS:
+        return f"the store wants credentials; set {_CREDENTIALS[scheme]}"
+    return no_room(error) or reason
 
 
 def _refuse_endpoints_that_are_none(scheme: str) -> None:
@@ -139,7 +158,7 @@ def _refuse_endpoints_that_are_none(scheme: str) -> None:
             raise ValueError(f"{name} is {value!r}, wanted http://host or https://host, with :port where it has one")
 
 
-def _opened(url: str) -> tuple[ObjectStore, str]:
+def connected(url: str) -> tuple[ObjectStore, str]:
     """Return the store, and the name of the object or prefix in it."""
     import obstore  # noqa: PLC0415
 
@@ -156,7 +175,7 @@ def _opened(url: str) -> tuple[ObjectStore, str]:
     name = unquote(name) if scheme in _PERCENT_ENCODED else name
     options: dict[str, Any] = {} if scheme == "file" else {"retry_config": _RETRIES}
     if scheme != "file":  # who names an endpoint without TLS means it
-        options["client_options"] = {"allow_http": True, "connect_timeout": timedelta(seconds=5)}
+        options["client_options"] = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
     return obstore.store.from_url(f"{scheme}://{container}", **options), name
 
 

@@ -59,7 +59,7 @@ def put_record(root: Path, name: str, value: object) -> bool:
     clear(root)
     if read_record(root, name, type(value)) is not None:
         return False
-    if put_file(path, to_json(sealed(value)), staging=root):
+    if put_file(path, to_json(sealed(value)).encode(), staging=root):
         return True
     if read_record(root, name, type(value)) is not None:  # another process was faster
         return False

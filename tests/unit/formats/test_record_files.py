@@ -80,7 +80,7 @@ def test_a_file_system_without_hard_links(tmp_path, monkeypatch):
 
     monkeypatch.setattr(os, "link", refused)
     path = tmp_path / "kind" / "fact.json"
-    assert [put_file(path, text, staging=tmp_path) for text in ("first", "second")] == [True, False]
+    assert [put_file(path, text, staging=tmp_path) for text in (b"first", b"second")] == [True, False]
     assert path.read_text() == "first"
 
 

@@ -1,0 +1,206 @@
+"""A place in object storage: a prefix of a bucket, through obstore (S3, Google, Azure)."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.content_cache import cached
+from tcpipe.formats.object_storage import connected, is_url, told
+from tcpipe.formats.place import DirectoryPlace, Entry, Place
+from tcpipe.formats.seals import Checksum
+
+if TYPE_CHECKING:
+    from obstore.store import ObjectStore
+
+_PIECE_BYTES = 1 << 24
+_UPLOADS = 8
+"""Files that are on their way at once."""
+
+_SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
+
+
+def open_place(path: str | Path) -> Place:
+    """Return the place that a path or a URL names; nothing is asked of it yet."""
+    return BucketPlace(str(path).rstrip("/")) if is_url(path) else DirectoryPlace(Path(path))
+
+
+@dataclass(frozen=True, slots=True)
+class BucketPlace:
+    """What lies below a URL; it is connected to when it is first asked, in each process anew."""
+
+    url: str
+
+    def where(self, name: str = "") -> str:
+        """Return a URL."""
+        return f"{self.url}/{name}" if name else self.url
+
+    def below(self, prefix: str) -> BucketPlace:
+        """Return the place whose names begin with ``prefix/`` here."""
+        return BucketPlace(f"{self.url}/{prefix}")
+
+    def check(self) -> None:
+        """Raise `StoreError` where nothing can be listed here."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store()
+        with told(self.url, StoreError):
+            next(iter(obstore.list(store, prefix=key or None, chunk_size=1)), None)
+
+    def read(self, name: str) -> bytes | None:
+        """Return a whole object; None where there is none."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(name)
+        with suppress(FileNotFoundError), told(self.where(name), StoreError):
+            return bytes(obstore.get(store, key).bytes())
+        return None
+
+    def read_range(self, name: str, start: int, size: int) -> bytes:
+        """Return ``size`` bytes from ``start`` on."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(name)
+        with _gone(self.where(name)), told(self.where(name), StoreError):
+            return bytes(obstore.get_range(store, key, start=start, length=size)) if size else b""
+
+    def size(self, name: str) -> int | None:
+        """Return how large an object is [byte]."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(name)
+        with suppress(FileNotFoundError), told(self.where(name), StoreError):
+            return int(obstore.head(store, key)["size"])
+        return None
+
+    def entries(self, prefix: str = "") -> list[Entry]:
+        """Return the objects below ``prefix/``, by name; so many a request that a large store takes few."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(prefix)
+        cut = len(self._store()[1]) + 1 if self._store()[1] else 0
+        with told(self.where(prefix), StoreError):
+            found = [meta for batch in obstore.list(store, prefix=key or None) for meta in batch]
+        entries = (
+            Entry(meta["path"][cut:], meta["size"], round(meta["last_modified"].timestamp() * 1e6) * 1000)
+            for meta in found
+        )
+        return sorted(entries, key=lambda entry: entry.name)
+
+    def folders(self, prefix: str = "") -> list[str]:
+        """Return the first parts of names of more parts below ``prefix/``."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(prefix)
+        with told(self.where(prefix), StoreError):
+            found = obstore.list_with_delimiter(store, prefix=key or None)["common_prefixes"]
+        return sorted(name.rpartition("/")[2] for name in found)
+
+    def put(self, name: str, data: bytes) -> None:
+        """Write an object."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(name)
+        with told(self.where(name), StoreError, what="written"):
+            obstore.put(store, key, data, use_multipart=False)
+
+    def put_new(self, name: str, data: bytes) -> bool:
+        """Write an object by a conditional request."""
+        import obstore  # noqa: PLC0415
+        from obstore.exceptions import AlreadyExistsError  # noqa: PLC0415
+
+        store, key = self._store(name)
+        with told(self.where(name), StoreError, what="written"):
+            try:
+                obstore.put(store, key, data, mode="create", use_multipart=False)
+            except AlreadyExistsError:
+                return False
+        return True
+
+    def workshop(self) -> AbstractContextManager[Path]:
+        """Return a context: a temporary directory of this machine."""
+        return _temporary_directory()
+
+    def put_files(self, prefix: str, directory: Path) -> None:
+        """Upload the files of a directory, several at once."""
+        import obstore  # noqa: PLC0415
+
+        def upload(path: Path) -> None:
+            name = f"{prefix}/{path.relative_to(directory).as_posix()}"
+            store, key = self._store(name)
+            with told(self.where(name), StoreError, what="written"):
+                obstore.put(store, key, path)
+
+        files = sorted(path for path in directory.rglob("*") if path.is_file())
+        with ThreadPoolExecutor(_UPLOADS) as pool:
+            list(pool.map(upload, files))
+
+    def delete(self, name: str) -> None:
+        """Remove an object."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(name)
+        with suppress(FileNotFoundError), told(self.where(name), StoreError, what="written"):
+            obstore.delete(store, key)
+
+    def local(self, name: str, checksum: Checksum) -> Path:
+        """Return the cached copy of an object with this content; `StoreError` where the object is gone or another."""
+
+        def fetch(path: Path) -> None:
+            digest = hashlib.sha256()
+            with path.open("wb") as target:
+                for piece in self.pieces(name):
+                    digest.update(piece)
+                    target.write(piece)
+            if digest.hexdigest() != checksum.sha256:
+                raise StoreError(
+                    f"{self.where(name)}: its sha256 is {digest.hexdigest()[:12]}…, wanted {checksum.sha256[:12]}…"
+                )
+
+        return cached(checksum.sha256, fetch)
+
+    def pieces(self, name: str) -> Iterator[bytes]:
+        """Yield an object piece by piece; `StoreError` where there is none."""
+        import obstore  # noqa: PLC0415
+
+        store, key = self._store(name)
+        with _gone(self.where(name)), told(self.where(name), StoreError):
+            for piece in obstore.get(store, key).stream(min_chunk_size=_PIECE_BYTES):
+                yield bytes(piece)
+
+    def _store(self, name: str = "") -> tuple[ObjectStore, str]:
+        """Return the bucket, and the name in it of what is called ``name`` here."""
+        settings = tuple(sorted((key, value) for key, value in os.environ.items() if key.upper().startswith(_SETTINGS)))
+        with told(self.url, StoreError):
+            store, prefix = _connected(self.url, settings)
+        return store, "/".join(part for part in (prefix, name) if part)
+
+
+@lru_cache(maxsize=64)
+def _connected(url: str, settings: tuple[tuple[str, str], ...]) -> tuple[ObjectStore, str]:
+    """Return what `connected` does, once for each setting of the environment."""
+    del settings
+    return connected(url)
+
+
+@contextmanager
+def _gone(where: str) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError:
+        raise StoreError(f"{where}: is gone") from None
+
+
+@contextmanager
+def _temporary_directory() -> Iterator[Path]:
+    with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
+        yield Path(directory)

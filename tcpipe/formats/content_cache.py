@@ -1,0 +1,68 @@
+"""A bounded cache of this machine, by content: what was fetched from a bucket once is not fetched again.
+
+A key names its content for good (a sha256; an object's version and a range of it), so that nothing in here can be outdated. It lies in
+``TCPIPE_CACHE``, else the user's cache directory, and holds at most ``TCPIPE_CACHE_BYTES`` (8 GB): what was not used for longest goes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+
+from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import atomic_file
+
+_MOST_BYTES = 8_000_000_000
+_IN_USE_S = 60.0
+"""What was used so lately stays: another process may be about to open it."""
+
+
+def cached(key: str, fetch: Callable[[Path], None]) -> Path:
+    """Return the file of a key; where there is none, ``fetch`` writes it.
+
+    Raises
+    ------
+    StoreError
+        The cache cannot be written.
+    """
+    digest = hashlib.sha256(key.encode()).hexdigest()
+    path = _directory() / digest[:2] / digest
+    with suppress(FileNotFoundError):
+        os.utime(path)
+        return path
+    with atomic_file(path) as temporary:
+        fetch(temporary)
+        temporary.touch()
+    _make_room(path.parent.parent, now=path.stat().st_mtime)
+    return path
+
+
+def _directory() -> Path:
+    if given := os.environ.get("TCPIPE_CACHE"):
+        return Path(given)
+    base = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"))  # noqa: PTH111  also without a home
+    if base.is_absolute() and os.access(next(of for of in (base, *base.parents) if of.exists()), os.W_OK):
+        return base / "tcpipe"
+    return Path(tempfile.gettempdir()) / f"tcpipe-cache-{os.getuid()}"
+
+
+def _make_room(directory: Path, *, now: float) -> None:
+    """Remove what was not used for longest until the bound holds."""
+    given = os.environ.get("TCPIPE_CACHE_BYTES", str(_MOST_BYTES))
+    if not given.isdecimal():
+        raise UsageError(f"TCPIPE_CACHE_BYTES is {given!r}, wanted a number of bytes")
+    files = []
+    for path in directory.glob("??/*"):
+        with suppress(OSError):
+            seen = path.stat()
+            files.append((seen.st_mtime, seen.st_size, path))
+    total = sum(size for _, size, _ in files)
+    for used, size, path in sorted(files):
+        if total <= int(given) or now - used < _IN_USE_S:
+            return
+        path.unlink(missing_ok=True)
+        total -= size

@@ -1,0 +1,207 @@
+"""Where files lie, a directory or a bucket, behind the same few verbs: what a store, its index and its readers are made of (ADR 84).
+
+A name is relative, with ``/`` between its parts. What may be there already under a name is of three kinds, and there is a verb for each:
+
+- a file that is named after its content (`Place.put_files`): writing it twice is writing it once;
+- a document that exactly one writer may make (`Place.put_new`): the first wins, and is told so;
+- a file that can be made again at will, and is nobody's truth (`Place.put`): the last writer's stays.
+
+Nothing appears before it is whole, and on disk before it is synced.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Protocol
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, put_directory, put_file, working_directory
+from tcpipe.formats.seals import Checksum, file_checksum
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """A file at a place: its name there, its size [byte], and when it was written [ns] by the clock of where it lies."""
+
+    name: str
+    size_bytes: int
+    modified_ns: int
+
+
+class Place(Protocol):
+    """A directory or a prefix of a bucket; every method raises `StoreError`, in one line, where it cannot be read or written."""
+
+    def where(self, name: str = "") -> str:
+        """Return how a user would name a file here: a path or a URL."""
+
+    def below(self, prefix: str) -> Place:
+        """Return the place whose names begin with ``prefix/`` here."""
+
+    def check(self) -> None:
+        """Raise `StoreError` unless names can be listed here: missing bucket, wrong credentials."""
+
+    def read(self, name: str) -> bytes | None:
+        """Return a whole file; None where there is none."""
+
+    def read_range(self, name: str, start: int, size: int) -> bytes:
+        """Return ``size`` bytes from ``start`` on; fewer at the end of the file."""
+
+    def size(self, name: str) -> int | None:
+        """Return how large a file is [byte]; None where there is none."""
+
+    def entries(self, prefix: str = "") -> list[Entry]:
+        """Return the files below ``prefix/``, however deep, by name (from here on); temporaries are none."""
+
+    def folders(self, prefix: str = "") -> list[str]:
+        """Return the first parts of all names of more parts below ``prefix/``, sorted: the folders that lie there."""
+
+    def put(self, name: str, data: bytes) -> None:
+        """Write a file, in the place of what is there."""
+
+    def put_new(self, name: str, data: bytes) -> bool:
+        """Write a file where there is none; of several writers the first wins. Return whether this call did."""
+
+    def workshop(self) -> AbstractContextManager[Path]:
+        """Return a context: an empty directory of this machine, for what is to be put here by `put_files`; it goes in the end."""
+
+    def put_files(self, prefix: str, directory: Path) -> None:
+        """Put the files of a directory in a `workshop` below ``prefix/``, which is named after their content; the directory is used up."""
+
+    def delete(self, name: str) -> None:
+        """Remove a file; where there is none nothing happens."""
+
+    def local(self, name: str, checksum: Checksum) -> Path:
+        """Return a file of this machine with the content of ``name``: itself, or a copy in the cache by content."""
+
+
+@dataclass(frozen=True, slots=True)
+class DirectoryPlace:
+    """A directory."""
+
+    root: Path
+    staging: Path | None = None
+    """Where temporaries lie, at the top of the same file system; None: in ``root``."""
+
+    def where(self, name: str = "") -> str:
+        """Return a path."""
+        return str(self._path(name))
+
+    def below(self, prefix: str) -> DirectoryPlace:
+        """Return the directory ``prefix`` in this one."""
+        return DirectoryPlace(self._path(prefix), self.staging or self.root)
+
+    def check(self) -> None:
+        """Raise `StoreError` where this is no directory, or cannot be listed."""
+        with _told(self.where(), "read"):
+            os.scandir(self.root).close()
+
+    def read(self, name: str) -> bytes | None:
+        """Return a whole file; None where there is none."""
+        with _told(self.where(name), "read"), suppress(FileNotFoundError, NotADirectoryError):
+            return self._path(name).read_bytes()
+        return None
+
+    def read_range(self, name: str, start: int, size: int) -> bytes:
+        """Return ``size`` bytes from ``start`` on."""
+        with _told(self.where(name), "read"), self._path(name).open("rb") as stream:
+            return os.pread(stream.fileno(), size, start)
+
+    def size(self, name: str) -> int | None:
+        """Return how large a file is [byte]."""
+        path = self._path(name)
+        with _told(self.where(name), "read"), suppress(FileNotFoundError, NotADirectoryError):
+            return path.stat().st_size if path.is_file() else None
+        return None
+
+    def entries(self, prefix: str = "") -> list[Entry]:
+        """Return the files below ``prefix/``, by name."""
+        with _told(self.where(prefix), "read"):
+            return sorted(_walked(self._path(prefix), prefix), key=lambda entry: entry.name)
+
+    def folders(self, prefix: str = "") -> list[str]:
+        """Return the names of the directories in ``prefix``."""
+        with _told(self.where(prefix), "read"), suppress(FileNotFoundError, NotADirectoryError):
+            found = (entry.name for entry in os.scandir(self._path(prefix)) if entry.is_dir())
+            return sorted(name for name in found if not name.startswith(TEMPORARY_PREFIX))
+        return []
+
+    def put(self, name: str, data: bytes) -> None:
+        """Write a file by a rename."""
+        put_file(self._path(name), data, staging=self._staging(), over=True)
+
+    def put_new(self, name: str, data: bytes) -> bool:
+        """Write a file by a link."""
+        return put_file(self._path(name), data, staging=self._staging())
+
+    def workshop(self) -> AbstractContextManager[Path]:
+        """Return a context: an empty directory among the temporaries."""
+        return working_directory(self._staging())
+
+    def put_files(self, prefix: str, directory: Path) -> None:
+        """Put the directory there by one rename."""
+        put_directory(directory, self._path(prefix))
+
+    def delete(self, name: str) -> None:
+        """Remove a file, and the directories above it that it leaves empty."""
+        path = self._path(name)
+        with _told(self.where(name), "written"), suppress(FileNotFoundError, NotADirectoryError):
+            path.unlink()
+        with suppress(OSError):
+            for parent in path.parents:
+                if parent == self.root:
+                    break
+                parent.rmdir()
+
+    def local(self, name: str, checksum: Checksum) -> Path:
+        """Return the file itself."""
+        del checksum
+        return self._path(name)
+
+    def clear(self) -> None:
+        """Remove what killed writers left as temporaries."""
+        clear(self.staging or self.root)
+
+    def _path(self, name: str) -> Path:
+        if ".." in PurePosixPath(name).parts or name.startswith("/"):
+            raise StoreError(f"{self.root}: {name!r} is no name of a file in it")
+        return self.root / name
+
+    def _staging(self) -> Path:
+        staging = self.staging or self.root
+        staging.mkdir(parents=True, exist_ok=True)
+        return staging
+
+
+def checksums_of(directory: Path) -> dict[str, Checksum]:
+    """Return size and sha256 of every file below a directory of this machine, by its name in it."""
+    return {entry.name: file_checksum(directory / entry.name) for entry in DirectoryPlace(directory).entries()}
+
+
+def _walked(directory: Path, prefix: str) -> Iterator[Entry]:
+    """Yield the files below a directory, ``prefix/`` before their names; a file that goes meanwhile is none."""
+    with suppress(FileNotFoundError, NotADirectoryError), os.scandir(directory) as found:
+        for entry in found:
+            name = f"{prefix}/{entry.name}" if prefix else entry.name
+            if entry.name.startswith(TEMPORARY_PREFIX):
+                continue
+            if entry.is_dir():
+                yield from _walked(Path(entry), name)
+                continue
+            with suppress(FileNotFoundError):
+                seen = entry.stat()
+                yield Entry(name, seen.st_size, seen.st_mtime_ns)
+
+
+@contextmanager
+def _told(where: str, what: str) -> Iterator[None]:
+    """Turn what the operating system says into one line."""
+    try:
+        yield
+    except (FileNotFoundError, NotADirectoryError):
+        raise StoreError(f"{where}: is gone") from None
+    except OSError as error:
+        raise StoreError(f"{where}: cannot be {what} ({error.strerror or error})") from error

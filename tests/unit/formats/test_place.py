@@ -1,0 +1,147 @@
+"""A directory and a bucket behind the same verbs: each test is made of both, and of a real gateway where there is one."""
+
+import hashlib
+import pickle
+import time
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from object_gateway import gateway, in_environment  # noqa: F401  a fixture
+from storage_server import FORBIDDEN, READ_ONLY, object_store
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.bucket import open_place
+from tcpipe.formats.place import Entry, Place
+from tcpipe.formats.seals import Checksum
+
+NAMES = ("a.json", "drives of May/ü ñ #1?.json", "runs/100%/track.parquet", "runs/x/[1] & 'two'+~.bin")
+
+
+@pytest.fixture(params=["directory", "bucket", "gateway"])
+def place(request, tmp_path, monkeypatch):
+    if request.param == "directory":
+        yield open_place(tmp_path / "place")
+    elif request.param == "gateway":
+        in_environment(monkeypatch, request.getfixturevalue("gateway"), tmp_path / "cache")
+        yield open_place(f"s3://tests/{uuid.uuid4().hex}/below this")
+    else:
+        (tmp_path / "served" / "tests").mkdir(parents=True)
+        with object_store(tmp_path / "served") as (environment, _):
+            in_environment(monkeypatch, environment, tmp_path / "cache")
+            yield open_place("s3://tests/below this/")
+
+
+def _names(entries: list[Entry]) -> list[str]:
+    return [entry.name for entry in entries]
+
+
+def test_what_is_put_is_there(place: Place) -> None:
+    for name in NAMES:
+        assert place.read(name) is None
+        assert place.size(name) is None
+        place.put(name, b"old")
+        place.put(name, name.encode())
+        assert place.read(name) == name.encode()
+        assert place.size(name) == len(name.encode())
+        assert place.read_range(name, 2, 3) == name.encode()[2:5]
+    assert _names(place.entries()) == sorted(NAMES)
+    assert _names(place.entries("runs/x")) == [NAMES[3]]
+    assert [entry.size_bytes for entry in place.entries("runs/100%")] == [len(NAMES[2])]
+    assert place.folders() == ["drives of May", "runs"]
+    assert place.folders("runs") == ["100%", "x"]
+    assert place.folders("nowhere") == place.entries("nowhere") == []
+    there = pickle.loads(pickle.dumps(place))  # noqa: S301  as a worker gets it
+    assert there.below("runs").read("100%/track.parquet") == NAMES[2].encode()
+
+
+def test_of_many_writers_the_first_wins(place: Place) -> None:
+    with ThreadPoolExecutor(12) as pool:
+        won = list(pool.map(lambda number: place.put_new("document.json", b"%d" % number), range(12)))
+    assert sum(won) == 1
+    assert place.read("document.json") == b"%d" % won.index(True)
+    assert not place.put_new("document.json", b"late")
+
+
+def test_nothing_is_a_file_too_and_what_is_gone_is_told(place: Place) -> None:
+    place.put("empty", b"")
+    assert place.read("empty") == b""
+    assert place.size("empty") == 0
+    place.delete("empty")
+    place.delete("empty")
+    assert place.read("empty") is None
+    with pytest.raises(StoreError, match="nowhere: is gone"):
+        place.read_range("nowhere", 0, 1)
+    assert place.entries() == []
+
+
+def test_files_are_put_together_and_had_here(place: Place) -> None:
+    data = {"track.parquet": b"1" * 1000, "c/0/1": b""}
+    for _ in range(2):
+        with place.workshop() as directory:
+            for name, content in data.items():
+                (directory / name).parent.mkdir(parents=True, exist_ok=True)
+                (directory / name).write_bytes(content)
+            assert place.entries() == [] or _names(place.entries()) == ["runs/x/c/0/1", "runs/x/track.parquet"]
+            place.put_files("runs/x", directory)
+        assert not directory.exists()
+    assert [(entry.name, entry.size_bytes) for entry in place.entries()] == [
+        ("runs/x/c/0/1", 0),
+        ("runs/x/track.parquet", 1000),
+    ]
+    checksum = Checksum(1000, hashlib.sha256(data["track.parquet"]).hexdigest())
+    for _ in range(2):
+        assert place.local("runs/x/track.parquet", checksum).read_bytes() == data["track.parquet"]
+
+
+@pytest.mark.parametrize("name", ["../outside", "/etc/passwd"])
+def test_no_name_leads_outside(place: Place, name: str) -> None:
+    with pytest.raises(StoreError):
+        place.put(name, b"")
+
+
+@pytest.fixture
+def served(tmp_path, monkeypatch):
+    (tmp_path / "served" / READ_ONLY).mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, _):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        yield tmp_path / "served"
+
+
+def test_a_bucket_that_cannot_be_used_is_one_line(served: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(StoreError, match=r"^s3://nowhere/x: it cannot be read \(there is no such bucket\)$"):
+        open_place("s3://nowhere/x").check()
+    with pytest.raises(StoreError, match="wants credentials; set AWS_ACCESS_KEY_ID"):
+        open_place(f"s3://{FORBIDDEN}/x").check()
+    open_place(f"s3://{READ_ONLY}").check()
+    with pytest.raises(
+        StoreError, match=r"read-only/x/a: it cannot be written \(the credentials that are set do not allow it\)"
+    ):
+        open_place(f"s3://{READ_ONLY}/x").put_new("a", b"")
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    began = time.monotonic()
+    with pytest.raises(StoreError, match="cannot be read"):
+        open_place("s3://tests/x").check()
+    assert time.monotonic() - began < 10
+
+
+def test_a_copy_that_is_not_what_it_should_be_is_no_copy(served: Path) -> None:
+    (served / "tests").mkdir()
+    place = open_place("s3://tests")
+    place.put("a", b"damaged")
+    for _ in range(2):
+        with pytest.raises(StoreError, match="s3://tests/a: its sha256 is"):
+            place.local("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))
+
+
+def test_the_cache_is_bounded(served: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (served / "tests").mkdir()
+    monkeypatch.setenv("TCPIPE_CACHE_BYTES", "2500")
+    monkeypatch.setattr("tcpipe.formats.content_cache._IN_USE_S", -1.0)
+    place = open_place("s3://tests")
+    for number in range(5):
+        data = bytes([number]) * 1000
+        place.put("a", data)
+        place.local("a", Checksum(1000, hashlib.sha256(data).hexdigest()))
+    assert sum(path.is_file() for path in (tmp_path / "cache").rglob("*")) == 2
