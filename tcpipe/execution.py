@@ -1,6 +1,7 @@
-"""Independent tasks side by side, behind one ``concurrent.futures.Executor``; a worker that dies costs only its own task.
+"""Independent tasks side by side, in this process, local processes or a Dask cluster; a worker that dies costs only its own task.
 
-What workers log is said here. They end with this process, and at once when it is interrupted.
+What workers log is said here. Local ones end with this process, and at once when it is interrupted; a cluster's finish what they began.
+The home of dask.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import logging
 import multiprocessing
 import os
+import re
 import signal
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -15,8 +17,15 @@ from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExe
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from itertools import islice
 from multiprocessing.connection import Connection
-from typing import Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
+
+from tcpipe import __version__
+from tcpipe.errors import UsageError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -36,12 +45,29 @@ class Outcome(Generic[R]):
     died: bool = False
 
 
-def run_all(function: Callable[[T], R], tasks: Sequence[T], *, jobs: int) -> Generator[Outcome[R]]:
-    """Yield the outcome of ``function(task)`` for every task, as each ends; ``jobs`` processes, or this one for 1.
+def run_all(
+    function: Callable[[T], R], tasks: Sequence[T], *, jobs: int, cluster: str | None = None
+) -> Generator[Outcome[R]]:
+    """Yield the outcome of ``function(task)`` for every task, as each ends.
 
     ``function`` and tasks are picklable (workers are spawned); ``function`` returns its errors rather than raising them.
     Use it within ``contextlib.closing``: workers end when the iterator is closed.
+
+    Parameters
+    ----------
+    jobs
+        Processes; this one for 1.
+    cluster
+        Address of a Dask scheduler (``tcp://host:8786``), whose workers do it instead. They see the same files under the same names.
+
+    Raises
+    ------
+    UsageError
+        There is no such scheduler, it has no workers, or they are not as they have to be.
     """
+    if cluster is not None and tasks:
+        yield from _run_on_cluster(function, tasks, cluster)
+        return
     if jobs <= 1 or len(tasks) <= 1:
         for index, task in enumerate(tasks):
             yield Outcome(index, function(task))
@@ -150,3 +176,110 @@ class _Saying(logging.Handler):
         text = record.getMessage().encode(errors="backslashreplace")[:_LONGEST_SAYING_BYTES].decode(errors="ignore")
         with suppress(OSError):
             self._saying.send((record.levelno, text))
+
+
+_ANSWER_S = 10
+"""So long a scheduler has to answer, and to have a worker."""
+_ADDRESS = re.compile(r"(tcp|tls)://[^/]+:\d+")
+_AHEAD = 2
+"""Tasks that a worker is handed at once: the next waits beside it."""
+
+
+def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str) -> Generator[Outcome[R]]:
+    """Run the tasks on a cluster's workers; one that is killed has its task run again on another, three times."""
+    from distributed import KilledWorker, as_completed  # noqa: PLC0415  most calls stay on this machine
+
+    with _client(address) as client:
+        level, todo = logger.getEffectiveLevel(), iter(range(len(tasks)))
+
+        def submit(count: int) -> dict[Any, int]:
+            at_once = islice(todo, count)
+            return {
+                client.submit(_on_worker, function, tasks[at], __version__, level, pure=False): at for at in at_once
+            }
+
+        running = submit(_AHEAD * _workers(client, address))
+        ended = as_completed(running, loop=client.loop)
+        for future in ended:
+            index = running.pop(future)
+            try:
+                said, result = future.result()
+            except KilledWorker:
+                yield Outcome(index, None, died=True)
+            except ModuleNotFoundError as error:
+                raise UsageError(
+                    f"{address}: a worker lacks {error.name}; install there what is installed here"
+                ) from None
+            except RuntimeError as error:
+                if "deserialization" not in str(error):
+                    raise
+                raise UsageError(
+                    f"{address}: the scheduler lacks tcpipe; install there what is installed here"
+                ) from None
+            else:
+                for record in said:
+                    logger.log(*record)
+                yield Outcome(index, result)
+            new = submit(1)
+            running |= new
+            ended.update(new)
+
+
+@contextmanager
+def _client(address: str) -> Iterator[Client]:
+    try:
+        from distributed import Client  # noqa: PLC0415  most calls stay on this machine
+    except ImportError:
+        raise UsageError("dask not installed, wanted for --cluster: pip install 'tcpipe[cluster]'") from None
+    if not _ADDRESS.fullmatch(address):
+        raise UsageError(f"{address!r}: no address of a Dask scheduler; wanted tcp://host:port or tls://host:port")
+    try:
+        client = Client(address, timeout=_ANSWER_S, set_as_default=False)
+    except (OSError, ValueError) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise UsageError(f"{address}: no Dask scheduler answers ({reason}); start one: dask scheduler") from None
+    with client:
+        yield client
+
+
+def _workers(client: Client, address: str) -> int:
+    """Return the number of workers; `UsageError` where there is none, or one runs tasks as threads of one process."""
+    try:
+        client.wait_for_workers(1, timeout=_ANSWER_S)
+    except TimeoutError:
+        raise UsageError(
+            f"{address}: the scheduler has no workers; start some: dask worker {address} --nthreads 1"
+        ) from None
+    threads = client.nthreads()
+    if many := [worker for worker, count in threads.items() if count != 1]:
+        raise UsageError(
+            f"{many[0]}: has {threads[many[0]]} threads; wanted one a worker: dask worker {address} --nthreads 1"
+        )
+    return len(threads)
+
+
+def _on_worker(function: Callable[[T], R], task: T, version: str, level: int) -> tuple[list[tuple[int, str, str]], R]:
+    """Run a task on a cluster's worker; return what it logged, and its result."""
+    if version != __version__:
+        raise UsageError(
+            f"{os.uname().nodename}: a worker has tcpipe {__version__}, wanted {version} as here; install that"
+        )
+    said: list[tuple[int, str, str]] = []
+    keeping = _Keeping(said)
+    logger.addHandler(keeping)
+    logger.setLevel(level)
+    try:
+        return said, function(task)
+    finally:
+        logger.removeHandler(keeping)
+
+
+class _Keeping(logging.Handler):
+    """Keeps what a task logs, as arguments of `Logger.log`."""
+
+    def __init__(self, said: list[tuple[int, str, str]]) -> None:
+        super().__init__()
+        self._said = said
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._said.append((record.levelno, "%s", record.getMessage()))

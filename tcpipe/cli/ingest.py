@@ -9,6 +9,7 @@ import click
 
 from tcpipe.cli.options import (
     ONE_OF_SEVERAL,
+    cluster_option,
     duration_value,
     msgdef_option,
     quiet_option,
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     "--tag", "tags", multiple=True, metavar="K=V", callback=tag_values, help="Free tag on the runs; repeatable."
 )
 @click.option("--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help="Logs side by side.")
+@cluster_option
 @click.option("--as-one", is_flag=True, help="All logs are parts of one drive (splits; power logged apart).")
 @msgdef_option
 @click.option(
@@ -66,6 +68,7 @@ def ingest(
     robot: str | None,
     tags: dict[str, str],
     jobs: int,
+    cluster: str | None,
     as_one: bool,
     msgdef: str | None,
     shard: tuple[int, int] | None,
@@ -113,6 +116,7 @@ def ingest(
             robot=robot,
             tags=tags,
             jobs=jobs,
+            cluster=cluster,
             force=force,
             retry_failed=retry_failed,
             as_one=as_one,

@@ -78,6 +78,14 @@ store_option = click.option(
 )
 """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""
 
+cluster_option = click.option(
+    "--cluster",
+    envvar="TCPIPE_CLUSTER",
+    metavar="ADDRESS",
+    help="Dask scheduler whose workers do it, tcp://host:port (or TCPIPE_CLUSTER); instead of --jobs.",
+)
+"""``--cluster``, or TCPIPE_CLUSTER."""
+
 recipe_option = click.option(
     "--recipe",
     type=INPUT_FILE,

@@ -80,6 +80,7 @@ def ingest(
     robot: str | None = None,
     tags: Mapping[str, str] | None = None,
     jobs: int = 1,
+    cluster: str | None = None,
     force: bool = False,
     retry_failed: bool = False,
     as_one: bool = False,
@@ -100,6 +101,10 @@ def ingest(
         A `Recipe`, a path to one, or None for the one that rules here (``TCPIPE_RECIPE``, nearest tcpipe.toml, defaults).
     robot
         Profile; None takes the recipe's, or finds it by message types.
+    jobs
+        Logs side by side, each in a process of its own.
+    cluster
+        Address of a Dask scheduler whose workers take the logs instead; they see logs and store under the same absolute paths.
     force
         Do again what is there already, and what is known to fail.
     retry_failed
@@ -134,14 +139,18 @@ def ingest(
         opened = open_store(store, create=True)
         remember_earlier(opened)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
-        common = (opened.root, ruling, robot, dict(tags or {}), force, message_definitions)
+        root = opened.root
+        if cluster is not None:  # its workers are elsewhere
+            root = root.absolute()
+            message_definitions = None if message_definitions is None else message_definitions.absolute()
+        common = (root, ruling, robot, dict(tags or {}), force, message_definitions)
         how = (definitions_key(message_definitions), retry_failed, min_age_s)
         sources = with_hashes(mine, (lambda _: []) if force else opened.sightings)
         tasks = [IngestTask(source, *common, *how) for source in sources]
         if on_found:
             on_found(len(tasks) + len(found.problems))
         results = {}
-        for index, source, result in _results(opened, tasks, found, jobs):
+        for index, source, result in _results(opened, tasks, found, jobs=jobs, cluster=cluster):
             results[index] = result
             if on_result:
                 on_result(result)
@@ -151,7 +160,7 @@ def ingest(
 
 
 def _results(
-    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, jobs: int
+    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, LogSource | None, IngestResult]]:
     """Yield what became of each path that holds no log, and of each log as it ends, by its place; what needs no work is told first."""
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
@@ -165,7 +174,7 @@ def _results(
                 todo.append(index)
             else:
                 yield index, tasks[index].source, _judged(store, tasks[index].source, result, runs)
-        with closing(run_all(ingest_one, [tasks[index] for index in todo], jobs=jobs)) as outcomes:
+        with closing(run_all(ingest_one, [tasks[index] for index in todo], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
                 task = tasks[todo[outcome.index]]
                 source, result = outcome.result or (task.source, died(task.source))

@@ -19,6 +19,7 @@ from tcpipe.store import open_store
 TEXTS = {
     "name",
     "robot",
+    "cluster",
     "map_name",
     "tags",
     "sample_id",

@@ -1,0 +1,77 @@
+"""A Dask cluster for tests: its scheduler and workers, each a process of its own, as the commands start them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tcpipe.formats.json_files import read_json
+
+
+@dataclass(slots=True)
+class DaskCluster:
+    """A scheduler's address and file, and its workers."""
+
+    address: str
+    file: Path
+    workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
+
+    def start_worker(self, *, threads: int = 1) -> None:
+        """Start one more worker."""
+        how = ("--nthreads", str(threads), "--no-dashboard", "--local-directory", str(self.file.parent))
+        self.workers.append(_started("worker", "--scheduler-file", str(self.file), *how))
+
+
+def _started(*arguments: str) -> subprocess.Popen[bytes]:
+    said, path = subprocess.DEVNULL, [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, path))}  # the tasks below
+    return subprocess.Popen([sys.executable, "-m", "dask", *arguments], stdout=said, stderr=said, env=env)
+
+
+@contextmanager
+def dask_cluster(directory: Path, *, workers: int = 2) -> Iterator[DaskCluster]:
+    """Yield a running cluster; it is gone when the block ends."""
+    file = directory / "scheduler.json"
+    with ExitStack() as stack:
+        local = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
+        scheduler = _started("scheduler", *local)
+        stack.callback(_ended, scheduler)
+        end = time.monotonic() + 60
+        while not file.exists():
+            assert scheduler.poll() is None
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        cluster = DaskCluster(read_json(file)["address"], file)
+        stack.callback(lambda: [_ended(worker) for worker in cluster.workers])
+        for _ in range(workers):
+            cluster.start_worker()
+        yield cluster
+
+
+def _ended(process: subprocess.Popen[bytes]) -> None:
+    process.kill()
+    process.wait()
+
+
+def where(value: int) -> tuple[int, int]:
+    """Return the square, and which process it is from."""
+    logging.getLogger("tcpipe").info("task %d", value)
+    return value * value, os.getpid()
+
+
+def die_once(mark: Path) -> int:
+    """Kill the worker that comes first."""
+    try:
+        mark.touch(exist_ok=False)
+    except FileExistsError:
+        return os.getpid()
+    os.kill(os.getpid(), signal.SIGKILL)
+    raise AssertionError

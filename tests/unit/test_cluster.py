@@ -1,0 +1,81 @@
+"""Tasks on a real Dask cluster: the same outcomes as here, a killed worker costs its task only, and what is in the way is one line."""
+
+import logging
+import os
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+pytest.importorskip("distributed", reason="the extra cluster is not installed")
+
+from dask_cluster import DaskCluster, dask_cluster, die_once, where
+
+import tcpipe
+from tcpipe import execution
+from tcpipe.errors import UsageError
+from tcpipe.execution import run_all
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
+    with dask_cluster(tmp_path_factory.mktemp("dask")) as running:
+        yield running
+
+
+def test_workers_do_all_tasks_and_what_they_say_is_said_here(cluster, caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+    with caplog.at_level(logging.INFO, "tcpipe"):
+        outcomes = sorted(run_all(where, range(9), jobs=1, cluster=cluster.address), key=lambda outcome: outcome.index)
+    assert [outcome.result[0] for outcome in outcomes] == [value * value for value in range(9)]
+    assert os.getpid() not in {outcome.result[1] for outcome in outcomes}
+    assert len({outcome.result[1] for outcome in outcomes}) == 2
+    assert sorted(record.getMessage() for record in caplog.records if record.name == "tcpipe") == [
+        f"task {value}" for value in range(9)
+    ]
+
+
+def test_no_tasks_are_no_outcomes(cluster):
+    assert list(run_all(where, [], jobs=1, cluster=cluster.address)) == []
+
+
+def test_the_task_of_a_killed_worker_runs_again_and_costs_no_other(cluster, tmp_path):
+    outcomes = list(
+        run_all(die_once, [tmp_path / "a", tmp_path / "b", tmp_path / "b"], jobs=1, cluster=cluster.address)
+    )
+    assert sorted(outcome.index for outcome in outcomes) == [0, 1, 2]
+    assert not any(outcome.died for outcome in outcomes)
+
+
+def test_a_closed_iterator_leaves_no_task_waiting(cluster):
+    with closing(run_all(where, range(100), jobs=1, cluster=cluster.address)) as outcomes:
+        next(outcomes)
+    assert len(list(run_all(where, range(2), jobs=1, cluster=cluster.address))) == 2
+
+
+def test_a_worker_of_another_version_is_refused(cluster, monkeypatch):
+    monkeypatch.setattr(execution, "__version__", "99.0")
+    with pytest.raises(UsageError, match=f"a worker has tcpipe {tcpipe.__version__}, wanted 99.0 as here"):
+        list(run_all(where, [1], jobs=1, cluster=cluster.address))
+
+
+def test_a_worker_of_many_threads_is_refused(tmp_path):
+    with dask_cluster(tmp_path, workers=0) as wide:
+        wide.start_worker(threads=2)
+        with pytest.raises(UsageError, match="has 2 threads; wanted one a worker"):
+            list(run_all(where, [1], jobs=1, cluster=wide.address))
+
+
+def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
+    monkeypatch.setattr(execution, "_ANSWER_S", 1)
+    with pytest.raises(UsageError, match=r"tcp://127\.0\.0\.1:9: no Dask scheduler answers"):
+        list(run_all(where, [1], jobs=1, cluster="tcp://127.0.0.1:9"))
+    for address in ("nowhere", "ftp://x:1", "tcp://x"):
+        with pytest.raises(UsageError, match="no address of a Dask scheduler; wanted tcp://host:port"):
+            list(run_all(where, [1], jobs=1, cluster=address))
+
+
+def test_a_scheduler_without_workers_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(execution, "_ANSWER_S", 1)
+    with dask_cluster(tmp_path, workers=0) as lonely, pytest.raises(UsageError, match="the scheduler has no workers"):
+        list(run_all(where, [1], jobs=1, cluster=lonely.address))
