@@ -1,16 +1,22 @@
 """The errors that the simulator itself implies: those of a predictor that knows its plant and reads the world without error.
 
-It sees what a map shows, class and height along the chord of a sample, where the pipeline believes the chord to be. What is left is
-the labels' noise and what no map layer shows: the hidden resistance, its fluctuation, curves, weaving, the lag of the wheels.
+It sees what a map shows along the chord of a sample, where the pipeline believes the chord to be, and how much the robot turned. Of a
+world without hidden resistance (`shown`) it says what could be told at best: what is left is the labels' noise, that resistance, its
+fluctuation in time, and the lag of the wheels.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 
 from tcpipe.dataset import Split
 from tcpipe.learning.metrics import Array, costs
 from tcpipe.simulation.robot import SimulatedRobot
+from tcpipe.simulation.wheels import rolling_resistance
 from tcpipe.simulation.world import World
 
 _STEP_M = 0.05
@@ -24,7 +30,7 @@ def plant_costs(world: World, robot: SimulatedRobot, split: Split) -> dict[str, 
     world, robot
         What was simulated.
     split
-        Samples, by the ends of their chords.
+        Samples, by the ends of their chords and their turn.
 
     """
     ends = [split.column(f"{end}_{axis}_deg").astype(np.float64) for end in ("start", "end") for axis in ("lon", "lat")]
@@ -39,23 +45,82 @@ def plant_costs(world: World, robot: SimulatedRobot, split: Split) -> dict[str, 
     rise_x, rise_y = world.gradient(x, y)
     slope = np.arctan((rise_x * np.cos(direction) + rise_y * np.sin(direction)) / np.reshape(scale, x.shape))
     ground = robot.ground_table()[world.terrain_class(x, y)]
-    under = [_mean_over(ground[..., column], round(robot.wheelbase_m / _STEP_M) + 1) for column in range(3)]
-    cut = (x.shape[1] - under[0].shape[1]) // 2
-    slope = slope[:, cut : x.shape[1] - cut]
-    wheel = robot.max_velocity_mps * robot.speed_factor(under[0], np.sin(slope))
-    velocity = wheel * (1.0 - robot.slip(under[1], np.sin(slope))) * np.cos(slope)
-    still = np.zeros_like(slope)
+    usual = [_mean_over(ground[..., column], round(robot.wheelbase_m / _STEP_M) + 1) for column in range(3)]
+    cut = slice((x.shape[1] - usual[0].shape[1]) // 2, (x.shape[1] + usual[0].shape[1]) // 2)
+    slope = slope[:, cut]
+    rolling = rolling_resistance(world, robot, x[:, cut], y[:, cut], direction)
+    lost = 0.0 if robot.wheels is None else robot.wheels.slowdown * (rolling - usual[2])
+    wheel = robot.max_velocity_mps * robot.speed_factor(usual[0], np.sin(slope)) * (1.0 - lost)
+    velocity = wheel * (1.0 - robot.slip(usual[1], np.sin(slope))) * np.cos(slope)
+    turning = np.abs(np.nan_to_num(split.column("turn_rate_radps").astype(np.float64)))
     mechanical = robot.wheel_power_watt(
         wheel_velocity_mps=wheel,
-        acceleration_mps2=still,
-        yaw_rate_radps=still,
+        acceleration_mps2=np.zeros_like(slope),
+        yaw_rate_radps=np.broadcast_to(turning[:, None], slope.shape),
         slope_rad=slope,
-        rolling_resistance=under[2],
+        rolling_resistance=rolling,
     )
     power = robot.propulsion_watt(mechanical, wheel)
     seconds_per_m = np.mean(1.0 / velocity, axis=1)
     joule_per_m = np.mean(power / velocity, axis=1)
     return costs(joule_per_m / seconds_per_m, 1.0 / seconds_per_m, 1.0)
+
+
+def shown(world: World) -> World:
+    """Return a world without what nothing shows."""
+    return replace(world, resistance=())
+
+
+CLASS_AND_SLOPE, REST = "class and slope", "left: fluctuation in time, lag of the wheels, the labels' noise"
+
+
+def variance_shares(world: World, robot: SimulatedRobot, split: Split, energy_joule: Array) -> dict[str, float]:
+    """Return the share of the variance of measured E, shape (N,), that each part of the simulated world makes.
+
+    That of class and slope is the variance without all other parts; that of a part, of what changes where it alone is missing; the
+    rest, of what the plant with everything in it misses. They add up to one only as far as the parts are independent.
+    """
+    known = np.isfinite(energy_joule)
+
+    def energy(without: Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]] = _nothing) -> Array:
+        return plant_costs(*without(world, robot), split)["E"]
+
+    whole, plain = energy(), energy(lambda *both: reduce(lambda left, take: take(*left), _PARTS.values(), both))
+    missing = {CLASS_AND_SLOPE: plain, **{name: whole - energy(take) for name, take in _PARTS.items()}}
+    missing[REST] = energy_joule - whole
+    total = float(np.var(energy_joule[known]))
+    return {name: float(np.var(part[known])) / total for name, part in missing.items()}
+
+
+def _nothing(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    return world, robot
+
+
+def _without_pictured(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    if world.surface is None:
+        return world, robot
+    looks = {
+        name: replace(look, wet_resistance=0.0, cover_resistance=0.0) for name, look in world.surface.looks.items()
+    }
+    return replace(world, surface=replace(world.surface, looks=looks)), robot
+
+
+def _without_bumps(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    return world, replace(robot, wheels=robot.wheels and replace(robot.wheels, bump_loss=0.0))
+
+
+def _without_side(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:
+    return world, replace(robot, wheels=robot.wheels and replace(robot.wheels, cornering_per_rad=np.inf))
+
+
+_PARTS: Mapping[str, Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]]] = {
+    "the orthophoto alone: wetness, cover": _without_pictured,
+    "heights within the patch: bumps and ridges under the wheels": _without_bumps,
+    "heights within the patch: slope across": _without_side,
+    "the path: turning": lambda world, robot: (world, replace(robot, scrub_torque_nm=0.0)),
+    "nothing: hidden resistance": lambda world, robot: (shown(world), robot),
+}
+"""What shows a part of the world, and the world and robot without it."""
 
 
 def _mean_over(values: Array, count: int) -> Array:

@@ -18,7 +18,7 @@ from tcpipe.learning.claims import Claim, checked_claims
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
 from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.learning.plant_floor import plant_costs
+from tcpipe.learning.plant_floor import plant_costs, shown
 from tcpipe.learning.reproduction_page import reproduction_page
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
@@ -168,7 +168,7 @@ def _train_and_evaluate(place: Path, made: Scenario, plan: Experiment, seed: int
     with _timed(result, "train"):
         train(dataset, here / "model", config=replace(plan.fitting, seed=seed), disposable=True)
     with _timed(result, "evaluate"):
-        known = partial(plant_costs, made.world, made.drives[0].robot)
+        known = partial(plant_costs, shown(made.world), made.drives[0].robot)
         config = replace(plan.evaluating, seed=seed)
         return run_evaluation(here / "model", dataset, here / "evaluation", config=config, plant=known).values
 

@@ -29,6 +29,7 @@ from tcpipe.simulation.route import (
 )
 from tcpipe.simulation.site import Float
 from tcpipe.simulation.truth import Truth
+from tcpipe.simulation.wheels import rolling_resistance
 from tcpipe.simulation.world import World
 
 STEP_NS = 5_000_000
@@ -147,9 +148,8 @@ def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, b
     gx, gy = world.gradient(x, y)
     slope = np.arctan((gx * np.cos(direction) + gy * np.sin(direction)) / scale)
     ground = robot.ground_table()[world.terrain_class(x, y)]
-    excess = moving_average(world.resistance_factor(x, y), robot.wheelbase_m) - 1.0
     speed_factor = robot.speed_factor(moving_average(ground[:, 0], robot.wheelbase_m), np.sin(slope))
-    speed_factor = speed_factor * (1.0 - robot.hidden_slowdown * excess)
+    speed_factor = speed_factor * (1.0 - _slowdown(world, robot, x, y, direction))
     slip = robot.slip(moving_average(ground[:, 1], robot.wheelbase_m), np.sin(slope))
     command_mps = command * robot.max_velocity_mps
     brake_at_m = max(path.stop_m - _BRAKE_BEFORE_M * command, 0.1)
@@ -170,6 +170,14 @@ def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, b
     return _Stretch(uv, yaw, sign * wheel, np.interp(s, grid, slip), commanded, commanded_rate)
 
 
+def _slowdown(world: World, robot: SimulatedRobot, x: Float, y: Float, direction_rad: Float) -> Float:
+    """Return the share of wheel speed that is lost where the ground resists more than its class does, along a path."""
+    if robot.wheels is None:
+        return robot.hidden_slowdown * (moving_average(world.resistance_factor(x, y), robot.wheelbase_m) - 1.0)
+    usual = moving_average(robot.ground_table()[world.terrain_class(x, y)][:, 2], robot.wheelbase_m)
+    return robot.wheels.slowdown * (rolling_resistance(world, robot, x, y, direction_rad) - usual)
+
+
 def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator) -> Truth:
     site = world.site
     x, y = driven.uv_m[:, 0] + site.west_m, driven.uv_m[:, 1] + site.south_m
@@ -185,7 +193,7 @@ def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int,
     slope = np.arctan(rise_east * np.cos(yaw) + rise_north * np.sin(yaw))
     stamp_ns = start_ns + np.arange(x.size, dtype=np.int64) * STEP_NS
     terrain = world.terrain_class(x, y)
-    rolling = _rolling_resistance(world, robot, x, y, driven.yaw_map_rad)
+    rolling = rolling_resistance(world, robot, x, y, driven.yaw_map_rad)
     voltage, current, right_share = _power(robot, driven, slope, rolling, rng)
     step = np.diff(enu, axis=0)
     energy_step = 0.5 * (voltage[1:] * current[1:] + voltage[:-1] * current[:-1]) * _DT_S
@@ -200,16 +208,6 @@ def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int,
         energy_joule=np.concatenate([[0.0], np.cumsum(energy_step)]),
         distance_m=np.concatenate([[0.0], np.cumsum(np.hypot(step[:, 0], step[:, 1]))]),
     )  # fmt: skip
-
-
-def _rolling_resistance(world: World, robot: SimulatedRobot, x: Float, y: Float, yaw_map_rad: Float) -> Float:
-    """Return the mean over the wheelbase."""
-    by_class = robot.ground_table()[:, 2]
-    along = np.linspace(-0.5, 0.5, 5) * robot.wheelbase_m
-    places = [(x + d * np.cos(yaw_map_rad), y + d * np.sin(yaw_map_rad)) for d in along]
-    return np.asarray(
-        np.mean([by_class[world.terrain_class(*at)] * world.resistance_factor(*at) for at in places], axis=0)
-    )
 
 
 def _tangent_pose(yaw_rad: Float, rise_east: Float, rise_north: Float) -> Float:

@@ -10,10 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.simulation.robot import GroundModel, SimulatedRobot
+from tcpipe.simulation.ripples import Wave, waves
+from tcpipe.simulation.robot import GroundModel, SimulatedRobot, Wheels
 from tcpipe.simulation.route import AlongRoad, Wander
 from tcpipe.simulation.sensors import Gnss, Power, Sensors
 from tcpipe.simulation.site import Site
+from tcpipe.simulation.surface import Look, Surface
 from tcpipe.simulation.world import (
     GRASS,
     MUD,
@@ -26,7 +28,6 @@ from tcpipe.simulation.world import (
     Ellipse,
     Hill,
     World,
-    waves,
 )
 
 _GROUNDS = {"grass": GRASS, "mud": MUD, "unpaved_road": UNPAVED, "paved_road": PAVED}
@@ -51,9 +52,38 @@ def paper_site() -> PaperSite:
     """Return a site as large, as high and as steep as the paper's (section IV-A), its robot, and drives with its class shares."""
     told = paper_parameters()
     ground = {_GROUNDS[name]: GroundModel(**_numbers(table)) for name, table in told["ground"].items()}
-    robot = SimulatedRobot(**_of(SimulatedRobot, told["robot"]), ground=ground)
+    wheels = Wheels(**_of(Wheels, told["wheels"]))
+    robot = SimulatedRobot(**_of(SimulatedRobot, told["robot"]), ground=ground, wheels=wheels)
     sensors = Sensors(gnss=Gnss(**_of(Gnss, told["gnss"])), power=Power(**_of(Power, told["power"])))
     return PaperSite(paper_world(), robot, sensors, tuple(_tours(told["drives"])))
+
+
+def paper_surface() -> Surface:
+    """Return what the ground is like from metre to metre."""
+    told = paper_parameters()
+    states = told["states"]
+
+    def field(seed: int, name: str, count: int, **options: Any) -> tuple[Wave, ...]:
+        return waves(seed, count=count, total=1.0, wavelength_m=tuple(states[f"{name}_m"]), **options)
+
+    return Surface(
+        looks={_GROUNDS[name]: Look(**_of(Look, table)) for name, table in told["look"].items()},
+        wetness=field(31, "wetness", 16),
+        cover=field(32, "cover", 16),
+        roughness=field(33, "roughness", 10),
+        grain=field(34, "grain", 24),
+        bumps=field(35, "bumps", 20),
+        ridges=field(36, "ridges", 6, direction_rad=tuple(states["ridges_rad"])),
+        noise=field(37, "noise", 16),
+        map_noise_std_m=states["map_noise_std_m"],
+        swing=states["swing"],
+    )
+
+
+def hidden_as(world: World, factor: float) -> World:
+    """Return a world in which what nothing shows has ``factor`` times its variance."""
+    hidden = tuple(replace(wave, amplitude=float(np.sqrt(factor)) * wave.amplitude) for wave in world.resistance)
+    return replace(world, resistance=hidden)
 
 
 def _numbers(table: Mapping[str, Any]) -> dict[str, Any]:
@@ -131,6 +161,7 @@ def paper_world() -> World:
         ),
         texture=waves(22, count=12, total=surface["texture_share"], wavelength_m=(0.8, 6.0)),
         resistance=waves(23, count=10, total=surface["hidden_resistance_share"], wavelength_m=(1.5, 15.0)),
+        surface=paper_surface(),
     )
     return _stretched(world, about["lowest_m"], about["highest_m"])
 

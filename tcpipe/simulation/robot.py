@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tcpipe.compiled import kernel
 from tcpipe.simulation.site import Float
 from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED
+from tcpipe.tables.findings import ABSENT
 
 GRAVITY_MPS2 = 9.80665
 _STEEPEST_SIN = float(np.sin(np.radians(22.5)))
@@ -37,6 +38,22 @@ _GROUND = {
     UNPAVED: GroundModel(speed=0.94, slip=0.02, rolling_resistance=0.135),
     PAVED: GroundModel(speed=0.97, slip=0.01, rolling_resistance=0.115),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class Wheels:
+    """Four wheels without suspension, and what uneven and sidelong ground costs them."""
+
+    track_m: float
+    """From left to right."""
+    contact_m: float
+    """Length of a wheel's contact, over which bumps are averaged."""
+    bump_loss: float
+    """Share of the height climbed at bumps that is not given back."""
+    cornering_per_rad: float
+    """Side force per slip angle, over the normal force: on a slope the wheels run sidelong by so much that it holds."""
+    slowdown: float
+    """Speed lost by a rolling resistance beyond the class's, as a fraction of speed over one of weight."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +95,8 @@ class SimulatedRobot:
     """Its correlation time."""
     ground: dict[int, GroundModel] = field(default_factory=lambda: dict(_GROUND))
     """By class id; a class that is not named is grass."""
+    wheels: Wheels | None = field(default=None, metadata=ABSENT)
+    """None: the ground under the robot's middle counts, and its bumps and slope across cost nothing."""
 
     def ground_table(self) -> Float:
         """Return speed, slip and rolling resistance by class id, shape (256, 3)."""

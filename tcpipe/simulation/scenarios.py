@@ -11,12 +11,13 @@ import numpy as np
 from tcpipe.errors import UsageError
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.messages import Recorder
-from tcpipe.simulation.paper_site import paper_site
+from tcpipe.simulation.paper_site import paper_site, paper_surface
+from tcpipe.simulation.ripples import waves
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import AlongRoad, Leg, Manoeuvre, Pause, Reverse, Stuck, Turn, Wander
 from tcpipe.simulation.sensors import Imu, Sensors, Visual
 from tcpipe.simulation.site import Site
-from tcpipe.simulation.world import MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, World, waves
+from tcpipe.simulation.world import MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, World
 
 HUSKY_ROS2 = Recorder("ros2", "clearpath_power")
 HUSKY_ROS1 = Recorder("ros1", "husky_status")
@@ -130,7 +131,8 @@ def _paper_quick() -> Scenario:
         )
         for number, start in enumerate(starts, 1)
     )  # fmt: skip
-    return Scenario("paper_quick", small_world(), drives, _WEST, RasterSpec(0.1, 0.12, 0.1))
+    world = replace(small_world(), surface=paper_surface(), resistance=site.world.resistance)
+    return Scenario("paper_quick", world, drives, _WEST, RasterSpec(0.1, 0.12, 0.1))
 
 
 def _demo() -> Scenario:

@@ -183,7 +183,7 @@ def _write_raster(
 
 
 def _height_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:
-    return np.where(world.mapped(x, y), world.height_m(x, y), _HEIGHT_NODATA).astype(np.float32)[None]
+    return np.where(world.mapped(x, y), world.mapped_height_m(x, y), _HEIGHT_NODATA).astype(np.float32)[None]
 
 
 def _ortho_pixels(world: World, x: NDArray[np.float64], y: NDArray[np.float64]) -> Pixels:

@@ -15,7 +15,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.simulation.ripples import Wave, ripple
 from tcpipe.simulation.site import Float, Site
+from tcpipe.simulation.surface import Surface
+from tcpipe.tables.findings import ABSENT
 
 OBSTACLE, TREE, VEGETATION, GRASS, MUD, UNPAVED, PAVED = range(1, 8)
 
@@ -46,31 +49,6 @@ class Hill:
     height_m: float
     x_sigma_m: float
     y_sigma_m: float
-
-
-@dataclass(frozen=True, slots=True)
-class Wave:
-    """A plane wave: amplitude in the unit of what it ripples."""
-
-    amplitude: float
-    wavelength_m: float
-    direction_rad: float
-    phase_rad: float
-
-
-def waves(seed: int, *, count: int, total: float, wavelength_m: tuple[float, float]) -> tuple[Wave, ...]:
-    """Return plane waves of random direction and phase, log-uniform wavelength, and amplitudes that sum in square to ``total``²."""
-    rng = np.random.default_rng(seed)
-    amplitude = total * np.sqrt(2.0 / count)
-    return tuple(
-        Wave(
-            amplitude,
-            float(np.exp(rng.uniform(*np.log(wavelength_m)))),
-            float(rng.uniform(0.0, np.pi)),
-            float(rng.uniform(0.0, 2.0 * np.pi)),
-        )
-        for _ in range(count)
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,6 +124,8 @@ class World:
     """Ripples of the brightness, as a fraction."""
     resistance: tuple[Wave, ...] = field(default=())
     """Ripples of the rolling resistance that no map shows, as a fraction."""
+    surface: Surface | None = field(default=None, metadata=ABSENT)
+    """What the ground of a class is like from metre to metre; None: everywhere the same."""
 
     def height_m(self, x_map_m: Float, y_map_m: Float) -> Float:
         """Return the height above the geoid [m]."""
@@ -153,7 +133,16 @@ class World:
         total = np.full(np.broadcast_shapes(np.shape(u), np.shape(v)), self.base_m)
         for hill in self.hills:
             total += hill.height_m * _bell(u - hill.x_m, hill.x_sigma_m) * _bell(v - hill.y_m, hill.y_sigma_m)
-        return total + _ripple(self.waves, u, v)
+        return total + ripple(self.waves, u, v)
+
+    def mapped_height_m(self, x_map_m: Float, y_map_m: Float) -> Float:
+        """Return the height that a raster holds: with bumps and ridges, which wheels feel and the pose does not, and the map's noise."""
+        height = self.height_m(x_map_m, y_map_m)
+        if self.surface is None:
+            return height
+        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
+        classes = self.terrain_class(x_map_m, y_map_m)
+        return height + self.surface.relief_m(classes, u, v) + self.surface.map_noise_m(u, v)
 
     def gradient(self, x_map_m: Float, y_map_m: Float) -> tuple[Float, Float]:
         """Return the rise per map metre along the map's x and y."""
@@ -186,7 +175,10 @@ class World:
             share = np.clip(region.depth_m(u, v) / _SOFT_BORDER_M + 0.5, 0.0, 1.0)
             share = (share * share * (3.0 - 2.0 * share))[..., None]
             rgb += share * (_COLOUR[region.class_id] - rgb)
-        return rgb * (1.0 + _ripple(self.texture, u, v))[..., None]
+        shade = 1.0 + ripple(self.texture, u, v)
+        if self.surface is not None:
+            shade = shade * self.surface.shade(self.terrain_class(x_map_m, y_map_m), u, v)
+        return rgb * shade[..., None]
 
     def mapped(self, x_map_m: Float, y_map_m: Float) -> NDArray[np.bool_]:
         """Return whether the rasters hold data here."""
@@ -197,8 +189,12 @@ class World:
         return inside
 
     def resistance_factor(self, x_map_m: Float, y_map_m: Float) -> Float:
-        """Return what the rolling resistance is multiplied with here; no map layer shows it."""
-        return 1.0 + _ripple(self.resistance, x_map_m - self.site.west_m, y_map_m - self.site.south_m)
+        """Return what the class's rolling resistance is multiplied with here: what the orthophoto shows, and what nothing does."""
+        u, v = x_map_m - self.site.west_m, y_map_m - self.site.south_m
+        hidden = ripple(self.resistance, u, v)
+        if self.surface is None:
+            return 1.0 + hidden
+        return 1.0 + hidden + self.surface.resistance(self.terrain_class(x_map_m, y_map_m), u, v)
 
     @staticmethod
     def _near(regions: Sequence[Ellipse | Band], u: Float, v: Float) -> Sequence[Ellipse | Band]:
@@ -212,14 +208,3 @@ class World:
 
 def _bell(offset_m: Float, sigma_m: float) -> Float:
     return np.exp(-0.5 * (offset_m / sigma_m) ** 2)
-
-
-def _ripple(waves: Sequence[Wave], u: Float, v: Float) -> Float:
-    """Sum the waves; sin(a + b) is expanded, so that row and column vectors meet in outer products only."""
-    total = np.zeros(np.broadcast_shapes(np.shape(u), np.shape(v)))
-    for wave in waves:
-        k = 2.0 * np.pi / wave.wavelength_m
-        a = k * np.cos(wave.direction_rad) * u + wave.phase_rad
-        b = k * np.sin(wave.direction_rad) * v
-        total += wave.amplitude * (np.sin(a) * np.cos(b) + np.cos(a) * np.sin(b))
-    return total

@@ -7,7 +7,7 @@ import pytest
 
 from tcpipe.learning.plant_floor import plant_costs
 from tcpipe.simulation.drive import drive
-from tcpipe.simulation.paper_site import paper_site
+from tcpipe.simulation.paper_site import paper_site, paper_surface
 from tcpipe.simulation.route import Leg, Pause
 from tcpipe.simulation.scenarios import small_world
 from tcpipe.simulation.truth import true_cost
@@ -20,9 +20,10 @@ class _Chords:
         self.column = columns.__getitem__
 
 
-def test_without_hidden_effects_the_truth_is_what_it_says():
+@pytest.mark.parametrize("surface", [None, paper_surface()], ids=["even", "uneven"])
+def test_without_hidden_effects_the_truth_is_what_it_says(surface):
     robot = replace(paper_site().robot, resistance_noise=0.0, scrub_torque_nm=0.0)
-    world = replace(small_world(), resistance=())
+    world = replace(small_world(), resistance=(), surface=surface)
     plan = [Pause(1.0), Leg(((56.0, 52.0),)), Pause(1.0)]
     truth = drive(world, plan, start_m=(6.0, 52.0), robot=robot, weave_m=0.0, rng=np.random.default_rng(0))
     steady = np.flatnonzero((truth.command_velocity_mps > 0.99) & (truth.forward_velocity_mps > 0.5))[300:-600:100]
@@ -31,7 +32,7 @@ def test_without_hidden_effects_the_truth_is_what_it_says():
     end = truth.at(cost.end_ns.astype(np.int64))
     chords = _Chords(
         start_lon_deg=truth.lon_deg[steady], start_lat_deg=truth.lat_deg[steady],
-        end_lon_deg=end.lon_deg, end_lat_deg=end.lat_deg,
+        end_lon_deg=end.lon_deg, end_lat_deg=end.lat_deg, turn_rate_radps=np.zeros(len(steady)),
     )  # fmt: skip
     told = plant_costs(world, robot, chords)
     assert len(start) > 40
