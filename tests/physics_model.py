@@ -66,8 +66,9 @@ class PhysicsModel:
     )
     residuals: dict = field(default_factory=made_residuals)
     physics: PhysicsFit | None = None
+    takes_turns: bool = False
 
-    def predict(self, patches):
+    def predict(self, patches, beside=None):  # noqa: ARG002  it is told nothing that it wants
         height = patches[..., self.channels.index("height")].astype(np.float64)
         px = height.shape[1]
         along = (np.arange(px) + 0.5) / px * self.patch_m

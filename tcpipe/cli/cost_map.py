@@ -14,6 +14,7 @@ from tcpipe.cli.options import (
     json_option,
     map_option,
     quiet_option,
+    speed_option,
     store_option,
 )
 
@@ -37,6 +38,7 @@ from tcpipe.cli.options import (
     type=LonLat(),
     help="Where the Nav2 maps' frame begins, as navsat_transform's datum (default: where the map's CRS does).",
 )
+@speed_option
 @store_option
 @json_option
 @quiet_option
@@ -47,6 +49,7 @@ def cost_map(
     map_name: str | None,
     step_m: float,
     origin_deg: tuple[float, float] | None,
+    speed_mps: float | None,
     store: str,
     as_json: bool,
     quiet: bool,
@@ -57,12 +60,12 @@ def cost_map(
     maps for Nav2. An interrupted call goes on where it was.
     """
     from tcpipe.cli.output import progress, say_result
-    from tcpipe.learning.models import load_model
+    from tcpipe.learning.models import chosen_model
     from tcpipe.planning.cost_map import make_cost_map
     from tcpipe.planning.inputs import chosen_map
 
     with progress("cost-map", 1, quiet=quiet) as shown:
         source = chosen_map(store, map_name)
-        found = load_model(model)
+        found = chosen_model(model, speed_mps=speed_mps)
         result = make_cost_map(found, source, Path(out), step_m=step_m, origin_deg=origin_deg, step=shown.count)
     say_result(result, as_json=as_json)

@@ -121,6 +121,15 @@ physics_option = click.option(
 )
 """``--physics``: whose physics costs the turns of a path."""
 
+speed_option = click.option(
+    "--speed",
+    "speed_mps",
+    type=FloatRange(0.0, 100.0, min_open=True),
+    metavar="MPS",
+    help="Commanded speed, for a model trained with --beside (default: the mean of its training).",
+)
+"""``--speed``: what speed is planned to be commanded."""
+
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _MOST_SHARDS = 100_000
 

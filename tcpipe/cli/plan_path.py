@@ -15,6 +15,7 @@ from tcpipe.cli.options import (
     json_option,
     physics_option,
     quiet_option,
+    speed_option,
     store_option,
 )
 
@@ -54,6 +55,7 @@ from tcpipe.cli.options import (
 )
 @click.option("--allow-unseen", is_flag=True, help="Also cross ground unlike any that the model was trained on.")
 @physics_option
+@speed_option
 @store_option
 @json_option
 @quiet_option
@@ -70,6 +72,7 @@ def plan_path(
     step_m: float,
     allow_unseen: bool,
     physics: str | None,
+    speed_mps: float | None,
     store: str,
     as_json: bool,
     quiet: bool,
@@ -87,6 +90,13 @@ def plan_path(
     with progress("plan-path", 1, quiet=quiet) as shown:
         source = chosen_map(store, map_name)
         drawn = Path(picture) if picture else None
-        result = plan(chosen_model(model, physics), source, request, out=Path(out), picture=drawn, step=shown.count)
+        result = plan(
+            chosen_model(model, physics=physics, speed_mps=speed_mps),
+            source,
+            request,
+            out=Path(out),
+            picture=drawn,
+            step=shown.count,
+        )
     say_result(result, as_json=as_json)
     return result.exit_code

@@ -14,6 +14,7 @@ from tcpipe.cli.options import (
     map_option,
     physics_option,
     quiet_option,
+    speed_option,
     store_option,
 )
 
@@ -31,6 +32,7 @@ from tcpipe.cli.options import (
 @map_option
 @click.option("--out", type=OUTPUT_FILE, metavar="FILE", help="Write the table of pieces: .csv, .parquet or .json.")
 @physics_option
+@speed_option
 @store_option
 @json_option
 @quiet_option
@@ -41,6 +43,7 @@ def predict_path(
     map_name: str | None,
     out: str | None,
     physics: str | None,
+    speed_mps: float | None,
     store: str,
     as_json: bool,
     quiet: bool,
@@ -57,6 +60,11 @@ def predict_path(
 
     with progress("predict-path", 1, quiet=quiet):
         source = chosen_map(store, map_name)
-        result = run(chosen_model(model, physics), source, Path(path_file), Path(out) if out else None)
+        result = run(
+            chosen_model(model, physics=physics, speed_mps=speed_mps),
+            source,
+            Path(path_file),
+            Path(out) if out else None,
+        )
     say_result(result, as_json=as_json)
     return result.exit_code

@@ -13,8 +13,9 @@ from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRan
 @click.argument("dataset", type=INPUT_DIRECTORY, metavar="DATASET")
 @click.argument("out", default="model", type=OUTPUT_DIRECTORY, metavar="[OUT]")
 @click.option(
-    "--model", default="resnet18", show_default=True, type=click.Choice(["resnet18", "table"]),
-    help="The paper's network, or boosted trees on features of patches, in seconds; they heed --loss, --weights and --label alone.",
+    "--model", default="resnet18", show_default=True, type=click.Choice(["resnet18", "table", "physics"]),
+    help="The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, --weights, "
+    "--label and --beside alone.",
 )  # fmt: skip
 @click.option(
     "--loss", default="nrmse", show_default=True, type=click.Choice(["nrmse", "paper_eq4"]),
@@ -48,6 +49,11 @@ from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRan
     "--label", default="total", show_default=True, type=click.Choice(["total", "above_standing"]),
     help="Energy to train on: all that was measured, or less what the robot draws while it stands.",
 )  # fmt: skip
+@click.option(
+    "--beside",
+    is_flag=True,
+    help="Tell it the turn and the commanded speed of each metre beside its patch; the paper does not.",
+)
 @click.option("--seed", default=0, show_default=True, type=SEED, help="Of weights, shuffles and mirrors.")
 @click.option("--fresh", is_flag=True, help="Do not go on from where an earlier training was stopped.")
 @json_option

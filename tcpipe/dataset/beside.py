@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,16 +33,75 @@ class Beside:
         return Beside(*(getattr(self, of.name)[rows] for of in fields(self)))
 
 
+@dataclass(frozen=True, slots=True)
+class BesideInput:
+    """A number that a model takes beside a patch, and what it was among the training samples."""
+
+    name: Literal["turn_radpm", "command_mps"]
+    mean: float
+    deviation: float
+    """Greater than 0."""
+    usual: float
+    """What a metre has of which it is not known: the mean, unless the user says what."""
+    seen: tuple[float, float]
+    """Smallest and largest."""
+
+
+COLUMNS = ("turn_rate_radps", "duration_s", "arc_length_m", "commanded_velocity_mps")
+"""Of samples.parquet, that the inputs are formed of."""
+
+
 def beside_of(split: Split) -> Beside:
-    """Return what the samples of a split have beside their patches; columns that an older dataset lacks are NaN."""
-    turned_rad = _numbers(split, "turn_rate_radps") * _numbers(split, "duration_s")
-    return Beside(
-        np.nan_to_num(_numbers(split, "terrain_class"), nan=0.0).astype(np.int64),
-        _numbers(split, "slope_rad"),
-        turned_rad / _numbers(split, "arc_length_m"),
-        _numbers(split, "commanded_velocity_mps"),
-    )
+    """Return what the samples of a split have beside their patches; what an older dataset lacks is NaN."""
+    turn, command = _formed([split.column(name).astype(np.float64) for name in COLUMNS])
+    class_id = np.nan_to_num(split.column("terrain_class").astype(np.float64), nan=0.0).astype(np.int64)
+    return Beside(class_id, split.column("slope_rad").astype(np.float64), turn, command)
 
 
-def _numbers(split: Split, name: str) -> Floats:
-    return split.column(name).astype(np.float64)
+def nothing_beside(count: int) -> Beside:
+    """Return that nothing is known of so many metres."""
+    unknown = np.full(count, np.nan)
+    return Beside(np.zeros(count, np.int64), unknown, unknown, unknown)
+
+
+def inputs_of(beside: Beside) -> tuple[BesideInput, ...]:
+    """Return the inputs that these samples tell: those that are known of any of them."""
+    found = []
+    for name in ("turn_radpm", "command_mps"):
+        values = getattr(beside, name)
+        if (known := values[np.isfinite(values)]).size:
+            mean = float(known.mean())
+            found.append(
+                BesideInput(name, mean, max(float(known.std()), 1e-3), mean, (float(known.min()), float(known.max())))
+            )
+    return tuple(found)
+
+
+def numbers_of(inputs: Sequence[BesideInput], beside: Beside) -> Floats:
+    """Return what a model takes beside N patches, in units of its deviation from its mean, shape (N, inputs)."""
+    return _scaled(inputs, {"turn_radpm": beside.turn_radpm, "command_mps": beside.command_mps})
+
+
+def numbers_of_columns(inputs: Sequence[BesideInput], columns: NDArray[np.floating]) -> Floats:
+    """Return the same of `COLUMNS`, shape (N, 4)."""
+    turn, command = _formed(list(columns.T.astype(np.float64)))
+    return _scaled(inputs, {"turn_radpm": turn, "command_mps": command})
+
+
+def _formed(columns: Sequence[Floats]) -> tuple[Floats, Floats]:
+    rate, duration, arc, command = columns
+    return rate * duration / arc, command
+
+
+def _scaled(inputs: Sequence[BesideInput], values: dict[str, Floats]) -> Floats:
+    columns = [np.where(np.isfinite(values[of.name]), values[of.name], of.usual) for of in inputs]
+    scaled = [(column - of.mean) / of.deviation for of, column in zip(inputs, columns, strict=True)]
+    return np.column_stack(scaled) if scaled else np.empty((len(next(iter(values.values()))), 0))
+
+
+def with_planes(patches: NDArray[np.float32], numbers: Floats) -> NDArray[np.float32]:
+    """Return patches, shape (N, px, px, depth), with a channel of one value for each of N rows of numbers."""
+    if not numbers.shape[1]:
+        return patches
+    planes = np.broadcast_to(numbers[:, None, None, :].astype(np.float32), (*patches.shape[:3], numbers.shape[1]))
+    return np.concatenate([patches, planes], axis=3)

@@ -21,7 +21,9 @@ class Architecture:
     """Channels of a patch."""
     outputs: int = 2
     width: int = 64
-    """Filters of the first stage, a multiple of `BLOCK`; 64 is ResNet-18, less is a narrower copy for quick runs, 0 a table."""
+    """Filters of the first stage, a multiple of `BLOCK`; 64 is ResNet-18, less is a narrower copy for quick runs, 0 no network."""
+    beside: int = 0
+    """Numbers that it takes beside a patch, each as a channel of one value."""
 
 
 def check_trainable(shape: Architecture) -> None:

@@ -267,9 +267,10 @@ def _warnings(ours: Model, data: Dataset, sets: Sets) -> list[str]:
             count = int((found.class_ids == class_id).sum())
             if class_id not in {NODATA_ID, *ours.class_counts}:
                 lines.append(f"{called}: {count} samples of {name}, none in training: the model never saw this class")
-    if ours.card.training.config.model == "table":
+    if (kind := ours.card.training.config.model) != "resnet18":
         lines.append(
-            "the model is a table: the networks of Wei and Isler are trained beside a network alone, and are not here"
+            f"the model is {'a table' if kind == 'table' else 'physics'}: the networks of Wei and Isler are trained beside a network "
+            "alone, and are not here"
         )
     if dataset_checksum(data.card) != ours.card.dataset.sha256:
         lines.append(

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
+from tcpipe.dataset.beside import COLUMNS, BesideInput, beside_of, numbers_of, numbers_of_columns, with_planes
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.errors import ModelError
 from tcpipe.learning.architecture import Architecture, check_trainable
@@ -25,13 +26,15 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger("tcpipe")
 
-ModelKind = Literal["resnet18", "table"]
-"""The paper's network on patches, or boosted trees on features of them."""
+ModelKind = Literal["resnet18", "table", "physics"]
+"""The paper's network on patches, boosted trees on features of them, or coefficients of physics."""
 
 Floats = NDArray[np.float32]
 
 _SLOWER = 0.1
 """What the learning rate is multiplied by where it is too long a step."""
+
+_TOGETHER = 256
 
 _LAST = 0.8
 """Share of the most epochs after which the rate is smaller in any case."""
@@ -39,7 +42,10 @@ _LAST = 0.8
 
 @dataclass(frozen=True, slots=True)
 class FitConfig:
-    """How a model is trained; the paper gives ResNet-18, equation 4 and the learning rate. A table takes loss, weights and label alone."""
+    """How a model is trained; the paper gives ResNet-18, equation 4 and the learning rate.
+
+    A table and physics take loss, weights, label and beside alone.
+    """
 
     model: ModelKind = "resnet18"
     loss: Loss = "nrmse"
@@ -61,6 +67,8 @@ class FitConfig:
     """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
     """Which energy is trained on: all that was measured, or what is above standing."""
+    beside: bool = False
+    """Whether it is told the turn and the commanded speed of each metre."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +81,8 @@ class Task:
     held: Split
     outputs: tuple[str, ...]
     """The split's label columns, or its energy alone."""
+    beside: tuple[BesideInput, ...] = ()
+    """What it is told beside a patch."""
 
 
 @dataclass(slots=True)
@@ -145,13 +155,15 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         write_checkpoint(checkpoint, progress, _state(trainer, best))
         _say(name, progress, config, spent)
     network.set_arrays(best, str(checkpoint))
-    return Fitted(best, scale, task.held, predicted(network, task.held, scale), progress, spent, device)
+    return Fitted(best, scale, task.held, predicted(network, task, task.held, scale), progress, spent, device)
 
 
 def _new_trainer(task: Task, config: FitConfig, scale: Sequence[float], factors: Floats) -> tuple[Trainer, str]:
     """Return an untrained network with its optimiser, and what it runs on."""
     start = labels_of(task.fit, task.outputs).mean(axis=0) / scale
-    shape = Architecture(task.fit.view.stored.files.patch_px, task.fit.view.form.depth, len(scale), config.width)
+    shape = Architecture(
+        task.fit.view.stored.files.patch_px, task.fit.view.form.depth, len(scale), config.width, len(task.beside)
+    )
     check_trainable(shape)
     from tcpipe.learning.network import device_name, resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
     from tcpipe.learning.trainer import Trainer  # noqa: PLC0415
@@ -164,11 +176,14 @@ def label_scale(task: Task) -> tuple[float, ...]:
     return tuple(float(value) for value in labels_of(task.train, task.outputs).max(axis=0))
 
 
-def predicted(network: ResNet18, split: Split, scale: Sequence[float]) -> Floats:
+def predicted(network: ResNet18, task: Task, split: Split, scale: Sequence[float]) -> Floats:
     """Return what a network says of all samples of a split, in the labels' units, shape (N, outputs)."""
-    batches: Iterable[Any] = split.batches(256)
-    found = [network.predict(patches) for patches, _ in batches]
-    return np.concatenate([np.empty((0, len(scale)), np.float32), *found]) * np.array(scale, np.float32)
+    numbers, found, first = numbers_of(task.beside, beside_of(split)), [np.empty((0, len(scale)), np.float32)], 0
+    batches: Iterable[Any] = split.batches(_TOGETHER)
+    for patches, _ in batches:
+        found.append(network.predict(with_planes(patches, numbers[first : first + len(patches)])))
+        first += len(patches)
+    return np.concatenate(found) * np.array(scale, np.float32)
 
 
 def held_loss(network: ResNet18, task: Task, scale: Sequence[float], factors: Floats, *, weighted: bool) -> float:
@@ -176,7 +191,7 @@ def held_loss(network: ResNet18, task: Task, scale: Sequence[float], factors: Fl
     over = np.array(scale, np.float32)
     labels = labels_of(task.held, task.outputs) / over
     weights = task.held.weights if weighted and len(over) == task.held.weights.shape[1] else np.ones_like(labels)
-    return float(mean_loss(predicted(network, task.held, scale) / over, labels, factors, weights))
+    return float(mean_loss(predicted(network, task, task.held, scale) / over, labels, factors, weights))
 
 
 def learning_rate(config: FitConfig, progress: TrainingProgress) -> float:
@@ -205,6 +220,8 @@ def _epoch(
     """Train on every sample once; return the mean loss."""
     energy = len(task.outputs) == 1
     rules: dict[str, Any] = {"features": task.outputs} if energy else {"weights": config.weights}
+    if task.beside:
+        rules["features"] = COLUMNS
     batches = task.fit.batches(config.batch, shuffle=True, seed=config.seed, mirror=config.mirror, **rules)
     rate = learning_rate(config, progress)
     total, count, began = 0.0, 0, time.perf_counter()
@@ -212,6 +229,8 @@ def _epoch(
     asked = began
     while (batch := next(feed, None)) is not None:
         patches, labels = batch[0] if energy else batch[:2]
+        if task.beside:
+            patches = with_planes(patches[0], numbers_of_columns(task.beside, patches[1]))
         weights = batch[2] if len(batch) == 3 else np.ones_like(labels)
         spent.feeding_s += time.perf_counter() - asked
         total += trainer.step(patches, labels / scale, weights, rate) * len(patches)

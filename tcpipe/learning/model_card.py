@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from tcpipe.dataset.beside import BesideInput
 from tcpipe.dataset.energies import EnergyName
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.seals import Checksum
@@ -69,6 +70,8 @@ class ModelCard:
     channels: tuple[str, ...]
     outputs: tuple[str, ...]
     """Columns that it predicts, in order: w, v (or E for a baseline)."""
+    beside: tuple[BesideInput, ...] = ()
+    """What it takes beside a patch."""
     scale: tuple[float, ...]
     """Largest label of train in each output's unit: what the network gives is multiplied by it."""
     patch_m: float

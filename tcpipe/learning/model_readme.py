@@ -18,6 +18,9 @@ Predicts {{ outputs }} of {{ chord }} m of ground ahead of the robot from a patc
 mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{ chord }} m.
 
 - Takes float32 (N, {{ px }}, {{ px }}, {{ depth }}) in [0, 1]: {{ channels }}; a patch is {{ patch }} m wide, travel to the right.
+{% if beside -%}
+- Is told beside a patch: {{ beside }}.
+{% endif -%}
 - Velocity is the {{ velocity }} one; power is {{ energy }}; robot {{ robot }}.
 {%- if includes %}
   What was measured feeds {{ includes }}, too.
@@ -25,6 +28,10 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
 {% if config.model == "table" -%}
 - Table: up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM), as many as are best where each fold of
   train is predicted by the others; their loss {{ config.loss }} there is {{ "%.4f" | format(told.held_out_loss) }}.
+{% elif config.model == "physics" -%}
+- Physics: standing, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted robustly. Its
+  loss {{ config.loss }} where each fold of train is predicted by the others is {{ "%.4f" | format(told.held_out_loss) }}. Of a patch it
+  takes slope and class, which `predict` is told beside it.
 {% else -%}
 - Network: ResNet-18 of width {{ width }}; loss {{ config.loss }}, Adam {{ config.learning_rate }}, batch {{ config.batch }},
   seed {{ config.seed }}; best of {{ told.epochs }} epochs by fold {{ config.fold }} of train: {{ told.best_epoch }},
@@ -53,6 +60,7 @@ def model_readme(card: ModelCard) -> str:
         outputs=", ".join(card.outputs), chord=f"{card.chord_m:g}", px=card.architecture.patch_px,
         depth=card.architecture.depth, channels=", ".join(card.channels), patch=f"{card.patch_m:g}",
         velocity=card.label_velocity, energy=ENERGIES[card.label_energy].words,
+        beside=", ".join(f"{of.name} (usually {of.usual:.3g})" for of in card.beside),
         includes="; ".join(map(_in_markdown, card.label_includes)), robot=card.robot, width=card.architecture.width,
         config=card.training.config, told=card.training, dataset=dataset, classes=", ".join(counts),
         slope=" to ".join(f"{np.degrees(value):.1f}°" for value in card.seen.ranges["slope_rad"]),

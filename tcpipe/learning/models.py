@@ -3,8 +3,8 @@
 ::
 
     model.json         what it takes, gives, and has seen; how it was trained; checksums of the rest
-    weights.npz        every weight by its path in the network; the arrays of a table's trees
-    residuals.parquet  labels and predictions of the fold that training was stopped by; of a table, of all samples by the other folds
+    weights.npz        every weight by its path in the network; the arrays of a table's trees; coefficients of physics
+    residuals.parquet  labels and predictions of the fold that stopped a network; else of all samples, by the other folds
     history.csv        losses of every epoch
     MODEL.md           the same for people
 """
@@ -21,6 +21,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from tcpipe.dataset.beside import Beside, nothing_beside, numbers_of, with_planes
 from tcpipe.errors import ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import atomic_directory, write_text
 from tcpipe.formats.dataset_files import read_card
@@ -31,6 +32,7 @@ from tcpipe.formats.weights import read_arrays, write_arrays
 from tcpipe.learning.architecture import check_trainable
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
+from tcpipe.learning.physics_model import PhysicsModel, physics_model_of
 from tcpipe.tables.findings import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
@@ -50,6 +52,9 @@ FILES = CARD, WEIGHTS, RESIDUALS, HISTORY, README = (
 )
 
 _TOGETHER = 256
+
+_SPEED_MARGIN_MPS = 0.01
+"""By which a speed that is asked for may lie beside those of training: it is rounded."""
 
 
 @dataclass(frozen=True)
@@ -80,6 +85,16 @@ class Model:
         from tcpipe.learning.forest import forest_of  # noqa: PLC0415  numba takes a second
 
         return forest_of(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
+
+    @cached_property
+    def physics_model(self) -> PhysicsModel:
+        """Return the coefficients of a model of physics."""
+        return physics_model_of(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
+
+    @property
+    def takes_turns(self) -> bool:
+        """Whether it is told how far a metre turns, and its predictions hold what that costs."""
+        return any(of.name == "turn_radpm" for of in self.card.beside)
 
     @property
     def classes(self) -> ClassTable:
@@ -146,32 +161,44 @@ class Model:
         """Smallest and largest slope_rad, cross_slope_rad, relief_m in training."""
         return self.card.seen.ranges
 
-    def predict(self, patches: Floats) -> Floats:
-        """Return power [W] and velocity [m/s], shape (N, 2), of patches in [0, 1], shape (N, px, px, depth)."""
+    def predict(self, patches: Floats, beside: Beside | None = None) -> Floats:
+        """Return power [W] and velocity [m/s], shape (N, 2), of patches in [0, 1], shape (N, px, px, depth).
+
+        ``beside`` is what is known of the N metres beside their patches (`tcpipe.dataset.beside.beside_of` of a split): physics needs
+        it, other models take what they were trained with, and what is usual where it is not given.
+        """
         wanted = (self.patch_px, self.patch_px, self.card.architecture.depth)
         if patches.shape[1:] != wanted:
             raise ModelError(
                 f"{self.name}: patches of shape {patches.shape[1:]}, wanted {wanted}: {', '.join(self.channels)}"
             )
-        out = self.outputs(patches)
+        out = self.outputs(patches, beside)
         if "velocity_mps" in self._short_outputs:
             column = self._short_outputs.index("velocity_mps")
             out[:, column] = np.maximum(out[:, column], np.float32(LEAST_VELOCITY_MPS))
         return out
 
-    def outputs(self, patches: Floats) -> Floats:
+    def outputs(self, patches: Floats, beside: Beside | None = None) -> Floats:
         """Return what the model gives, in the units of its outputs, shape (N, outputs)."""
-        if self.card.training.config.model == "resnet18":
-            return self.network.predict(patches) * np.array(self.card.scale, np.float32)
+        kind = self.card.training.config.model
+        if kind == "physics":
+            if beside is None:
+                raise ModelError(
+                    f"{self.name}: physics needs the slope and class of each patch: predict(patches, beside)"
+                )
+            return self.physics_model.predict(beside).astype(np.float32)
+        numbers = numbers_of(self.card.beside, beside or nothing_beside(len(patches)))
+        if kind == "resnet18":
+            return self.network.predict(with_planes(patches, numbers)) * np.array(self.card.scale, np.float32)
         from tcpipe.learning.patch_features import patch_features  # noqa: PLC0415  where it is needed, as is the next
 
         out = np.empty((len(patches), len(self.card.scale)), np.float32)
         for first in range(0, len(patches), _TOGETHER):
+            rows = slice(first, first + _TOGETHER)
             features = patch_features(
-                patches[first : first + _TOGETHER],
-                channels=self.channels, class_count=self.classes.count, patch_m=self.patch_m,
-            )  # fmt: skip
-            out[first : first + _TOGETHER] = self.forest.predict(features)
+                patches[rows], channels=self.channels, class_count=self.classes.count, patch_m=self.patch_m
+            )
+            out[rows] = self.forest.predict(np.column_stack([features, numbers[rows]]))
         return out
 
     @cached_property
@@ -214,14 +241,31 @@ def load_model(path: str | Path) -> Model:
     return Model(str(path), card, place, card_checksum(card), residuals)
 
 
-def chosen_model(path: str, physics: str | None) -> Model:
-    """Return a model as `load_model`, with the physics of a dataset where one is given."""
+def chosen_model(path: str, *, physics: str | None = None, speed_mps: float | None = None) -> Model:
+    """Return a model as `load_model`, with the physics of a dataset and asked for a commanded speed [m/s] where these are given."""
     model = load_model(path)
-    return model if physics is None else with_physics(model, Path(physics))
+    model = model if physics is None else with_physics(model, Path(physics))
+    return model if speed_mps is None else at_speed(model, speed_mps)
+
+
+def at_speed(model: Model, speed_mps: float) -> Model:
+    """Return the model asked for a commanded speed [m/s] instead of the usual one; `UsageError` if it knows no such speed."""
+    command = next((of for of in model.card.beside if of.name == "command_mps"), None)
+    if command is None:
+        raise UsageError(f"{model.name}: takes no commanded speed; leave out --speed, or train it with --beside")
+    low, high = command.seen
+    if not low - _SPEED_MARGIN_MPS <= speed_mps <= high + _SPEED_MARGIN_MPS:
+        raise UsageError(
+            f"--speed {speed_mps:g}: {model.name} was trained at commanded speeds of {low:.3g} to {high:.3g} m/s; give one of these"
+        )
+    beside = tuple(replace(of, usual=speed_mps) if of is command else of for of in model.card.beside)
+    return replace(model, card=replace(model.card, beside=beside), checksum=digest([model.checksum, speed_mps]))
 
 
 def with_physics(model: Model, dataset: Path) -> Model:
     """Return the model with the physics of its robot that a dataset's card holds, instead of its own; `ModelError` if it holds none."""
+    if model.takes_turns:
+        raise UsageError(f"{model.name}: is told the turns of a path and holds what they cost; leave out --physics")
     card = read_card(dataset)
     if model.robot not in card.physics:
         raise ModelError(

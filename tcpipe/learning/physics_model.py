@@ -97,7 +97,7 @@ def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | 
         standing_watt=_of_all(found, "standing"),
         grade_newton=_of_all(found, "grade"),
         recovered=np.array(found.recovered),
-        usual_turn_radpm=np.array(float(np.median(known)) if known.size else 0.0),
+        usual_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
         rolling_newton=_by_class(found, "rolling"),
         turning_joule_per_rad=_by_class(found, "turning"),
     )

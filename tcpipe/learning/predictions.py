@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Dataset, Split
+from tcpipe.dataset.beside import beside_of
 from tcpipe.errors import ModelError
 from tcpipe.learning.metrics import Array, costs
 from tcpipe.learning.model_card import ModelCard
@@ -85,10 +86,12 @@ def predicted_costs(
     rng = np.random.default_rng(list(seed))
     replaced = [model.channels.index(name) for name in noise]
     parts = [np.empty((0, len(model.card.outputs)), np.float32)]
+    beside, first = beside_of(split), 0
     for patches in _patches(chosen):
         for channel in replaced:
             patches[..., channel] = rng.random(patches.shape[:3], np.float32)
-        parts.append(model.predict(patches))
+        parts.append(model.predict(patches, beside.take(slice(first, first + len(patches)))))
+        first += len(patches)
     said = np.concatenate(parts).astype(np.float64)
     return {"E": said[:, 0]} if said.shape[1] == 1 else costs(said[:, 0], said[:, 1], model.chord_m)
 

@@ -1,26 +1,41 @@
-"""Fitting a table model: features of every patch, trees over them, and what each fold's samples were told by the other folds."""
+"""Fitting a model at once, without epochs: trees over features of every patch, or physics; each sample is told by the other folds, too."""
 
 from __future__ import annotations
 
 import logging
 import time
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
+from tcpipe.dataset.beside import beside_of, numbers_of
 from tcpipe.learning.checkpoint import TrainingProgress
 from tcpipe.learning.fitting import FitConfig, Fitted, Spent, Task, label_scale, labels_of
-from tcpipe.learning.forest import MOST_ROUNDS, grow
+from tcpipe.learning.forest import grow
 from tcpipe.learning.losses import loss_factors, mean_loss
 from tcpipe.learning.patch_features import Floats, patch_features
+from tcpipe.learning.physics_model import fit_physics_model, standing_of
 
 logger = logging.getLogger("tcpipe")
 
 _READ_TOGETHER = 1024
 
 
-def fit_table(task: Task, config: FitConfig, *, name: str, key: str, patch_m: float, class_count: int) -> Fitted:
-    """Fit trees to all of train, as many as its folds are told best by.
+@dataclass(frozen=True, slots=True)
+class _Made:
+    """A model's arrays, what it and what those of the other folds said of each sample, (N, outputs); how large it is."""
+
+    weights: dict[str, NDArray[np.generic]]
+    said: Floats
+    held_out: Floats
+    rounds: int
+    fed_s: float = 0.0
+
+
+def fit_at_once(task: Task, config: FitConfig, *, name: str, key: str, patch_m: float, class_count: int) -> Fitted:
+    """Fit a table or physics to all of train.
 
     Parameters
     ----------
@@ -38,26 +53,43 @@ def fit_table(task: Task, config: FitConfig, *, name: str, key: str, patch_m: fl
     Raises
     ------
     ModelError
-        LightGBM is not installed.
+        LightGBM is not installed, or there are too few samples.
 
     """
     split, scale, began = task.train, label_scale(task), time.perf_counter()
-    features = features_of(split, patch_m, class_count)
     labels = labels_of(split, task.outputs).astype(np.float64)
     weighed = config.weights and split.weights.shape == labels.shape
     weights = split.weights.astype(np.float64) if weighed else np.ones_like(labels)
-    fed_s = time.perf_counter() - began
-    logger.info("%s: %d samples of %d features, each predicted by the other folds", name, *features.shape)
-    grown = grow(features, labels, weights, split.column("fold"))
+    logger.info("%s: %d samples, each predicted by the other folds", name, len(split))
+    made = _physics(split, labels) if config.model == "physics" else _trees(task, labels, weights, patch_m, class_count)
     factors, over = loss_factors(config.loss, scale), np.array(scale)
-    loss, held = (
-        float(mean_loss(said / over, labels / over, factors, weights))
-        for said in (grown.forest.predict(features), grown.held_out)
-    )
+    loss, held = (float(mean_loss(said / over, labels / over, factors, weights)) for said in (made.said, made.held_out))
+    progress = TrainingProgress(key, made.rounds, made.rounds, held, [(made.rounds, loss, held)])
+    spent = Spent(time.perf_counter() - began, made.fed_s, len(split))
+    return Fitted(made.weights, (1.0,) * labels.shape[1], split, made.held_out, progress, spent, "cpu")
+
+
+def _trees(task: Task, labels: Floats, weights: Floats, patch_m: float, class_count: int) -> _Made:
+    """Grow trees, as many as the folds are told best by."""
+    split, began = task.train, time.perf_counter()
+    numbers = numbers_of(task.beside, beside_of(split))
+    features = np.column_stack([features_of(split, patch_m, class_count), numbers])
+    fed_s = time.perf_counter() - began
+    grown = grow(features, labels, weights, split.column("fold"))
     rounds = int(np.bincount(grown.forest.output).max())
-    progress = TrainingProgress(key, MOST_ROUNDS, rounds, held, [(rounds, loss, held)])
-    spent = Spent(time.perf_counter() - began, fed_s, len(split))
-    return Fitted(grown.forest.arrays(), (1.0,) * labels.shape[1], split, grown.held_out, progress, spent, "cpu")
+    return _Made(grown.forest.arrays(), grown.forest.predict(features), grown.held_out, rounds, fed_s)
+
+
+def _physics(split: Split, labels: Floats) -> _Made:
+    """Fit physics to all, and to all but each fold."""
+    beside, folds, standing_watt = beside_of(split), split.column("fold"), standing_of(split)
+    held_out = np.empty_like(labels)
+    for fold in np.unique(folds):
+        held = folds == fold
+        fitted = fit_physics_model(beside.take(~held), labels[~held], standing_watt=standing_watt)
+        held_out[held] = fitted.predict(beside.take(held))
+    whole = fit_physics_model(beside, labels, standing_watt=standing_watt)
+    return _Made(whole.arrays(), whole.predict(beside), held_out, 1)
 
 
 def features_of(split: Split, patch_m: float, class_count: int) -> Floats:

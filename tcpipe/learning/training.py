@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.dataset import Dataset, Split, open_dataset
+from tcpipe.dataset.beside import beside_of, inputs_of
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
@@ -29,6 +30,8 @@ from tcpipe.terrain.relief import relief_m
 logger = logging.getLogger("tcpipe")
 
 _READ_TOGETHER = 1024
+
+_CALLED = {"turn_radpm": "turn (turn_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +70,11 @@ class TrainResult:
         if self.status == "unchanged":
             return f"{self.path}: nothing to do: trained on the same dataset with the same options"
         fitted, held = self.samples["fitted"], self.samples["held out"]
+        if self.model == "physics":
+            return (
+                f"{self.path}: physics of {fitted} samples, each predicted by the other folds\n"
+                f"held-out loss {self.held_out_loss:.4f}; {self.spent.total_s:.1f} s"
+            )
         if self.model == "table":
             return (
                 f"{self.path}: {self.best_epoch} trees a label of {fitted} samples, each predicted by the other folds\n"
@@ -114,13 +122,15 @@ def train(
     """
     rules, other, place = config or FitConfig(), variant or Variant(), Path(out)
     data = open_dataset(dataset, label=rules.label)
+    if rules.model == "physics":
+        other = replace(other, channels=("height",))  # the patch itself is not looked at; every dataset has heights
     clear_beside(place)
     key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
     checkpoint = _checkpoint_of(place)
     if (known := _known(place)) is not None and known.training.key == key and not fresh and _is_whole(place):
         _drop_what_is_done(checkpoint, key)
         return _unchanged(place, known.training)
-    task = training_task(data, rules.fold, other)
+    task = _with_beside(training_task(data, rules.fold, other), rules, data)
     _refuse_strangers(place)
     if rules.weights and not other.energy_only:
         _refuse_without_deviations(task, data)
@@ -152,9 +162,9 @@ def train(
 def _fitted(task: Task, rules: FitConfig, data: Dataset, *, name: str, key: str, checkpoint: Path) -> Fitted:
     if rules.model == "resnet18":
         return fit(task, rules, name=name, key=key, checkpoint=checkpoint)
-    from tcpipe.learning.table_fitting import fit_table  # noqa: PLC0415  numba loads with it
+    from tcpipe.learning.table_fitting import fit_at_once  # noqa: PLC0415  numba loads with it
 
-    return fit_table(
+    return fit_at_once(
         task, rules, name=name, key=key, patch_m=data.card.patch_m, class_count=class_table(data.card).count
     )
 
@@ -196,6 +206,23 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
             f"wanted both (there are folds {named}; a block holds 10 m of ground: drive more of it)"
         )
     return Task(train, fitted, held, outputs)
+
+
+def _with_beside(task: Task, rules: FitConfig, data: Dataset) -> Task:
+    """Return the task with what its model is told beside a patch; physics takes the turn in any case, a network of energy alone nothing."""
+    if rules.model != "physics" and (not rules.beside or len(task.outputs) == 1):
+        return task
+    wanted = ("turn_radpm",) if rules.model == "physics" else ("turn_radpm", "command_mps")
+    found = tuple(of for of in inputs_of(beside_of(task.fit)) if of.name in wanted)
+    lacking = [_CALLED[name] for name in wanted if name not in {of.name for of in found}]
+    if lacking and not found and rules.model != "physics":
+        raise DatasetError(
+            f"{data.path}: its samples have no {' and no '.join(lacking)}; process the runs anew and build the dataset again, "
+            "or train without --beside"
+        )
+    if lacking:
+        logger.warning("%s: its samples have no %s: the model is not told it", data.path, " and no ".join(lacking))
+    return replace(task, beside=found)
 
 
 def what_was_seen(split: Split) -> Seen:
@@ -308,11 +335,16 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
     card, form = data.card, task.fit.view.form
     return ModelCard(
         architecture=Architecture(
-            card.patch_px, form.depth, len(fitted.scale), 0 if config.model == "table" else config.width
+            card.patch_px,
+            form.depth,
+            len(fitted.scale),
+            config.width if config.model == "resnet18" else 0,
+            len(task.beside),
         ),
         channels=task.fit.channels,
         outputs=task.outputs,
         scale=fitted.scale,
+        beside=task.beside,
         patch_m=card.patch_m,
         chord_m=card.recipe.segment.chord_m,
         max_arc_to_chord=card.recipe.segment.max_arc_to_chord,
@@ -321,7 +353,7 @@ def _card(data: Dataset, task: Task, config: FitConfig, fitted: Fitted, key: str
         label_includes=card.label.includes,
         robot=", ".join(card.robots),
         classes=class_table(card).classes,
-        seen=what_was_seen(task.train if config.model == "table" else task.fit),
+        seen=what_was_seen((task.fit if config.model == "resnet18" else task.train).with_channels(*card.layers)),
         physics=card.physics.get(card.robots[0]) if len(card.robots) == 1 else None,
         dataset=TrainedOn(card.name, dataset_checksum(card), card.data_model_version, card.splits),
         training=_told(task, config, fitted, key),
@@ -333,14 +365,17 @@ def class_table(card: DatasetCard) -> ClassTable:
     return ClassTable(card.classes) if card.classes else PAPER_CLASSES
 
 
+_OPTIMIZERS: Mapping[ModelKind, str] = {"resnet18": "Adam", "table": "LightGBM", "physics": "robust least squares"}
+
+
 def _told(task: Task, config: FitConfig, fitted: Fitted, key: str) -> Training:
     """Return what a model card tells of its training."""
     progress = fitted.progress
     return Training(
         key=key,
         config=config,
-        optimizer="LightGBM" if config.model == "table" else "Adam",
-        samples={"fitted": len(task.train if config.model == "table" else task.fit), "held out": len(fitted.held)},
+        optimizer=_OPTIMIZERS[config.model],
+        samples={"fitted": len(task.fit if config.model == "resnet18" else task.train), "held out": len(fitted.held)},
         epochs=progress.epoch,
         best_epoch=progress.best_epoch,
         held_out_loss=progress.best_loss,

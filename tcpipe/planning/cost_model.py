@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.dataset.beside import Beside
 from tcpipe.dataset.tensor import TensorForm
 from tcpipe.errors import ModelError
 from tcpipe.tables.findings import PhysicsFit
@@ -97,8 +98,12 @@ class CostModel(Protocol):
         ``power_predicted_watt``, ``velocity_predicted_mps``.
         """
 
-    def predict(self, patches: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return power [W] and velocity [m/s], shape (N, 2), of tensors of shape (N, px, px, channels)."""
+    @property
+    def takes_turns(self) -> bool:
+        """Whether it is told how far a metre turns: its predictions hold what that costs."""
+
+    def predict(self, patches: NDArray[np.float32], beside: Beside) -> NDArray[np.float32]:
+        """Return power [W] and velocity [m/s], shape (N, 2), of tensors of shape (N, px, px, channels), and what is known beside them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +137,12 @@ def check_model(model: CostModel, source: MapReader) -> None:
         raise ModelError(*problems)
 
 
-def predict_patches(model: CostModel, patches: Patches, asked: NDArray[np.bool_]) -> Predicted:
+def predict_patches(
+    model: CostModel, patches: Patches, asked: NDArray[np.bool_], turn_radpm: Floats | None = None
+) -> Predicted:
     """Return what the model says of the patches that it is asked about, shape (N,); tensors are formed batch by batch.
+
+    ``turn_radpm`` is how far a metre of each turns; NaN, or nothing, is as usual, and so is the speed that is commanded.
 
     Raises
     ------
@@ -142,9 +151,11 @@ def predict_patches(model: CostModel, patches: Patches, asked: NDArray[np.bool_]
     """
     form = _form(model)
     pixels = {layer: patches.pixels[layer] for layer in form.layers}
-    out = np.full((asked.size, 2), np.nan)
+    out, unknown = np.full((asked.size, 2), np.nan), np.full(asked.size, np.nan)
+    turns = unknown if turn_radpm is None else turn_radpm
+    beside = Beside(patches.terrain_class.astype(np.int64), patches.slope_rad, turns, unknown)
     for rows in _batches(np.flatnonzero(asked)):
-        said = model.predict(form.form(pixels, rows))
+        said = model.predict(form.form(pixels, rows), beside.take(rows))
         if said.shape != (rows.size, 2):
             raise ModelError(
                 f"{model.name}: gives {said.shape[-1]} numbers a patch, wanted two: power and velocity; train it on both labels"

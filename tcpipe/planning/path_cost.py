@@ -40,7 +40,8 @@ class PathTotals:
     turn_rad: float = 0.0
     """How far it turns, both ways counted."""
     turn_energy_joule: float | None = None
-    """Of the energy, what turns cost beyond those of the segments that the model knows; None where its robot's physics is not known."""
+    """Of the energy, what turns cost beyond those of the segments that the model knows; None where its robot's physics is not known, and
+    where the model was told the turns: its energies hold them."""
     duration_interval_s: tuple[float, float] | None
     """None, as that of energy, without held-out samples."""
     energy_interval_joule: tuple[float, float] | None
@@ -90,9 +91,16 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
     frames = pieces.frames(model.chord_m)
     if not corners_on(source.grid, footprints(frames, model.patch_m)).any():
         raise PathError(off_map_text(source, where, lonlat_deg))
-    said = joined(verdicts_of(model, source, in_batches(frames)))
+    turn_radpm = _turn_radpm(model, turns_between(pieces.start_xy_m, pieces.end_xy_m) / pieces.arc_m)
+    said = joined(verdicts_of(model, source, in_batches(frames), turn_radpm=turn_radpm))
     said.reasons[pieces.arc_m > model.max_arc_to_chord * pieces.chord_m] |= np.uint16(Reason.CURVED)
     return _costed(model, source, pieces, said)
+
+
+def _turn_radpm(model: CostModel, planned_radpm: Floats) -> Floats:
+    """Return how far metres turn: as planned, but NaN, as usual, where that is less: nobody drives as straight as a line is drawn."""
+    usual_radpm = 0.0 if model.physics is None else model.physics.usual_turn_radpm
+    return np.where(planned_radpm > usual_radpm, planned_radpm, np.nan)
 
 
 def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
@@ -116,7 +124,8 @@ def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: s
 def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts) -> PathCost:
     bits, class_id, errors = said.reasons, said.terrain_class, errors_of(model.residuals)
     duration, nothing = pieces.arc_m / said.velocity_mps, np.full(len(bits), np.nan)
-    turn_rad, turning = turns_between(pieces.start_xy_m, pieces.end_xy_m), turning_of(model.physics, model.classes)
+    turn_rad = turns_between(pieces.start_xy_m, pieces.end_xy_m)
+    turning = None if model.takes_turns else turning_of(model.physics, model.classes)
     turn_joule = nothing if turning is None else turning.energy_joule(turn_rad, pieces.arc_m, class_id)
     energy = said.power_watt * duration + np.nan_to_num(turn_joule)
     turn_joule = np.where(np.isfinite(energy), turn_joule, np.nan)

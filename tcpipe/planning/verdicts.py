@@ -41,24 +41,31 @@ class Verdicts:
 
 
 def verdicts_of(
-    model: CostModel, source: MapReader, batches: Iterable[PatchFrames], *, ask: bool = True
+    model: CostModel,
+    source: MapReader,
+    batches: Iterable[PatchFrames],
+    *,
+    ask: bool = True,
+    turn_radpm: Floats | None = None,
 ) -> Iterator[Verdicts]:
     """Yield what is said of each batch of frames, in order; tiles of the map are kept from batch to batch.
 
-    Without ``ask`` the ground is judged alone: no predictions.
+    Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
+    after another; without it all turn as usual.
     """
     tiles = TilePool(level_for(source, model.patch_m / model.patch_px))
 
-    def sampled(frames: PatchFrames) -> tuple[Patches, NDArray[np.bool_]]:
+    def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
         chord_m = np.full(len(frames.centre_xy_m), model.chord_m)
         on_map = corners_on(source.grid, footprints(frames, model.patch_m)) == 4
         patch_m, patch_px = model.patch_m, model.patch_px
-        return sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles), on_map
+        found = sample_patches(source, frames, chord_m, patch_m=patch_m, patch_px=patch_px, pool=tiles)
+        return found, on_map, None if turn_radpm is None else turn_radpm[first : first + len(chord_m)]
 
     with ThreadPoolExecutor(max_workers=1) as ahead:
-        waiting = None
+        waiting, first = None, 0
         for frames in batches:
-            following = ahead.submit(sampled, frames)
+            following, first = ahead.submit(sampled, frames, first), first + len(frames.centre_xy_m)
             if waiting is not None:
                 yield _judged(model, source, *waiting.result(), ask=ask)
             waiting = following
@@ -66,10 +73,18 @@ def verdicts_of(
             yield _judged(model, source, *waiting.result(), ask=ask)
 
 
-def _judged(model: CostModel, source: MapReader, patches: Patches, on_map: NDArray[np.bool_], *, ask: bool) -> Verdicts:
+def _judged(
+    model: CostModel,
+    source: MapReader,
+    patches: Patches,
+    on_map: NDArray[np.bool_],
+    turn_radpm: Floats | None,
+    *,
+    ask: bool,
+) -> Verdicts:
     bits = reasons_of(patches, on_map, model, source)
     asked = (bits & NO_COST == 0) & ask
-    said = predict_patches(model, patches, asked)
+    said = predict_patches(model, patches, asked, turn_radpm)
     bits[asked & np.isnan(said.velocity_mps)] |= np.uint16(Reason.NO_MOTION)
     known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
     horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0

@@ -37,7 +37,7 @@ def test_what_is_not_known_is_as_usual():
     beside, labels = drive()
     model = fit_physics_model(beside, labels, standing_watt=50.0)
     unknown = replace(beside, turn_radpm=np.full(COUNT, np.nan))
-    usual = replace(beside, turn_radpm=np.full(COUNT, np.median(beside.turn_radpm)))
+    usual = replace(beside, turn_radpm=np.full(COUNT, np.mean(beside.turn_radpm)))
     assert model.predict(unknown) == pytest.approx(model.predict(usual))
     elsewhere = model.predict(Beside(np.array([2]), np.array([0.0]), np.array([0.0]), np.array([np.nan])))[0]
     assert 50.0 + 30.0 * 0.7 < elsewhere[0] < 50.0 + 60.0 * 1.0

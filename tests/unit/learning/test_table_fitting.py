@@ -79,7 +79,8 @@ def test_it_is_a_command_and_answers_planning(trained, dataset, tmp_path):
     model, split = load_model(tmp_path / "model"), open_dataset(dataset)["train"]
     pixels = split.layers(np.arange(20))
     asked = np.arange(20) != 3
-    said = predict_patches(model, SimpleNamespace(pixels=pixels), asked)
+    ground = {name: split.column(name)[:20] for name in ("terrain_class", "slope_rad")}
+    said = predict_patches(model, SimpleNamespace(pixels=pixels, **ground), asked)
     assert np.isnan(said.power_watt[3])
     assert said.power_watt[asked] == pytest.approx(model.predict(split.patches[:20])[asked, 0])
 

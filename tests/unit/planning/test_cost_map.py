@@ -135,11 +135,11 @@ class _Asked(PhysicsModel):
     patches: list = None
     most: int = 10**9
 
-    def predict(self, patches):
+    def predict(self, patches, beside):
         if len(self.patches) == self.most:
             raise KeyboardInterrupt
         self.patches.append(len(patches))
-        return super().predict(patches)
+        return super().predict(patches, beside)
 
 
 def test_an_interrupted_map_goes_on_where_it_was_and_ends_the_same(made, tmp_path: Path, monkeypatch):

@@ -10,9 +10,11 @@ from planning_worlds import lonlat, plane
 from tcpipe.errors import ModelError, PathError
 from tcpipe.planning.path_cost import cost_of_path
 from tcpipe.planning.reasons import Reason
+from tcpipe.tables.findings import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
 MODEL = PhysicsModel()
+TURNS = PhysicsFit(500, (PhysicsTerm("turning", "all", 80.0, 2.0, "J/rad"),), {}, 0.4, 8.0, {}, None, None, 0.05, None)
 SCALE = 1.0 / 0.9996
 """Ground metres a map metre on the central meridian of a UTM zone."""
 
@@ -116,15 +118,36 @@ def test_without_held_out_samples_there_are_no_intervals():
 
 
 class _Stuck(PhysicsModel):
-    def predict(self, patches):
-        said = super().predict(patches)
+    def predict(self, patches, beside):
+        said = super().predict(patches, beside)
         said[3:5, 1] = 0.0, np.nan
         return said
 
 
+class _Told(PhysicsModel):
+    """Takes 1000 W more for a radian a metre."""
+
+    def predict(self, patches, beside):
+        return super().predict(patches, beside) + np.column_stack(
+            [1000.0 * np.nan_to_num(beside.turn_radpm), 0.0 * beside.slope_rad]
+        )
+
+
+def test_a_model_that_takes_turns_is_told_those_of_the_path_and_none_is_paid_twice():
+    bend = (plane(), (4.0, 4.0), (8.0, 4.0), (8.0, 8.0))
+    plain = _cost(*bend, model=replace(MODEL, physics=TURNS))
+    told = _cost(*bend, model=_Told(takes_turns=True, physics=TURNS))
+    assert told.totals.turn_energy_joule is None
+    assert plain.totals.turn_energy_joule > 0.0
+    turn = told.pieces.column("turn_rad").to_numpy() / told.pieces.column("arc_length_m").to_numpy()
+    more = told.pieces.column("power_watt").to_numpy() - plain.pieces.column("power_watt").to_numpy()
+    assert turn.max() > 0.5
+    assert more == pytest.approx(np.where(turn > TURNS.usual_turn_radpm, 1000.0 * turn, 0.0), rel=1e-4, abs=1e-3)
+
+
 class _EnergyAlone(PhysicsModel):
-    def predict(self, patches):
-        return super().predict(patches)[:, :1]
+    def predict(self, patches, beside):
+        return super().predict(patches, beside)[:, :1]
 
 
 def test_where_the_model_says_that_nothing_moves_there_is_no_cost():
