@@ -2,6 +2,7 @@
 
 import re
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from email.utils import formatdate
@@ -18,11 +19,18 @@ OVERWRITING = "overwriting"
 """A bucket that takes no notice of put-if-absent."""
 
 
+class Fetched(list[str]):
+    """The objects fetched so far, one a request, and their bytes; the next ``cuts`` answers with an object break off in the middle."""
+
+    sent_bytes = 0
+    cuts = 0
+
+
 class _Server(ThreadingHTTPServer):
     def __init__(self, root: Path) -> None:
         super().__init__(("127.0.0.1", 0), _Handler)
         self.root = root
-        self.fetched: list[str] = []
+        self.fetched = Fetched()
         self.writing = threading.Lock()
 
 
@@ -41,15 +49,15 @@ class _Handler(BaseHTTPRequestHandler):
         path = self.server.root / bucket / name
         if bucket == READ_ONLY:
             self._send(403, b"<Error><Code>AccessDenied</Code></Error>")
-        elif not path.exists() or bucket == OVERWRITING or self.headers["If-None-Match"] != "*":
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with self.server.writing:
+            return
+        with self.server.writing:
+            allowed = not path.exists() or bucket == OVERWRITING or self.headers["If-None-Match"] != "*"
+            if allowed:
+                path.parent.mkdir(parents=True, exist_ok=True)
                 new = path.with_name(f".{threading.get_ident()}")
                 new.write_bytes(data)
                 new.rename(path)
-            self._send(200, b"")
-        else:
-            self._send(412, b"<Error><Code>PreconditionFailed</Code></Error>")
+        self._send(*((200, b"") if allowed else (412, b"<Error><Code>PreconditionFailed</Code></Error>")))
 
     def do_DELETE(self) -> None:
         (self.server.root / unquote(urlsplit(self.path).path).lstrip("/")).unlink(missing_ok=True)
@@ -84,33 +92,40 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(404, b"<Error><Code>NoSuchBucket</Code></Error>")
 
     def _send_part(self, data: bytes, *, with_body: bool) -> None:
+        tag = {"ETag": f'"{zlib.crc32(data)}"'}
+        if self.headers["If-Match"] not in (None, tag["ETag"]):
+            self._send(412, b"<Error><Code>PreconditionFailed</Code></Error>")
+            return
         wanted = re.fullmatch(r"bytes=(\d+)-(\d+)", self.headers["Range"] or "")
         if wanted is None:
-            self._send(200, data, with_body=with_body)
+            self._send(200, data, tag, with_body=with_body)
         elif (start := int(wanted[1])) >= len(data):
             self._send(416, b"<Error><Code>InvalidRange</Code></Error>")
         else:
             end = min(int(wanted[2]) + 1, len(data))
-            self._send(206, data[start:end], {"Content-Range": f"bytes {start}-{end - 1}/{len(data)}"})
+            self._send(206, data[start:end], {"Content-Range": f"bytes {start}-{end - 1}/{len(data)}", **tag})
 
     def _send(self, status: int, body: bytes, more: dict[str, str] | None = None, *, with_body: bool = True) -> None:
         self.send_response(status)
-        for key, value in (more or {}).items():
+        more = {"ETag": '"1"', **(more or {})}
+        for key, value in more.items():
             self.send_header(key, value)
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Last-Modified", formatdate(1_600_000_000, usegmt=True))
-        self.send_header("ETag", '"1"')
         self.end_headers()
         if with_body:
-            self.wfile.write(body)
+            cut = status in (200, 206) and self.server.fetched.cuts > 0
+            self.server.fetched.cuts -= cut
+            self.server.fetched.sent_bytes += len(body)
+            self.wfile.write(body[: len(body) // 2] if cut else body)
 
     def log_message(self, *_: object) -> None:
         """Say nothing."""
 
 
 @contextmanager
-def object_store(root: Path) -> Iterator[tuple[dict[str, str], list[str]]]:
-    """Serve each directory below ``root`` as a bucket; yield the environment that leads there, and the objects fetched so far."""
+def object_store(root: Path) -> Iterator[tuple[dict[str, str], Fetched]]:
+    """Serve each directory below ``root`` as a bucket; yield the environment that leads there, and what was fetched so far."""
     server = _Server(root)
     thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01})
     thread.start()

@@ -27,7 +27,6 @@ _BY_LIBRARY = {
     "zarr": """formats/maps/map_files.py:_put formats/maps/map_files.py:_place formats/maps/map_files.py:_add_layer
         formats/maps/map_files.py:_add_axis formats/maps/map_files.py:MapWriter._add_level formats/zarr_arrays.py:add_array""",
     "numcodecs": "formats/shards.py:_codec",
-    "obstore": "formats/object_storage.py:_remote_file",
     "ruamel.yaml": """formats/logs/rosbag2.py:_by_metadata formats/logs/rosbag2.py:_topic_counts
         formats/logs/rosbag2.py:_bag_information""",
     "rosbags": """formats/logs/ros_types.py:_typestore formats/logs/ros_types.py:TypeLibrary._known

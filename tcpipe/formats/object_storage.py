@@ -1,4 +1,4 @@
-"""Logs in object storage (``s3://``, ``gs://``, ``az://``, ``http(s)://``, ``file://``): copied to this machine, then read as any other.
+"""Logs in object storage (``s3://``, ``gs://``, ``az://``, ``http(s)://``, ``file://``): read by range, or copied to this machine.
 
 The home of obstore. Credentials, region and endpoint come from the environment, as the store's own tools take them (``AWS_…``).
 """
@@ -8,7 +8,8 @@ from __future__ import annotations
 import os
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -20,11 +21,14 @@ from tcpipe.errors import LogError, TcpipeError
 from tcpipe.formats.logs.log_part import no_room
 
 if TYPE_CHECKING:
+    from obstore import GetOptions, ObjectMeta
     from obstore.store import ObjectStore
 
 _URL = re.compile(r"[a-z][a-z0-9+.-]*://", re.IGNORECASE)
 _ENDPOINT = re.compile(r"https?://([\w.-]+|\[[0-9a-f:]+\])(:\d{1,5})?(/[\w./-]*)?", re.IGNORECASE)
 _PIECE_BYTES = 1 << 24
+"""What is copied comes in requests of so many bytes."""
+_AT_ONCE = 8
 _PERCENT_ENCODED = ("file", "http", "https")
 """Schemes whose names are written with percent signs; object stores' own tools write them as they are."""
 _RETRIES: dict[str, Any] = {
@@ -44,12 +48,50 @@ _CREDENTIALS = {
 
 
 @dataclass(frozen=True, slots=True)
-class RemoteFile:
-    """An object: its name in the store, size [byte] and modification time [ns]."""
+class StoredObject:
+    """An object: its name in the store, size [byte] and modification time [ns], and the tag that its content has."""
 
+    store: ObjectStore
+    url: str
     name: str
     size_bytes: int
     modified_ns: int
+    tag: str | None
+
+    def ranges(self, spans: Sequence[tuple[int, int]]) -> list[memoryview]:
+        """Return what lies from each start to its stop, some at once.
+
+        Raises
+        ------
+        LogError
+            It cannot be had, also after some attempts, or the object is another than it was.
+        """
+        with told(self.url):
+            if len(spans) == 1:
+                return [self._range(spans[0])]
+            with ThreadPoolExecutor(_AT_ONCE) as pool:
+                return list(pool.map(self._range, spans))
+
+    def copy(self, to: Path) -> None:
+        """Write all of it to a file; `LogError` as `ranges`, and where there is no room."""
+        with told(self.url), to.open("wb") as target:
+            for start in range(0, self.size_bytes, _PIECE_BYTES):
+                target.write(self._range((start, min(start + _PIECE_BYTES, self.size_bytes))))
+        os.utime(to, ns=(self.modified_ns, self.modified_ns))
+
+    def _range(self, span: tuple[int, int]) -> memoryview:
+        """Return one span of the object as it was when it was found; obstore asks again for what a broken connection cuts short."""
+        import obstore  # noqa: PLC0415  most runs stay on this machine
+        from obstore.exceptions import PreconditionError  # noqa: PLC0415
+
+        options: GetOptions = {"range": span, "if_match": self.tag} if self.tag else {"range": span}
+        try:
+            data = memoryview(obstore.get(self.store, self.name, options=options).bytes()).cast("B")
+        except PreconditionError:
+            raise LogError(f"{self.url}: changed while it was read; run it again") from None
+        if len(data) != span[1] - span[0]:
+            raise OSError(f"the store gives {len(data)} bytes for those from {span[0]} to {span[1]}")
+        return data
 
 
 def is_url(text: str | Path) -> bool:
@@ -58,65 +100,69 @@ def is_url(text: str | Path) -> bool:
 
 
 @contextmanager
-def copied(url: str, *, wanted: Callable[[str], bool]) -> Iterator[Path]:
-    """Copy an object, or what is wanted below a prefix, to a temporary directory, and yield where it lies until the block ends.
+def laid_out(
+    url: str, *, wanted: Callable[[str], bool], by_range: tuple[str, ...]
+) -> Iterator[tuple[Path, dict[Path, StoredObject]]]:
+    """Lay out an object, or what is wanted below a prefix, in a temporary directory, until the block ends.
+
+    Yields where it lies, and by path the objects for which there are stand-ins of their size that hold nothing; others are copied.
 
     Parameters
     ----------
     url
         An object (``s3://bucket/drives/run.mcap``), or a prefix (``s3://bucket/drives/bag_directory``).
     wanted
-        Whether an object of this name is copied where a prefix was given.
+        Whether an object of this name is laid out where a prefix was given.
+    by_range
+        Endings of the names of what is not copied.
 
     Raises
     ------
     LogError
-        There is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the copy's path.
+        There is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the path.
     """
-    import obstore  # noqa: PLC0415  most runs stay on this machine
-
-    def copy(store: ObjectStore, file: RemoteFile, to: Path) -> None:
-        with to.open("wb") as target:
-            for piece in obstore.get(store, file.name).stream(min_chunk_size=_PIECE_BYTES):
-                target.write(piece)
-
     with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
-        place = _laid_out(url, Path(directory), wanted, copy)
+        laid = _laid_out(url, Path(directory), wanted)
+        place = _place_of(url, Path(directory))
         try:
-            yield place
+            for path, stored in laid.items():
+                if not path.name.lower().endswith(by_range):
+                    stored.copy(path)
+            yield place, {path: stored for path, stored in laid.items() if path.name.lower().endswith(by_range)}
         except LogError as error:
             raise type(error)(*(problem.replace(str(place), url.rstrip("/")) for problem in error.problems)) from None
 
 
 def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
-    """Lay out what `copied` would copy as files of the right names, sizes and times that hold nothing and take no room.
+    """Lay out what lies at or below a URL as files of the right names, sizes and times that hold nothing and take no room.
 
     Raises
     ------
     LogError
         There is no such object, or the store cannot be read.
     """
-
-    def hole(_: ObjectStore, file: RemoteFile, to: Path) -> None:
-        with to.open("wb") as target:
-            target.truncate(file.size_bytes)
-
-    return _laid_out(url, directory, wanted, hole)
+    _laid_out(url, directory, wanted)
+    return _place_of(url, directory)
 
 
-def _laid_out(
-    url: str, directory: Path, wanted: Callable[[str], bool], lay: Callable[[ObjectStore, RemoteFile, Path], None]
-) -> Path:
+def _place_of(url: str, directory: Path) -> Path:
+    name = _container_and_name(url)[1]
+    return directory / name if name else directory
+
+
+def _laid_out(url: str, directory: Path, wanted: Callable[[str], bool]) -> dict[Path, StoredObject]:
+    """Lay out stand-ins, and return their objects."""
     with told(url):
         store, name = connected(url)
-        found = list(_found(store, name, wanted))
+        found = list(_found(store, url, name, wanted))
         if not found:
             raise LogError(f"{url}: there is no such object, and no log below it")
-        for file in found:
-            to = _place(file, directory)
-            lay(store, file, to)
-            os.utime(to, ns=(file.modified_ns, file.modified_ns))
-    return directory / name if name else directory
+        laid = {_place(stored.name, directory): stored for stored in found}
+        for path, stored in laid.items():
+            with path.open("wb") as target:
+                target.truncate(stored.size_bytes)
+            os.utime(path, ns=(stored.modified_ns, stored.modified_ns))
+    return laid
 
 
 @contextmanager
@@ -158,13 +204,10 @@ def _refuse_endpoints_that_are_none(scheme: str) -> None:
             raise ValueError(f"{name} is {value!r}, wanted http://host or https://host, with :port where it has one")
 
 
-def connected(url: str) -> tuple[ObjectStore, str]:
-    """Return the store, and the name of the object or prefix in it."""
-    import obstore  # noqa: PLC0415
-
+def _container_and_name(url: str) -> tuple[str, str]:
+    """Return the URL of a bucket, directory or server, and the name of the object or prefix in it."""
     scheme, _, rest = url.partition("://")
     scheme, rest = scheme.lower(), rest.rstrip("/")
-    _refuse_endpoints_that_are_none(scheme)
     if scheme == "file":
         container, _, name = rest.rpartition("/")
         container = container or "/"
@@ -172,36 +215,47 @@ def connected(url: str) -> tuple[ObjectStore, str]:
         container, _, name = rest.rpartition("/") if "/" in rest else (rest, "", "")
     else:
         container, _, name = rest.partition("/")
-    name = unquote(name) if scheme in _PERCENT_ENCODED else name
+    return f"{scheme}://{container}", unquote(name) if scheme in _PERCENT_ENCODED else name
+
+
+def connected(url: str) -> tuple[ObjectStore, str]:
+    """Return the store, and the name of the object or prefix in it."""
+    import obstore  # noqa: PLC0415
+
+    container, name = _container_and_name(url)
+    scheme = container.partition("://")[0]
+    _refuse_endpoints_that_are_none(scheme)
     options: dict[str, Any] = {} if scheme == "file" else {"retry_config": _RETRIES}
     if scheme != "file":  # who names an endpoint without TLS means it
         options["client_options"] = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
-    return obstore.store.from_url(f"{scheme}://{container}", **options), name
+    return obstore.store.from_url(container, **options), name
 
 
-def _found(store: ObjectStore, name: str, wanted: Callable[[str], bool]) -> Iterator[RemoteFile]:
+def _found(store: ObjectStore, url: str, name: str, wanted: Callable[[str], bool]) -> Iterator[StoredObject]:
     """Yield the object of a name; where there is none, what is wanted below it."""
     import obstore  # noqa: PLC0415
 
     if name:
         try:
-            yield _remote_file(obstore.head(store, name))
+            yield _stored(store, url, name, obstore.head(store, name))
         except (FileNotFoundError, IsADirectoryError):
             pass
         else:
             return
     for listed in obstore.list(store, prefix=name or None):
-        yield from (_remote_file(meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name))
+        yield from (_stored(store, url, name, meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name))
 
 
-def _remote_file(meta: Any) -> RemoteFile:
-    return RemoteFile(str(meta["path"]), int(meta["size"]), round(meta["last_modified"].timestamp() * 1e6) * 1000)
+def _stored(store: ObjectStore, url: str, name: str, meta: ObjectMeta) -> StoredObject:
+    path, tag = str(meta["path"]), meta.get("e_tag")
+    modified_ns = round(meta["last_modified"].timestamp() * 1e6) * 1000
+    return StoredObject(store, url.rstrip("/") + path.removeprefix(name), path, int(meta["size"]), modified_ns, tag)
 
 
-def _place(file: RemoteFile, directory: Path) -> Path:
-    name = PurePosixPath(file.name)
+def _place(object_name: str, directory: Path) -> Path:
+    name = PurePosixPath(object_name)
     if name.is_absolute() or ".." in name.parts:
-        raise LogError(f"{file.name}: an object of this name is not copied")
+        raise LogError(f"{object_name}: an object of this name is not read")
     place = directory / name
     place.parent.mkdir(parents=True, exist_ok=True)
     return place

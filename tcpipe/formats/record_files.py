@@ -33,6 +33,15 @@ class Sighting:
 
 
 @dataclass(frozen=True, slots=True)
+class Recording:
+    """That the run of a log has an `outline`, by which the log is known where all of it is not at hand."""
+
+    outline: str
+    run_id: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
 class Superseded:
     """That another run takes a run's place, or, by None, that the run counts again; of several the one of the highest number holds."""
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 from tcpipe.formats.seals import Checksum
 from tcpipe.recipe import IngestSections
@@ -21,6 +22,8 @@ class LogOrigin:
     paths: tuple[str, ...]
     sha256: str
     size_bytes: int = 0
+    sha256_of: Literal["log", "index"] = "log"
+    """What is hashed: of a log in object storage, of which only a part was fetched, sizes and indexes of its files (ADR 86)."""
 
 
 @dataclass(frozen=True, slots=True)

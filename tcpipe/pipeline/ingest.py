@@ -96,7 +96,7 @@ def ingest(
     ----------
     logs
         ``.mcap``, ``.bag``, ``.db3``, ROS 2 bag directories, or folders searched downward; or URLs of such (``s3://…``), which are
-        copied to this machine, one by one, while they are read.
+        read by range, or copied where they have no index.
     recipe
         A `Recipe`, a path to one, or None for the one that rules here (``TCPIPE_RECIPE``, nearest tcpipe.toml, defaults).
     robot

@@ -12,8 +12,9 @@ from tcpipe.tables.levels import DATA_MODEL_VERSION, LabelledSegments, Streams, 
 
 def run_json_of(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) -> RunJson:
     """Return what is known of a log that was read; its damage, remarks and tags are to be added."""
+    by_index = sha256 == log.outline or (log.is_known_by_outline and sha256 == log.sha256())
     return RunJson(
-        source=LogOrigin(task.source.origins, sha256, log.size_bytes),
+        source=LogOrigin(task.source.origins, sha256, log.size_bytes, "index" if by_index else "log"),
         robot=streams.robot,
         topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
         sensors=streams.sensors,

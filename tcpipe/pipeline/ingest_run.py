@@ -6,16 +6,19 @@ import logging
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.joined import AnyLog, open_logs
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import ingest_key, read_key
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.run_documents import RunJson
 from tcpipe.pipeline.ingest_documents import manifest_of, run_json_of
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, Status, result_of, told, too_young
-from tcpipe.pipeline.log_sources import LogSource, on_this_machine
+from tcpipe.pipeline.log_sources import LogSource
+from tcpipe.pipeline.outlines import known_as, remember_outline
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.store import RunDirectory, Store
 from tcpipe.tables.levels import Streams
@@ -42,20 +45,21 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
     store, source = Store(task.store), task.source
     with ExitStack() as stack:
         opened = None if source.sha256 else _opened(task, stack)
-        sha256 = str(opened[1].sha256() if opened else source.sha256)
+        sha256 = known_as(store, opened) if opened else str(source.sha256)
         hashed.append(sha256)
         run_id = stack.enter_context(store.claimed_run(source.stem, sha256))
         same_as = _twin(store, run_id, source)
         before = None if task.force or store.known_run(run_id) is None else made_before(store, run_id, task, sha256)
         if before is not None:
             return before
-        task, log = opened or _opened(task, stack)
+        log = opened or _opened(task, stack)
         logger.info("%s: reading", source.name)
         streams, damage, remarks = _streams(store, run_id, log, task)
         known = run_json_of(task, log, streams, sha256)
         known = replace(known, damage=damage, remarks=remarks, tags=_tags(store, run_id, task))
         store.write_run_json(run_id, known)
         run = _fuse_and_label(store, run_id, streams, known, task)
+        remember_outline(store, run_id, sha256, log)
     return result_of(source, "done", run, sha256, same_as=same_as)
 
 
@@ -79,12 +83,12 @@ def _finished(store: Store, run_id: str, task: IngestTask) -> RunDirectory | Non
     return None
 
 
-def _opened(task: IngestTask, stack: ExitStack) -> tuple[IngestTask, AnyLog]:
-    """Return the task with the log's files on this machine, and the log, both until ``stack`` ends."""
-    source = stack.enter_context(on_this_machine(task.source))
-    log = open_logs(source.paths, message_definitions=task.message_definitions, tables=task.recipe.tables)
+def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
+    """Return the log, open until ``stack`` ends."""
+    files = [entry if is_url(entry) else Path(entry) for entry in task.source.origins]
+    log = open_logs(files, message_definitions=task.message_definitions, tables=task.recipe.tables)
     stack.enter_context(log)
-    return replace(task, source=source), log
+    return log
 
 
 def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> RunDirectory:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -11,11 +12,12 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.logs.joined import opened
-from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below
+from tcpipe.formats.logs.log_file import logs_below
 from tcpipe.formats.logs.table_folders import table_files, table_folders
-from tcpipe.formats.object_storage import copied, is_url
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.run_documents import Counts, LogOrigin
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
+from tcpipe.pipeline.log_sources import remote_logs
 from tcpipe.pipeline.table_proposal import InspectedTables, proposed
 from tcpipe.recipe import Recipe
 from tcpipe.store import RunDirectory, Store, is_store, run_at
@@ -123,10 +125,9 @@ def inspect(
     """
     ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):
-        with copied(str(path), wanted=belongs_to_a_log) as copy:
-            return _named(
-                _logs_at([copy] if copy.is_file() else logs_below(copy), copy, ask), str(copy), str(path).rstrip("/")
-            )
+        with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
+            urls = list(remote_logs(str(path), Path(directory) / "logs").values())
+        return _logs_at(urls, str(path).rstrip("/"), ask)
     path = Path(path)
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or directory")
@@ -149,7 +150,7 @@ def inspect(
 
 
 def _logs_or_tables(
-    path: Path, recipe: Recipe, ask: Callable[[Path], InspectedLog]
+    path: Path, recipe: Recipe, ask: Callable[[Path | str], InspectedLog]
 ) -> InspectedLog | InspectedLogs | InspectedTables:
     if not path.is_dir():
         return ask(path)
@@ -159,7 +160,9 @@ def _logs_or_tables(
     return proposed(path, tables)
 
 
-def _logs_at(logs: list[Path], path: Path, ask: Callable[[Path], InspectedLog]) -> InspectedLog | InspectedLogs:
+def _logs_at(
+    logs: Sequence[Path | str], path: Path | str, ask: Callable[[Path | str], InspectedLog]
+) -> InspectedLog | InspectedLogs:
     if not logs:
         raise UsageError(f"{path}: is no map, dataset, run or store, and holds no log")
     if len(logs) == 1:
@@ -167,23 +170,14 @@ def _logs_at(logs: list[Path], path: Path, ask: Callable[[Path], InspectedLog]) 
     return InspectedLogs(path=str(path), logs=tuple(_one_of(entry, ask) for entry in logs))
 
 
-def _named(found: InspectedLog | InspectedLogs, copy: str, url: str) -> InspectedLog | InspectedLogs:
-    """Return what was found in a copy with the URL in the place of the copy's path."""
-    path = found.path.replace(copy, url)
-    if isinstance(found, InspectedLog):
-        return replace(found, path=path, problems=tuple(line.replace(copy, url) for line in found.problems))
-    logs = (_named(log, copy, url) for log in found.logs)
-    return replace(found, path=path, logs=tuple(log for log in logs if isinstance(log, InspectedLog)))
-
-
 def _one(
-    path: Path, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
+    path: Path | str, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
 ) -> InspectedLog:
     with opened(path, message_definitions=message_definitions, tables=recipe.tables) as log:
-        return inspect_log(log, recipe, robot, full=full)
+        return replace(inspect_log(log, recipe, robot, full=full), path=str(path))
 
 
-def _one_of(path: Path, ask: Callable[[Path], InspectedLog]) -> InspectedLog:
+def _one_of(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> InspectedLog:
     try:
         return ask(path)
     except TcpipeError as error:

@@ -6,7 +6,6 @@ import hashlib
 import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,7 +15,7 @@ from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs, logs_below
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, storage_files
 from tcpipe.formats.logs.table_folders import Mappings, table_files, table_folders
-from tcpipe.formats.object_storage import copied, is_url, stand_ins
+from tcpipe.formats.object_storage import is_url, stand_ins
 from tcpipe.formats.record_files import Sighting, record_name
 from tcpipe.pipeline.transience import is_transient
 
@@ -38,7 +37,7 @@ class LogSource:
     sha256: str | None = None
     """None where it has yet to be computed."""
     urls: tuple[str, ...] = ()
-    """Where the files lie, if one lies in object storage; ``paths`` then are stand-ins until `on_this_machine` has copied them."""
+    """Where the files lie, if one lies in object storage; ``paths`` then are stand-ins of the right names and sizes."""
     place: str = ""
     """Where the log lies in the folder that was given: the same wherever that is mounted."""
 
@@ -49,7 +48,7 @@ class LogSource:
 
     @property
     def origins(self) -> tuple[str, ...]:
-        """Where the files are, or were copied from."""
+        """Where the files are."""
         return self.urls or tuple(str(path) for path in self.paths)
 
     @property
@@ -80,13 +79,15 @@ class LogSource:
         return max((time_ns for _, time_ns in self.files), default=0)
 
     def now(self) -> LogSource:
-        """Return the log as it is now: what was written since is another content."""
+        """Return the log as it is now: what was written since is another content; in object storage nobody looks again."""
+        if self.urls:
+            return self
         files = _files(self.paths)
         return self if files == self.files else replace(self, files=files, sha256=None)
 
     def has_changed(self) -> bool:
-        """Tell whether a file was written since."""
-        return _files(self.paths) != self.files
+        """Tell whether a file was written since; an object that was is refused when it is read."""
+        return not self.urls and _files(self.paths) != self.files
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ def find_sources(
     for number, entry in enumerate(logs):
         try:
             if is_url(entry):
-                remote = _remote(str(entry), staging / str(number))
+                remote = remote_logs(str(entry), staging / str(number))
                 urls.update(remote)
                 for path, url in remote.items():
                     paths.setdefault(path, (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
@@ -194,25 +195,11 @@ def definitions_key(directory: Path | None) -> str:
     return digest.hexdigest()[:8]
 
 
-def _remote(url: str, directory: Path) -> dict[Path, str]:
+def remote_logs(url: str, directory: Path) -> dict[Path, str]:
     """Return stand-ins for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
     place = stand_ins(url, directory, wanted=belongs_to_a_log)
     return {_real(path): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)}
-
-
-@contextmanager
-def on_this_machine(source: LogSource) -> Iterator[LogSource]:
-    """Yield the source with its files here: what lies in object storage is copied, and the copy removed in the end."""
-    if not source.urls:
-        yield source
-        return
-    with ExitStack() as stack:
-        paths = [
-            stack.enter_context(copied(origin, wanted=belongs_to_a_log)) if is_url(origin) else Path(origin)
-            for origin in source.urls
-        ]
-        yield replace(source, paths=tuple(paths))
 
 
 def with_hashes(sources: Sequence[LogSource], seen: Callable[[str], Sequence[Sighting]]) -> list[LogSource]:
@@ -275,7 +262,7 @@ def _remembered(source: LogSource, seen: Sequence[Sighting]) -> LogSource:
 
 
 def _hashed(source: LogSource) -> LogSource:
-    if source.urls:  # it is hashed when it is copied
+    if source.urls:  # it is hashed when it is read
         return source
     try:
         with open_logs(source.paths) as log:

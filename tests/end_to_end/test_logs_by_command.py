@@ -186,10 +186,11 @@ def test_logs_in_object_storage(tmp_path):
         assert "s3://drives/junk.bag: not a log" in plain_lines(first, 3)
         assert "1 done, 1 failed" in first.stdout
         assert run_json(tmp_path / "tcpipe-store")["source"]["paths"] == ["s3://drives/run.mcap"]
-        assert sorted(fetched) == ["junk.bag", "run.mcap"]
+        assert set(fetched) == {"junk.bag", "run.mcap"}
+        requests = len(fetched)
         again = tcpipe("ingest", "s3://drives/run.mcap", cwd=tmp_path, env=environment)
         assert "nothing to do: 1 of 1" in again.stdout
-        assert sorted(fetched) == ["junk.bag", "run.mcap"]  # what is known is not fetched again
+        assert len(fetched) == requests  # what is known is not fetched again
         denied = tcpipe("inspect", f"s3://{FORBIDDEN}/run.mcap", cwd=tmp_path, env=environment)
         assert "wants credentials; set AWS_" in plain_lines(denied, 1, most=1)
 

@@ -33,6 +33,7 @@ from tcpipe.formats.logs.bag_records import (
     walk_chunk,
 )
 from tcpipe.formats.logs.chunk_reading import Entries, Excerpt, Messages, by_place, chunk_blocks, copy_pieces
+from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     Bounds,
@@ -44,6 +45,7 @@ from tcpipe.formats.logs.log_part import (
     decompressed,
     decompressed_prefix,
     listed,
+    outline_of,
 )
 from tcpipe.logs.coverage import silence_ns
 from tcpipe.logs.topics import Damage, normalized_type_name
@@ -54,6 +56,10 @@ _INDEX_ENTRY_BYTES = 12
 _INDEX_HEAD_BYTES = 64
 """As much as an index record's header takes as a rule, and the length behind it."""
 _LEAST_RECORD_BYTES = 8
+_PLACED_AT_ONCE = 1024
+"""Of so many chunks the heads are looked at together."""
+_EXPECTED_BYTES = 1 << 24
+"""An index is seldom longer, and a broken header may place it anywhere."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,10 +91,11 @@ class _Connection:
 class BagPart:
     """One .bag file, open for reading."""
 
-    def __init__(self, path: Path, name: str) -> None:
+    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         self.name = name
         self.damage: dict[Damage, None] = {}
-        self._bytes = ByteSource(path)
+        self.outline = ""
+        self._bytes = ByteSource(path, fetched)
         self._connections: dict[int, _Connection] = {}
         self._chunks: list[_Chunk] = []
         self._without_checksum = False
@@ -106,9 +113,9 @@ class BagPart:
             self._read_index()
         except DamageError as error:
             self._note(self._bytes.size, f"{error}; it is read record by record")
+            self._bytes.whole()
             self._connections, self._chunks = {}, []
             self._walk()
-        self._bounds.claim(self._placed(chunk).size for chunk in self._chunks)
 
     def close(self) -> None:
         """Close the file."""
@@ -127,11 +134,20 @@ class BagPart:
 
     def chunks_with(self, wanted: frozenset[int]) -> list[tuple[int, _Chunk]]:
         """Return the chunks that may hold wanted connections, each with the number of bytes in all chunks before it, at most."""
-        return [
-            (number * MAX_CHUNK_BYTES, chunk)
-            for number, chunk in enumerate(map(self._placed, self._chunks))
-            if chunk.counts is None or not wanted.isdisjoint(chunk.counts) or self._is_doubtful(chunk)
-        ]
+        found, sizes = [], []
+        for first in range(0, len(self._chunks), _PLACED_AT_ONCE):
+            chunks = self._chunks[first : first + _PLACED_AT_ONCE]
+            self._bytes.expect([(chunk.offset, _MAX_CHUNK_HEADER) for chunk in chunks])
+            chunks = [self._placed(chunk) for chunk in chunks]
+            self._bytes.expect([(chunk.record.end, _INDEX_HEAD_BYTES) for chunk in chunks if chunk.record])
+            sizes += [chunk.size for chunk in chunks]
+            found += [
+                (number * MAX_CHUNK_BYTES, chunk)
+                for number, chunk in enumerate(chunks, start=first)
+                if chunk.counts is None or not wanted.isdisjoint(chunk.counts) or self._is_doubtful(chunk)
+            ]
+        self._bounds.claim(sizes)
+        return found
 
     def _is_doubtful(self, chunk: _Chunk) -> bool:
         """Return whether the index behind a chunk that should hold nothing wanted is another than the summary says."""
@@ -195,6 +211,7 @@ class BagPart:
         held: list[bytes] = []
         places: list[tuple[int, int, int]] = []
         unsound = []
+        self._bytes.expect([_needed(chunk.offset, chunk.record) for chunk in chunks if chunk.record])
         for number, chunk in enumerate(chunks):
             try:
                 found = self._index_of(chunk)
@@ -295,6 +312,8 @@ class BagPart:
             raise DamageError("the bag has no index (it was not closed)")
         if position > self._bytes.size:
             raise DamageError("the bag's index is missing (the file is cut)")
+        start, index_bytes = position, self._bytes.size - position
+        self._bytes.expect([(start, min(index_bytes, _EXPECTED_BYTES))])
         while position < self._bytes.size:
             record = self._record(position)
             if record.opcode == OP_CONNECTION:
@@ -309,6 +328,7 @@ class BagPart:
         if len({chunk.offset for chunk in self._chunks}) < len(self._chunks):
             raise DamageError("the bag's index names a chunk twice")
         self._chunks.sort(key=lambda chunk: chunk.offset)
+        self.outline = outline_of(self._bytes.size, self._bytes.read(start, index_bytes)) if self._chunks else ""
 
     def _take_chunk_info(self, record: BagRecord) -> None:
         data = self._bytes.read(record.data_offset, record.data_bytes)
@@ -454,6 +474,13 @@ class BagPart:
             start_ns=chunk.start_ns or None,
             end_ns=chunk.end_ns or None,
         )
+
+
+def _needed(offset: int, record: BagRecord) -> tuple[int, int]:
+    """Return which bytes (offset, size) are read of a chunk that holds something wanted: of a plain one, its indexes to begin with."""
+    return (
+        (record.end, _INDEX_HEAD_BYTES) if record.codec == "none" else (offset, record.end + _INDEX_HEAD_BYTES - offset)
+    )
 
 
 def _channel(connection: _Connection) -> Channel:

@@ -58,6 +58,19 @@ class JoinedLog:
         """Size of all files together."""
         return sum(log.size_bytes for log in self._logs)
 
+    @property
+    def outline(self) -> str:
+        """A hash of the indexes of all files; "" where one has none."""
+        outlines = [log.outline for log in self._logs]
+        if not all(outlines):
+            return ""
+        return outlines[0] if len(outlines) == 1 else hashlib.sha256("".join(outlines).encode()).hexdigest()
+
+    @property
+    def is_known_by_outline(self) -> bool:
+        """Whether `sha256` holds an outline."""
+        return any(log.is_known_by_outline for log in self._logs)
+
     def sha256(self) -> str:
         """Return the file's hash; of several, that of their hashes, in order. `LogError` when two files are the same recording."""
         digests: dict[str, Log | TableLog] = {}
@@ -85,8 +98,10 @@ class JoinedLog:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         """Close every file."""
-        for log in (*self._logs, *([self._earlier] if self._earlier else [])):
-            log.close()
+        with ExitStack() as stack:
+            for log in (*self._logs, *([self._earlier] if self._earlier else [])):
+                stack.push(log)
+            stack.pop_all().__exit__(kind, error, trace)
 
 
 def _joined(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
@@ -108,15 +123,15 @@ AnyLog: TypeAlias = "Log | JoinedLog | TableLog"
 
 
 def open_logs(
-    paths: Sequence[Path], *, message_definitions: Path | None = None, tables: Mappings | None = None
+    paths: Sequence[Path | str], *, message_definitions: Path | None = None, tables: Mappings | None = None
 ) -> AnyLog:
-    """Open one log, or several as one; `LogError` when a topic has different types in two of them.
+    """Open one log, or several as one, by path or URL; `LogError` when a topic has different types in two of them.
 
     A folder that is no bag is one of tables, where ``tables`` says what they hold.
     """
     with ExitStack() as stack:
         logs: list[Log | TableLog] = []
-        for path in sorted(paths):
+        for path in sorted(paths, key=Path):
             logs.append(opened(path, message_definitions=message_definitions, tables=tables))
             stack.callback(logs[-1].close)
         alone = logs[0] if len(logs) == 1 else None
@@ -128,9 +143,9 @@ def open_logs(
     return joined if earlier or len(logs) > 1 else logs[0]
 
 
-def opened(path: Path, *, message_definitions: Path | None, tables: Mappings | None) -> Log | TableLog:
+def opened(path: Path | str, *, message_definitions: Path | None, tables: Mappings | None) -> Log | TableLog:
     """Open one log: a folder that is no bag is one of tables, where ``tables`` says what they hold."""
-    if tables and path.is_dir() and not is_one_bag(path):
+    if tables and isinstance(path, Path) and path.is_dir() and not is_one_bag(path):
         from tcpipe.formats.logs.table_log import TableLog  # noqa: PLC0415  polars only where a table is read
 
         return TableLog(path, tables)

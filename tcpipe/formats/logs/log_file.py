@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 import resource
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
@@ -16,25 +15,22 @@ from typing import Self
 import pyarrow as pa
 
 from tcpipe.errors import LogError
-from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
 from tcpipe.formats.logs.arrow_columns import TopicTable
-from tcpipe.formats.logs.bag_file import BagPart
+from tcpipe.formats.logs.fetched_file import FetchedFile
+from tcpipe.formats.logs.log_container import WANTED, container_of, open_part
 from tcpipe.formats.logs.log_part import Channel, LogPart, MessageBlock
-from tcpipe.formats.logs.mcap_file import McapPart
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
 from tcpipe.formats.logs.rosbag2 import (
     METADATA,
     STORAGE_SUFFIXES,
-    ZSTD_MAGIC,
     decompressed_blocks,
-    decompressed_file,
     is_one_bag,
     rosbag2_files,
 )
-from tcpipe.formats.logs.sqlite_file import SqlitePart
-from tcpipe.formats.object_storage import copied, is_url
+from tcpipe.formats.object_storage import StoredObject, is_url, laid_out
 from tcpipe.logs.topics import Damage, Topic, condensed
 
+_READ_BY_RANGE = (".mcap", ".bag")
 LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd")
 
 BATCH_BYTES = 1 << 25
@@ -45,22 +41,10 @@ MAX_TOPICS = 10_000
 MAX_COLUMNS = 200_000
 """Topics that unfold to more columns together are not read at once; five hundred topics of a robot have some 20,000."""
 
-_WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
 _HASH_BYTES = 1 << 20
 _LISTED = 5
 _OTHER_FILES = 256
 _FILE_SYSTEMS_OWN = ("lost+found",)
-_KNOWN_MAGIC = (
-    (b"PK\x03\x04", "a zip archive"),
-    (b"\x1f\x8b", "a gzip file"),
-    (b"BZh", "a bzip2 file"),
-    (b"\xfd7zXZ", "an xz file"),
-    (b"\x89HDF", "an HDF5 file"),
-    (b"PAR1", "a Parquet file"),
-    (b"%PDF", "a PDF"),
-    (b"II*\0", "a TIFF"),
-    (b"MM\0*", "a TIFF"),
-)
 
 
 def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Log:
@@ -69,8 +53,8 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
     Parameters
     ----------
     path
-        A .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``), which
-        is copied to a temporary directory until the log is closed.
+        A .mcap, .bag or .db3 file (told by content, not by name), or a ROS 2 bag directory; or the URL of one (``s3://…``): of an
+        .mcap or .bag with an index only what is asked for is fetched, anything else is copied until the log is closed.
     message_definitions
         A directory of .msg files for types that the log does not define.
 
@@ -80,18 +64,20 @@ def open_log(path: Path | str, *, message_definitions: Path | None = None) -> Lo
         The path is no log: one line with what was found there and what was wanted.
     """
     with ExitStack() as stack:
+        stored: dict[Path, StoredObject] = {}
         if is_url(path):
-            path = stack.enter_context(copied(str(path), wanted=belongs_to_a_log))
+            path, stored = stack.enter_context(laid_out(str(path), wanted=belongs_to_a_log, by_range=_READ_BY_RANGE))
         path = Path(path)
         _refuse_what_is_no_file(path)
-        opened = _open_directory(path, stack) if path.is_dir() else _open_file(path, stack)
+        fetched = {file: FetchedFile(of, file) for file, of in stored.items()}
+        opened = _open_directory(path, stack, fetched) if path.is_dir() else _open_file(path, stack, fetched)
         return Log(path, opened, TypeLibrary(message_definitions), stack.pop_all())
 
 
 def _refuse_what_is_no_file(path: Path) -> None:
     _refuse_what_is_not_there(path)
     if not path.is_file() and not path.is_dir():
-        raise LogError(f"{path}: it is a pipe or a device; {_WANTED}")
+        raise LogError(f"{path}: it is a pipe or a device; {WANTED}")
 
 
 def _refuse_what_is_not_there(path: Path) -> None:
@@ -122,7 +108,7 @@ def find_logs(path: Path) -> list[Path]:
         return [path]
     found = logs_below(path)
     if not found:
-        raise LogError(f"{path}: no log in this directory or below it; {_WANTED}")
+        raise LogError(f"{path}: no log in this directory or below it; {WANTED}")
     return found
 
 
@@ -138,6 +124,7 @@ class _OpenFiles:
     container: str
     files: tuple[Path, ...]
     parts: tuple[LogPart, ...]
+    fetched: Mapping[Path, FetchedFile]
     damage: tuple[Damage, ...] = ()
     message_count: int | None = None
     topic_counts: Mapping[str, int] = field(default_factory=dict)
@@ -151,6 +138,7 @@ class Log:
         self.container = opened.container
         """``mcap``, ``bag`` or ``rosbag2``."""
         self._files, self._parts, self._types, self._stack = opened.files, opened.parts, types, stack
+        self._fetched = tuple(opened.fetched.values())
         self._damage: dict[Damage, None] = dict.fromkeys(opened.damage)
         self.topics = self._merged_topics()
         """Every topic by name, as the index tells."""
@@ -177,8 +165,8 @@ class Log:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close the log."""
-        self.close()
+        """Close the log; what goes wrong with one in object storage is told with its URL."""
+        self._stack.__exit__(kind, error, trace)
 
     def close(self) -> None:
         """Close its files and remove temporary copies."""
@@ -209,14 +197,38 @@ class Log:
         found = [file.stat() for file in sorted(self._files, key=lambda file: file.name)]
         return [[stat.st_size, stat.st_mtime_ns] for stat in found]
 
+    @property
+    def fetched_bytes(self) -> int | None:
+        """How much of a log in object storage was fetched so far, other than what was copied; None of one on this machine."""
+        return sum(file.fetched_bytes for file in self._fetched) if self._fetched else None
+
+    @property
+    def outline(self) -> str:
+        """A hash (hex) of the sizes and indexes of all files, the same wherever they lie; "" where a file has no index."""
+        outlines = [part.outline for part in self._parts]
+        if not all(outlines) or len(outlines) < len(self._files):
+            return ""
+        return outlines[0] if len(outlines) == 1 else hashlib.sha256("".join(outlines).encode()).hexdigest()
+
+    @property
+    def is_known_by_outline(self) -> bool:
+        """Whether `sha256` is the outline: the log lies in object storage, and hashing it would take fetching all of it."""
+        return any(not file.is_whole for file in self._fetched) and bool(self.outline)
+
     def sha256(self) -> str:
         """Return the SHA-256 of the file; of a bag directory, of its storage files one after the other, by name.
+
+        Of a log in object storage that is read by its index it is that of the index, the `outline`.
 
         Raises
         ------
         LogError
             The disk does not give all of it.
         """
+        if self.is_known_by_outline:
+            return self.outline
+        for fetched in self._fetched:
+            fetched.whole()
         digest = hashlib.sha256()
         for file in sorted(self._files, key=lambda file: file.name):
             try:
@@ -450,24 +462,26 @@ def _topic(channel: Channel, types: TypeLibrary) -> Topic:
     )
 
 
-def _open_file(path: Path, stack: ExitStack) -> _OpenFiles:
-    return _OpenFiles(_container(path), (path,), (_open_part(path, path.name, stack),))
+def _open_file(path: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
+    part = open_part(path, path.name, stack, fetched.get(path))
+    return _OpenFiles(container_of(path, fetched.get(path)), (path,), (part,), fetched)
 
 
-def _open_directory(directory: Path, stack: ExitStack) -> _OpenFiles:
+def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
     """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
     found = rosbag2_files(directory)
     _allow_files(len(found.paths))
     parts, damage, errors = [], list(found.damage), []
     for file in found.paths:
         try:
-            parts.append(_open_part(file, f"{directory.name}/{file.name}", stack))
+            parts.append(open_part(file, f"{directory.name}/{file.name}", stack, fetched.get(file)))
         except LogError as error:
             errors.append(error)
             damage.append(Damage(f"{directory.name}/{file.name}", f"a file of the bag is lost: {error}"))
     if not parts:
         raise LogError(*(problem for error in errors for problem in error.problems))
-    return _OpenFiles("rosbag2", found.paths, tuple(parts), tuple(damage), found.message_count, found.topic_counts)
+    counts = found.message_count, found.topic_counts
+    return _OpenFiles("rosbag2", found.paths, tuple(parts), fetched, tuple(damage), *counts)
 
 
 def _allow_files(count: int) -> None:
@@ -477,65 +491,6 @@ def _allow_files(count: int) -> None:
     if soft != resource.RLIM_INFINITY and soft < wanted:
         most = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-
-
-def _open_part(path: Path, name: str, stack: ExitStack) -> LogPart:
-    magic, given = _magic(path), path
-    if magic.startswith(ZSTD_MAGIC):
-        path = decompressed_file(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tcpipe-"))))
-        magic = _magic(path)
-    part: LogPart
-    if magic.startswith(mcap_records.MAGIC) or _tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
-        part = McapPart(path, name)
-    elif magic.startswith(bag_records.MAGIC):
-        part = BagPart(path, name)
-    elif magic.startswith(sqlite_file.MAGIC):
-        part = SqlitePart(path, name)
-    else:
-        held = "" if path == given else "what it holds, decompressed: "
-        raise LogError(f"{given}: not a log: {held}{_described(path, magic)}; {_WANTED}")
-    stack.callback(part.close)
-    return part
-
-
-def _container(path: Path) -> str:
-    name = path.name.removesuffix(".zstd")
-    magic = _magic(path)
-    if magic.startswith(bag_records.MAGIC):
-        return "bag"
-    return "mcap" if magic.startswith(mcap_records.MAGIC) or name.endswith(".mcap") else "rosbag2"
-
-
-def _magic(path: Path) -> bytes:
-    try:
-        with path.open("rb") as file:
-            return file.read(16)
-    except OSError as error:
-        raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
-
-
-def _tail(path: Path, size: int) -> bytes:
-    """Return a file's last bytes; nothing where they cannot be read."""
-    try:
-        with path.open("rb") as file:
-            file.seek(max(path.stat().st_size - size, 0))
-            return file.read(size)
-    except OSError:
-        return b""
-
-
-def _described(path: Path, magic: bytes) -> str:
-    """Say what a file that is no log seems to be."""
-    if not magic:
-        return "it is empty (0 bytes)"
-    if magic.startswith(b"#ROSBAG V"):
-        return f"it is a ROS bag of version {magic[9:12].decode(errors='replace')} (rosbag fix converts it)"
-    for start, kind in _KNOWN_MAGIC:
-        if magic.startswith(start):
-            return f"it is {kind}"
-    if not any(magic):
-        return "it begins with zeros"
-    return f"it is {path.stat().st_size} bytes that begin with {magic[:8]!r}"
 
 
 def _logs_below(directory: Path) -> Iterator[Path]:

@@ -6,6 +6,7 @@ A `LogPart` is one file of a log. `tcpipe.formats.logs.log_file` joins the parts
 from __future__ import annotations
 
 import errno
+import hashlib
 import mmap
 import os
 import struct
@@ -22,6 +23,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
+from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.logs.topics import Damage
 
 MAX_CHUNK_BYTES = 1 << 29
@@ -142,6 +144,10 @@ class LogPart(Protocol):
     def unchecked(self) -> str:
         """What of that which was read no checksum covers, in plain words; "" where there is nothing."""
 
+    @property
+    def outline(self) -> str:
+        """A hash (hex) of the file's size and index, which tell it from any other recording; "" where it has no index."""
+
     def blocks(self, wanted: frozenset[int], *, threads: int = 1) -> Iterator[MessageBlock]:
         """Yield the messages of the wanted channels; what is broken is noted in ``damage`` and stepped over.
 
@@ -153,10 +159,10 @@ class LogPart(Protocol):
 
 
 class ByteSource:
-    """A file read by position."""
+    """A file read by position; with ``fetched``, one in object storage, for which the path is a stand-in until all of it is here."""
 
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("rb")
+    def __init__(self, path: Path, fetched: FetchedFile | None = None) -> None:
+        self._file, self._fetched = path.open("rb"), fetched
         self.size = os.fstat(self._file.fileno()).st_size
         self._peeked = 0, b""
         self._scratch = threading.local()
@@ -186,8 +192,7 @@ class ByteSource:
     def read_pieces(self, pieces: Sequence[tuple[int, memoryview]]) -> None:
         """Fill each view with the bytes at its offset; what lies between them is not read. `DamageError` as `read`."""
         self.skips()
-        for offset, view in pieces:
-            os.posix_fadvise(self._file.fileno(), offset, len(view), os.POSIX_FADV_WILLNEED)
+        self.expect([(offset, len(view)) for offset, view in pieces])
         for offset, view in pieces:
             if not self._fill(view, offset):
                 view[:] = self.read(offset, len(view))
@@ -214,6 +219,19 @@ class ByteSource:
         """Tell the system that this file is read in pieces: what follows a piece need not be read ahead."""
         os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_RANDOM)
 
+    def expect(self, pieces: Sequence[tuple[int, int]]) -> None:
+        """Have pieces (offset, size) brought here, which are read soon."""
+        if self._fetched is not None and not self._fetched.is_whole:
+            self._fetched.expect(pieces)
+            return
+        for offset, size in pieces:
+            os.posix_fadvise(self._file.fileno(), offset, size, os.POSIX_FADV_WILLNEED)
+
+    def whole(self) -> None:
+        """Have all of the file here: it is read from its beginning to its end."""
+        if self._fetched is not None:
+            self._fetched.whole()
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -222,6 +240,8 @@ class ByteSource:
         """Return up to ``size`` bytes at ``offset``, at least one unless the file ends there."""
         if offset > self.size:  # also what no system call takes
             return b""
+        if self._fetched is not None and not self._fetched.is_whole:
+            return self._fetched.read(offset, size)
         try:
             return os.pread(self._file.fileno(), size, offset)
         except OSError as error:
@@ -229,6 +249,10 @@ class ByteSource:
 
     def _fill(self, view: memoryview, offset: int) -> bool:
         """Read the bytes at ``offset`` into a view; return whether there were enough."""
+        if self._fetched is not None and not self._fetched.is_whole:
+            data = self._fetched.read(offset, len(view))
+            view[: len(data)] = data
+            return len(data) == len(view)
         try:
             return os.preadv(self._file.fileno(), [view], offset) == len(view)
         except OSError as error:
@@ -284,6 +308,11 @@ def in_order(work: Callable[[_Piece], _Result], pieces: Iterable[_Piece], *, thr
         finally:
             for waiting in ahead:
                 waiting.cancel()
+
+
+def outline_of(size: int, index: bytes | memoryview) -> str:
+    """Return a hash (hex) of a file's size [byte] and its index, which holds where its chunks lie and when they were recorded."""
+    return hashlib.sha256(size.to_bytes(8, "little") + bytes(index)).hexdigest()
 
 
 def listed(what: str, numbers: Sequence[int]) -> str:

@@ -7,7 +7,7 @@ covers) is believed only as far as the chunk's own records bear it out.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -26,6 +26,7 @@ from tcpipe.formats.logs.chunk_reading import (
     chunk_blocks,
     copy_pieces,
 )
+from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_part import (
     MAX_CHUNK_BYTES,
     Bounds,
@@ -70,6 +71,8 @@ from tcpipe.logs.topics import Damage, normalized_type_name
 
 _LOOSE_BYTES = 1 << 22
 """Messages outside chunks are read in runs of about this size."""
+_AT_ONCE = 256
+"""The heads of so many chunks are looked at together."""
 
 
 @dataclass(slots=True)
@@ -84,10 +87,10 @@ class _Tally:
 class McapPart:
     """One .mcap file, open for reading."""
 
-    def __init__(self, path: Path, name: str) -> None:
+    def __init__(self, path: Path, name: str, fetched: FetchedFile | None = None) -> None:
         self.name = name
         self.damage: dict[Damage, None] = {}
-        self._bytes = ByteSource(path)
+        self._bytes = ByteSource(path, fetched)
         self._tallies: dict[int, _Tally] = {}
         self._untimed = 0
         self._complete = False
@@ -109,10 +112,13 @@ class McapPart:
             if self._bytes.peek(0, len(MAGIC)) != MAGIC:
                 self._note(0, "the file's first bytes are not those of an MCAP file", messages_lost=0)
             self._contents = read_summary(self._bytes)
+            if not self._contents.chunks:
+                self._bytes.whole()
             self._bounds.claim(chunk.size for chunk in self._contents.chunks)
         except DamageError as error:
             if str(error):
                 self._note(self._bytes.size, f"{error}; it is read record by record")
+            self._bytes.whole()
             self._contents = Contents()
             if not self._walk(self._contents, len(MAGIC), self._bytes.size):
                 self._distrust_last_index(self._contents)
@@ -123,6 +129,11 @@ class McapPart:
     def close(self) -> None:
         """Close the file."""
         self._bytes.close()
+
+    @property
+    def outline(self) -> str:
+        """A hash of the file's size and summary; "" where it is read without one."""
+        return self._contents.outline
 
     @property
     def unchecked(self) -> str:
@@ -217,10 +228,14 @@ class McapPart:
     def _note_odd_ones_without_crc(self) -> None:
         """Note the chunks that were read without a CRC where others of the file have one: it may have been overwritten."""
         odd = [chunk for chunk in self._contents.chunks if chunk.offset in self._without_crc and not chunk.headless]
-        others = (chunk for chunk in self._contents.chunks if chunk.offset not in self._without_crc)
-        if odd and any(self._crc(chunk) for chunk in others):
+        others = [chunk for chunk in self._contents.chunks if chunk.offset not in self._without_crc] if odd else []
+        if any(self._any_crc(others[first : first + _AT_ONCE]) for first in range(0, len(others), _AT_ONCE)):
             for chunk in odd:
                 self._note(chunk.offset, "a chunk has no CRC, others of the file have one; it is read unchecked")
+
+    def _any_crc(self, chunks: Sequence[Chunk]) -> bool:
+        self._bytes.expect([(chunk.offset, RECORD_HEAD + CHUNK_HEAD) for chunk in chunks])
+        return any(self._crc(chunk) for chunk in chunks)
 
     def _note_read(self, chunk: Chunk, *, checked: bool) -> None:
         self._read_chunks.add(chunk.offset)
@@ -258,6 +273,7 @@ class McapPart:
         regions: list[memoryview | bytes] = []
         places: list[tuple[int, int, int, int]] = []
         unsound, before = [], 0
+        self._bytes.expect([_needed(chunk) for chunk in chunks if chunk.index is not None])
         for number, chunk in enumerate(chunks):
             if chunk.index is None or chunk.cut or chunk.size > MAX_PLANNED_BYTES:
                 unsound.append(number)
@@ -563,6 +579,12 @@ class _LooseMessages:
         if size:
             chunks.append(Chunk(self._start, self._start, size, "", size, 0, 0, headless=True))
         self._start = self._end = 0
+
+
+def _needed(chunk: Chunk) -> tuple[int, int]:
+    """Return which bytes (offset, size) are read of a chunk that holds something wanted: of a plain one, its indexes to begin with."""
+    start = chunk.offset if chunk.compression else chunk.end
+    return start, chunk.end + chunk.index_bytes - start
 
 
 def _possible_chunks(block: memoryview, size: int) -> list[int]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from isal.isal_zlib import crc32
 
-from tcpipe.formats.logs.log_part import ByteSource, DamageError
+from tcpipe.formats.logs.log_part import ByteSource, DamageError, outline_of
 from tcpipe.formats.logs.mcap_records import (
     FOOTER,
     MAGIC,
@@ -31,6 +31,8 @@ from tcpipe.formats.logs.mcap_records import (
 
 _DATA_END = RECORD_HEAD + 4
 """Bytes of the record that ends the data, right before the summary."""
+_SUMMARY_BYTES = 1 << 16
+"""A summary is seldom longer."""
 
 
 @dataclass(slots=True)
@@ -41,6 +43,8 @@ class Contents:
     channels: dict[int, ChannelRecord] = field(default_factory=dict)
     chunks: list[Chunk] = field(default_factory=list)
     statistics: Statistics | None = None
+    outline: str = ""
+    """A hash of the summary, where that names every chunk of a file that has some."""
 
     def note(self, opcode: int, content: bytes | memoryview) -> None:
         """Remember a schema or channel; the first of a number holds, and others are not looked at, however many there are."""
@@ -54,6 +58,7 @@ class Contents:
 def read_summary(source: ByteSource) -> Contents:
     """Read the summary section; `DamageError` (without text where there simply is none) when it cannot be used."""
     tail_bytes = RECORD_HEAD + FOOTER + len(MAGIC)
+    source.expect([(0, len(MAGIC)), (max(source.size - _SUMMARY_BYTES, 0), _SUMMARY_BYTES)])
     tail = bytes(source.read(max(source.size - tail_bytes, 0), min(tail_bytes, source.size)))
     if not tail.endswith(MAGIC) or tail[0] != OP_FOOTER or int.from_bytes(tail[1:9], "little") != FOOTER:
         raise DamageError("the file is not closed (no footer)")
@@ -70,6 +75,8 @@ def read_summary(source: ByteSource) -> Contents:
         raise DamageError("the summary's CRC does not match")
     contents = _parsed(section[: end - start])
     _check(contents, source.size)
+    if contents.chunks:
+        contents.outline = outline_of(source.size, section)
     return contents
 
 

@@ -68,6 +68,7 @@ class SqlitePart:
     def __init__(self, path: Path, name: str) -> None:
         self.name = name
         self.damage: dict[Damage, None] = {}
+        self.outline = ""
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self._table: _MessageTable | None = None
         self._broken = ""

@@ -83,6 +83,16 @@ class TableLog:
         """Size of the folder's tables together, mapped or not."""
         return sum(file.stat().st_size for file in self._files)
 
+    @property
+    def outline(self) -> str:
+        """Tables have no index."""
+        return ""
+
+    @property
+    def is_known_by_outline(self) -> bool:
+        """Tables lie on this machine, and are hashed."""
+        return False
+
     def sha256(self) -> str:
         """Return the SHA-256 of all tables of the folder, mapped or not, one after the other, by name."""
         digest = hashlib.sha256()

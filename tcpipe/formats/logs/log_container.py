@@ -1,0 +1,94 @@
+"""Which container a file of a log is, told by its content, not by its name."""
+
+from __future__ import annotations
+
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
+from tcpipe.formats.logs.bag_file import BagPart
+from tcpipe.formats.logs.fetched_file import FetchedFile
+from tcpipe.formats.logs.log_part import LogPart
+from tcpipe.formats.logs.mcap_file import McapPart
+from tcpipe.formats.logs.rosbag2 import ZSTD_MAGIC, decompressed_file
+from tcpipe.formats.logs.sqlite_file import SqlitePart
+
+WANTED = "wanted an .mcap, a .bag (2.0), or a ROS 2 bag directory or .db3"
+_KNOWN_MAGIC = (
+    (b"PK\x03\x04", "a zip archive"),
+    (b"\x1f\x8b", "a gzip file"),
+    (b"BZh", "a bzip2 file"),
+    (b"\xfd7zXZ", "an xz file"),
+    (b"\x89HDF", "an HDF5 file"),
+    (b"PAR1", "a Parquet file"),
+    (b"%PDF", "a PDF"),
+    (b"II*\0", "a TIFF"),
+    (b"MM\0*", "a TIFF"),
+)
+
+
+def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | None) -> LogPart:
+    """Open a file of a log until the stack ends; `LogError` where it is none, which says what it seems to be."""
+    magic, given = _magic(path, fetched), path
+    if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_records.MAGIC)):
+        fetched.whole()
+    if magic.startswith(ZSTD_MAGIC):
+        path = decompressed_file(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tcpipe-"))))
+        magic = _magic(path, None)
+    part: LogPart
+    if magic.startswith(mcap_records.MAGIC) or _tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:
+        part = McapPart(path, name, fetched)
+    elif magic.startswith(bag_records.MAGIC):
+        part = BagPart(path, name, fetched)
+    elif magic.startswith(sqlite_file.MAGIC):
+        part = SqlitePart(path, name)
+    else:
+        held = "" if path == given else "what it holds, decompressed: "
+        raise LogError(f"{given}: not a log: {held}{_described(path, magic)}; {WANTED}")
+    stack.callback(part.close)
+    return part
+
+
+def container_of(path: Path, fetched: FetchedFile | None) -> str:
+    """Return ``bag``, ``mcap`` or ``rosbag2``."""
+    name = path.name.removesuffix(".zstd")
+    magic = _magic(path, fetched)
+    if magic.startswith(bag_records.MAGIC):
+        return "bag"
+    return "mcap" if magic.startswith(mcap_records.MAGIC) or name.endswith(".mcap") else "rosbag2"
+
+
+def _magic(path: Path, fetched: FetchedFile | None) -> bytes:
+    if fetched is not None and not fetched.is_whole:
+        return fetched.read(0, 16)
+    try:
+        with path.open("rb") as file:
+            return file.read(16)
+    except OSError as error:
+        raise LogError(f"{path}: it cannot be read ({error.strerror})") from None
+
+
+def _tail(path: Path, size: int) -> bytes:
+    """Return a file's last bytes; nothing where they cannot be read."""
+    try:
+        with path.open("rb") as file:
+            file.seek(max(path.stat().st_size - size, 0))
+            return file.read(size)
+    except OSError:
+        return b""
+
+
+def _described(path: Path, magic: bytes) -> str:
+    """Say what a file that is no log seems to be."""
+    if not magic:
+        return "it is empty (0 bytes)"
+    if magic.startswith(b"#ROSBAG V"):
+        return f"it is a ROS bag of version {magic[9:12].decode(errors='replace')} (rosbag fix converts it)"
+    for start, kind in _KNOWN_MAGIC:
+        if magic.startswith(start):
+            return f"it is {kind}"
+    if not any(magic):
+        return "it begins with zeros"
+    return f"it is {path.stat().st_size} bytes that begin with {magic[:8]!r}"

@@ -1,0 +1,199 @@
+"""Logs in a bucket: what is fetched of them is counted; they are the same recording wherever they lie."""
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+from random_messages import (
+    ROS1,
+    ROS2,
+    Message,
+    assert_same,
+    expected_columns,
+    random_messages,
+    table_bytes,
+    write_bag,
+    write_mcap,
+)
+from rosbags.rosbag1 import Writer as BagWriter
+from storage_server import object_store
+from wheel_drives import drive_at
+
+from tcpipe.errors import LogError
+from tcpipe.formats.logs.fetched_file import FetchedFile
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+
+TOPIC, CAMERA = "/ColorRGBA", "/camera"
+COUNT, EACH = 40, 200_000
+"""Images of a camera, and bytes of each: 8 MB."""
+
+
+def with_camera(store):
+    """Return messages of two small topics, and images that no compression shortens, each a chunk."""
+    small = random_messages(
+        1, count=COUNT, types=("std_msgs/msg/ColorRGBA", "std_msgs/msg/UInt8MultiArray"), store=store
+    )
+    rng = np.random.default_rng(3)
+    images = [
+        Message(CAMERA, "std_msgs/msg/UInt8MultiArray", 1_700_000_000_000_000_000 + index, rng.bytes(EACH), None)
+        for index in range(COUNT)
+    ]
+    return [*small, *images]
+
+
+def write(path, kind):
+    """Write a log of some 8 MB, of which some 30 kB are of ``TOPIC``, in chunks of their own; return the messages."""
+    if kind.startswith("bag"):
+        messages = with_camera(ROS1)
+        codec = BagWriter.CompressionFormat.LZ4 if kind == "bag lz4" else None
+        write_bag(path, messages, codec, chunk_bytes=30_000)
+        return messages, ROS1
+    messages = with_camera(ROS2)
+    compression = {"mcap zstd": CompressionType.ZSTD, "mcap": CompressionType.NONE}.get(kind, CompressionType.NONE)
+    write_mcap(path, messages, compression=compression, chunk_bytes=30_000, enable_crcs=kind != "mcap without CRC")
+    return messages, ROS2
+
+
+@pytest.fixture
+def drives(tmp_path, monkeypatch):
+    """A bucket ``drives`` in a directory, and what was fetched of it."""
+    bucket = tmp_path / "served" / "drives"
+    bucket.mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, fetched):
+        for name in ("HTTP_PROXY", "http_proxy"):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        yield bucket, fetched
+
+
+@pytest.mark.parametrize("kind", ["mcap zstd", "mcap", "mcap without CRC", "bag", "bag lz4"])
+def test_only_the_index_and_the_chunks_that_are_wanted_are_fetched(drives, kind):
+    bucket, fetched = drives
+    name = f"run.{kind[:4].strip()}"
+    messages, store = write(bucket / name, kind)
+    with open_log(f"s3://drives/{name}") as log:
+        size = log.size_bytes
+        assert log.topics[CAMERA].message_count == COUNT
+        opened_bytes = fetched.sent_bytes
+        assert opened_bytes < 0.02 * size  # of 8 MB: 64 kB of its end are fetched at once
+        assert_same(log.table(TOPIC), expected_columns(messages, TOPIC, store))
+        assert not log.damage
+        assert log.fetched_bytes == fetched.sent_bytes
+        assert fetched.sent_bytes < 0.2 * size  # heads are looked at, 8 kB each: of a chunk of a megabyte 1 %
+        assert log.path.stat().st_blocks == 0
+
+
+def test_a_recording_is_one_run_wherever_it_lies(drives, tmp_path):
+    bucket, _fetched = drives
+    here = drive_at(tmp_path / "here" / "run.mcap")
+    (bucket / "run.mcap").write_bytes(here.read_bytes())
+    for first, then in (("s3://drives/run.mcap", here), (here, "s3://drives/run.mcap")):
+        store = Store(tmp_path / f"store of {first != here}")
+        (made,) = ingest([first], store=store.root, recipe=Recipe()).results
+        (again,) = ingest([then], store=store.root, recipe=Recipe()).results
+        assert (made.status, again.status) == ("done", "unchanged")
+        assert again.run_id == made.run_id
+        assert again.same_as == str(first)
+        source = store.run_json(made.run_id).source
+        assert source.sha256_of == ("log" if first == here else "index")
+        assert made.run_id == f"run-{source.sha256[:8]}"
+        assert (again.distance_m, again.segments) == (made.distance_m, made.segments)
+    assert len(inspect(store.root, recipe=Recipe()).runs) == 1
+
+
+def test_what_is_broken_in_one_copy_is_read_from_another(drives, tmp_path):
+    bucket, _ = drives
+    here = drive_at(tmp_path / "run.mcap")
+    broken = bytearray(here.read_bytes())
+    broken[len(broken) // 2] ^= 0xFF
+    (bucket / "run.mcap").write_bytes(broken)
+    store = tmp_path / "store"
+    (damaged,) = ingest(["s3://drives/run.mcap"], store=store, recipe=Recipe()).results
+    (whole,) = ingest([here], store=store, recipe=Recipe()).results
+    assert (damaged.status, whole.status) == ("damaged", "done")
+    assert damaged.run_id != whole.run_id
+
+
+@pytest.mark.parametrize("kind", ["cut", "chunkless"])
+def test_a_log_without_an_index_is_fetched_as_a_whole_and_hashed(drives, tmp_path, kind):
+    bucket, _ = drives
+    messages = random_messages(1, count=50, types=("std_msgs/msg/ColorRGBA",))
+    path = write_mcap(bucket / "run.mcap", messages, use_chunking=kind != "chunkless", chunk_bytes=500)
+    if kind == "cut":
+        path.write_bytes(path.read_bytes()[: path.stat().st_size * 2 // 3])
+    with open_log("s3://drives/run.mcap") as there, open_log(path) as here:
+        assert table_bytes(there.table(TOPIC)) == table_bytes(here.table(TOPIC))
+        assert there.sha256() == here.sha256()
+        assert there.outline == here.outline == ""
+        assert not there.is_known_by_outline
+
+
+def test_an_index_tells_recordings_apart(tmp_path):
+    with open_log(drive_at(tmp_path / "a.mcap", seed=1)) as a, open_log(drive_at(tmp_path / "b.mcap", seed=2)) as b:
+        assert a.outline != b.outline
+        assert len(a.outline) == 64
+        assert not a.is_known_by_outline
+
+
+def test_a_connection_that_breaks_is_made_again_and_named_where_it_breaks_for_good(drives):
+    bucket, fetched = drives
+    messages, store = write(bucket / "run.mcap", "mcap zstd")
+    with open_log("s3://drives/run.mcap") as log:
+        fetched.cuts = 2
+        assert_same(log.table(TOPIC), expected_columns(messages, TOPIC, store))
+    fetched.cuts = 1000
+    with pytest.raises(LogError, match=r"s3://drives/run.mcap: it cannot be read \(") as broken:
+        open_log("s3://drives/run.mcap")
+    assert len(broken.value.problems) == 1
+    fetched.cuts = 0
+
+
+def test_an_object_that_is_written_anew_while_it_is_read_is_refused(drives):
+    bucket, _ = drives
+    write(bucket / "run.mcap", "mcap zstd")
+    with open_log("s3://drives/run.mcap") as log:
+        (bucket / "run.mcap").write_bytes((bucket / "run.mcap").read_bytes()[:-1] + b"x")
+        with pytest.raises(LogError, match=r"s3://drives/run.mcap: changed while it was read"):
+            log.table(TOPIC)
+
+
+class Recorded:
+    """An object that counts what is asked for."""
+
+    def __init__(self, data):
+        self.data, self.spans = data, []
+
+    @property
+    def size_bytes(self):
+        return len(self.data)
+
+    def ranges(self, spans):
+        self.spans += spans
+        return [memoryview(self.data)[start:stop] for start, stop in spans]
+
+    def copy(self, to):
+        to.write_bytes(self.data)
+
+
+def test_pieces_of_a_file_are_fetched_once_and_forgotten_when_they_are_many(tmp_path):
+    stored = Recorded(np.random.default_rng(0).bytes(70 << 20))
+    file = FetchedFile(stored, tmp_path / "stand-in")
+    assert file.read(10_000, 20) == stored.data[10_000:10_020]
+    assert file.read(10_000, 30) == stored.data[10_000:10_030]
+    assert len(stored.spans) == 1
+    assert file.read(stored.size_bytes - 5, 10) == stored.data[-5:]
+    assert file.read(stored.size_bytes + 5, 10) == b""
+    file.expect([(1 << 20, 100), ((1 << 20) + 20_000, 100), (5 << 20, 100)])
+    assert [stop - start for start, stop in stored.spans[2:]] == [24_576, 8192]  # what lies near is one piece
+    before = len(stored.spans)
+    assert file.read((1 << 20) + 20_000, 100) == stored.data[(1 << 20) + 20_000 :][:100]
+    assert len(stored.spans) == before
+    assert file.read(0, 70 << 20) == stored.data
+    assert file.read(10_000, 20) == stored.data[10_000:10_020]
+    assert len(stored.spans) > before + 1
+    file.whole()
+    assert (tmp_path / "stand-in").read_bytes() == stored.data
