@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 
 _CLASSES = 256
 _SPEED = "speed_"
+_NO_LOAD_QUANTILES = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5)
+"""Of the power, that are tried for what is drawn without any load."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,7 +31,7 @@ class PhysicsModel:
 
     speed: Curves
     """One output [m/s], straight in each third of the slopes."""
-    standing_watt: Floats
+    no_load_watt: Floats
     """P0, shape ()."""
     grade_newton: Floats
     """N, shape ()."""
@@ -48,7 +50,7 @@ class PhysicsModel:
         turn = np.where(np.isfinite(beside.turn_radpm), beside.turn_radpm, self.usual_turn_radpm)
         force = self.rolling_newton[beside.class_id] + self.grade_newton * np.tan(beside.slope_rad)
         work = velocity * (force + self.turning_joule_per_rad[beside.class_id] * turn)
-        return np.column_stack([self.standing_watt + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
+        return np.column_stack([self.no_load_watt + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return everything by name, as `physics_model_of` takes it."""
@@ -77,7 +79,9 @@ def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | 
     labels
         Power [W] and velocity [m/s], finite, shape (N, 2).
     standing_watt
-        What the robot was seen to draw while it stood; None where it was not.
+        What the robot was seen to draw while it stood; None where it was not. Drives that turn may draw more without any load, and
+        where speeds hardly vary nothing tells that from rolling but the ground that is driven down: of this and some of the smaller
+        powers, that one is P0 which leaves the least error.
 
     Raises
     ------
@@ -88,18 +92,27 @@ def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | 
     names = np.where(beside.class_id > 0, beside.class_id.astype(np.str_), ALL)
     power, velocity = labels.T
     metres = Metres(power, velocity, np.tan(beside.slope_rad), beside.turn_radpm * velocity, names)
-    found = fit_physics(metres, standing_watt=standing_watt)
+    found = _best(metres, [standing_watt, *np.quantile(power, _NO_LOAD_QUANTILES).tolist()])
     if found is None:
         raise ModelError(f"{len(labels)} samples to fit physics to, wanted at least {FEWEST} that move")
     known = beside.turn_radpm[np.isfinite(beside.turn_radpm)]
     return PhysicsModel(
         speed=fit_curves("linear", beside.slope_rad, beside.class_id, labels[:, 1:]),
-        standing_watt=_of_all(found, "standing"),
+        no_load_watt=_of_all(found, "standing"),
         grade_newton=_of_all(found, "grade"),
         recovered=np.array(found.recovered),
         usual_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
         rolling_newton=_by_class(found, "rolling"),
         turning_joule_per_rad=_by_class(found, "turning"),
+    )
+
+
+def _best(metres: Metres, candidates_watt: Sequence[float | None]) -> Physics | None:
+    """Return the fit of the least mean error among those with each of these powers at no load."""
+    fits = [fit_physics(metres, standing_watt=None if watt is None else max(watt, 0.0)) for watt in candidates_watt]
+    found = [fit for fit in fits if fit is not None]
+    return min(
+        found, key=lambda fit: float(np.nanmean(np.abs(metres.power_watt - fit.power_watt(metres)))), default=None
     )
 
 

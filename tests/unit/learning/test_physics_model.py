@@ -25,12 +25,24 @@ def drive(seed=0, count=COUNT):
 def test_a_robot_is_found_again():
     beside, labels = drive()
     model = fit_physics_model(beside, labels, standing_watt=50.0)
-    assert model.standing_watt == pytest.approx(50.0, rel=0.01)
+    assert model.no_load_watt == pytest.approx(50.0, rel=0.01)
     assert model.grade_newton == pytest.approx(400.0, rel=0.01)
     assert model.rolling_newton[[4, 6]] == pytest.approx([60.0, 30.0], rel=0.02)
     assert model.turning_joule_per_rad[[4, 6]] == pytest.approx(80.0, rel=0.02)
     other, told = drive(seed=1)
     assert model.predict(other) == pytest.approx(told, rel=0.01)
+
+
+def test_what_the_drives_take_without_a_load_is_found_where_halts_tell_less():
+    """14 W at halts, 70 W as soon as it moves, seen where slopes drive the robot."""
+    beside, labels = drive()
+    slope = beside.slope_rad - 0.15
+    velocity = labels[:, 1] * 0.0 + 0.9 - 0.3 * np.maximum(slope, 0.0)
+    power = 70.0 + np.maximum(velocity * (40.0 + 400.0 * np.tan(slope)), 0.0)
+    moved, told = replace(beside, slope_rad=slope), np.column_stack([power, velocity])
+    model = fit_physics_model(moved, told, standing_watt=14.0)
+    assert model.no_load_watt == pytest.approx(70.0, abs=5.0)
+    assert np.abs(model.predict(moved)[:, 0] - power).mean() < 3.0
 
 
 def test_what_is_not_known_is_as_usual():
