@@ -227,7 +227,8 @@ def _recovered(traction: Floats, force: Floats, weight: Floats, down: NDArray[np
     if down.sum() < _FEWEST_DOWNHILL:
         return 0.0
     work = weight[down] * traction[down]
-    return float(np.clip((work @ force[down]) / (work @ traction[down]), 0.0, 1.0))
+    size = float(work @ traction[down])  # 0 where standing is said to take all that was measured
+    return float(np.clip((work @ force[down]) / size, 0.0, 1.0)) if size > 0.0 else 0.0
 
 
 def _covariance(

@@ -96,3 +96,10 @@ def test_too_few_metres_give_no_fit_and_no_robot_no_plausible_one():
     assert fit_physics(metres.take(np.arange(19)), standing_watt=STANDING_WATT) is None
     assert fit_physics(replace(metres, power_watt=np.full(400, np.nan)), standing_watt=STANDING_WATT) is None
     assert not fit_physics(pooled(replace(metres, rise=-metres.rise)), standing_watt=STANDING_WATT).is_plausible()
+
+
+def test_a_robot_that_is_said_to_take_all_its_power_while_it_stands():
+    metres = replace(made(), power_watt=np.full(len(made().rise), 50.0))
+    found = fit_physics(metres, standing_watt=50.0)
+    assert found.power_watt(metres) == pytest.approx(50.0, rel=0.01)
+    assert 0.0 <= found.recovered <= 1.0
