@@ -46,7 +46,7 @@ Floats32 = NDArray[np.float32]
 
 CARD = "cost-map.json"
 KIND = "tcpipe cost map"
-VERSION = "1.0"
+VERSION = "1.1"
 
 _BLOCKS_KEPT = 8
 """Blocks after which what is done is on disk."""

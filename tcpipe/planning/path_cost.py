@@ -10,10 +10,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from pyproj import CRS, Geod
 
+from tcpipe.cost.prediction_errors import COVERAGE, errors_of
 from tcpipe.errors import PathError
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.planning.cost_model import CostModel, check_model
-from tcpipe.planning.intervals import COVERAGE, errors_of
 from tcpipe.planning.path_table import PIECES
 from tcpipe.planning.pieces import Pieces, cut_path, ground_scale
 from tcpipe.planning.reasons import Reason, counts_of, names_of
@@ -47,6 +47,9 @@ class PathTotals:
     energy_interval_joule: tuple[float, float] | None
     coverage: float = COVERAGE
     """Share of drives that an interval is to hold."""
+    held_out_samples: int = 0
+    held_out_runs: int = 0
+    """What the intervals are told by."""
     reasons: Mapping[str, int]
     """Pieces by reason; a piece may have several."""
     complete: bool
@@ -165,6 +168,8 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts)
         turn_energy_joule=None if turning is None else float(np.nansum(turn_joule)),
         duration_interval_s=sums[0] if sums else None,
         energy_interval_joule=sums[1] if sums else None,
+        held_out_samples=errors["energy"].samples if errors else 0,
+        held_out_runs=errors["energy"].runs if errors else 0,
         reasons=counts_of(bits),
         complete=not without_cost,
     )

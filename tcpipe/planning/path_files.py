@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.errors import StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.geojson_lines import read_line
@@ -13,11 +14,10 @@ from tcpipe.formats.json_files import digest, recast
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import file_checksum, read_sealed_as, write_sealed
 from tcpipe.planning.cost_model import CostModel
-from tcpipe.planning.intervals import COVERAGE
 from tcpipe.planning.path_cost import PathTotals, cost_of_path
 from tcpipe.planning.path_table import check_ending, write_pieces
 
-VERSION = "1.1"
+VERSION = "1.2"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +90,16 @@ def _quantity(value: float, interval: tuple[float, float] | None, unit: str) -> 
 def _reason_lines(of: PathTotals) -> list[str]:
     lines = [f"warning: {count} of {of.pieces} pieces: {name.replace('_', ' ')}" for name, count in of.reasons.items()]
     if of.duration_interval_s is None:
-        lines.append("warning: no intervals: the model has too few held-out samples to tell its errors")
+        return [*lines, "warning: no intervals: the model has too few held-out samples to tell its errors"]
+    told = f"{of.held_out_samples} held-out samples of {of.held_out_runs} run{'s' if of.held_out_runs > 1 else ''}"
+    of_both = {"time": (of.duration_s, of.duration_interval_s), "energy": (of.energy_joule, of.energy_interval_joule)}
+    lines += [
+        f"warning: {name}: the interval is wider than the {name} itself: {told} tell no more"
+        for name, (value, ends) in of_both.items()
+        if ends is not None and ends[1] - ends[0] > abs(value)
+    ]
+    if of.held_out_runs == 1:
+        lines.append(f"warning: {told} do not tell how runs differ: the intervals are of such a run on such a day")
     return lines
 
 

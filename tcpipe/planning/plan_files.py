@@ -22,7 +22,7 @@ from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
 from tcpipe.planning.survey import Survey, new_survey, survey_from
 from tcpipe.tables.findings import LEFT_OUT
 
-VERSION = "1.0"
+VERSION = "1.1"
 
 
 @dataclass(frozen=True, slots=True)

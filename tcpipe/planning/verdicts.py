@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.cost.prediction_errors import Centring, centring_of
 from tcpipe.planning.cost_model import CostModel, predict_patches
 from tcpipe.planning.reasons import NO_COST, Bits, Reason, reasons_of
 from tcpipe.terrain.layers import HEIGHT_STEP_M
@@ -27,7 +28,7 @@ BATCH = 4_096
 class Verdicts:
     """What is said of N metres, shape (N,): `Reason` bits, predictions (NaN without a cost), and what the ground is.
 
-    ``velocity_mps`` is horizontal, whichever velocity the model predicts: a metre of the map takes its inverse. ``height_m`` is that of
+    Predictions are centred (`tcpipe.cost.prediction_errors`). ``velocity_mps`` is horizontal, whichever velocity the model predicts: a metre of the map takes its inverse. ``height_m`` is that of
     the metre's middle, NaN where the map has none.
     """
 
@@ -53,7 +54,7 @@ def verdicts_of(
     Without ``ask`` the ground is judged alone: no predictions. ``turn_radpm`` is how far a metre of each frame turns, of all batches one
     after another; without it all turn as usual.
     """
-    tiles = TilePool(level_for(source, model.patch_m / model.patch_px))
+    centring, tiles = centring_of(model.residuals), TilePool(level_for(source, model.patch_m / model.patch_px))
 
     def sampled(frames: PatchFrames, first: int) -> tuple[Patches, NDArray[np.bool_], Floats | None]:
         chord_m = np.full(len(frames.centre_xy_m), model.chord_m)
@@ -67,10 +68,10 @@ def verdicts_of(
         for frames in batches:
             following, first = ahead.submit(sampled, frames, first), first + len(frames.centre_xy_m)
             if waiting is not None:
-                yield _judged(model, source, *waiting.result(), ask=ask)
+                yield _judged(model, source, *waiting.result(), centring=centring, ask=ask)
             waiting = following
         if waiting is not None:
-            yield _judged(model, source, *waiting.result(), ask=ask)
+            yield _judged(model, source, *waiting.result(), centring=centring, ask=ask)
 
 
 def _judged(
@@ -80,19 +81,21 @@ def _judged(
     on_map: NDArray[np.bool_],
     turn_radpm: Floats | None,
     *,
+    centring: Centring,
     ask: bool,
 ) -> Verdicts:
     bits = reasons_of(patches, on_map, model, source)
     asked = (bits & NO_COST == 0) & ask
     said = predict_patches(model, patches, asked, turn_radpm)
-    bits[asked & np.isnan(said.velocity_mps)] |= np.uint16(Reason.NO_MOTION)
+    power_watt, velocity_mps = centring.apply(said.power_watt, said.velocity_mps, patches.terrain_class)
+    bits[asked & np.isnan(velocity_mps)] |= np.uint16(Reason.NO_MOTION)
     known = bits & (Reason.OUTSIDE_MAP | Reason.NODATA) == 0
     horizontal = np.cos(patches.slope_rad) if model.label_velocity == "fused" else 1.0
     middle = patches.pixels["height"][:, model.patch_px // 2, model.patch_px // 2] * HEIGHT_STEP_M
     return Verdicts(
         reasons=bits,
-        power_watt=said.power_watt,
-        velocity_mps=said.velocity_mps * horizontal,
+        power_watt=power_watt,
+        velocity_mps=velocity_mps * horizontal,
         terrain_class=patches.terrain_class,
         slope_rad=np.where(known, patches.slope_rad, np.nan),
         cross_slope_rad=np.where(known, patches.cross_slope_rad, np.nan),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from physics_model import made_residuals
 
-from tcpipe.planning.intervals import COVERAGE, errors_of
+from tcpipe.cost.prediction_errors import COVERAGE, centring_of, errors_of
 
 _GRASS = np.uint8(4)
 
@@ -42,12 +42,53 @@ def test_intervals_hold_the_share_of_drives_that_they_promise(shared):
     assert COVERAGE - 0.05 < held < COVERAGE + 0.09  # the correlation is never taken for less than was seen
 
 
-def test_a_model_that_is_off_on_average_has_an_interval_beside_its_prediction():
-    residuals = made_residuals(1000, sigma=0.01)
-    residuals["power_watt"] = residuals["power_watt"] * 1.2
-    low, high = errors_of(residuals)["energy"].of_sum(np.full(50, 100.0), np.full(50, _GRASS))
-    assert low < 50 * 120.0 < high
-    assert low > 50 * 110.0
+def _with_power(residuals, factor, rows=slice(None)):
+    power = residuals["power_watt"].copy()
+    power[rows] *= factor
+    return {**residuals, "power_watt": power}
+
+
+def test_a_model_that_is_off_on_average_is_centred_and_lies_in_its_interval():
+    residuals = _with_power(made_residuals(1000, sigma=0.01), 1.2)
+    power, velocity = centring_of(residuals).apply(np.full(50, 100.0), np.full(50, 0.8), np.full(50, _GRASS))
+    assert power == pytest.approx(120.0, rel=0.003)
+    assert velocity == pytest.approx(0.8)
+    energy = power / velocity
+    low, high = errors_of(residuals)["energy"].of_sum(energy, np.full(50, _GRASS))
+    assert 0.97 * energy.sum() < low < energy.sum() < high < 1.03 * energy.sum()
+
+
+def test_a_few_samples_of_a_class_do_not_make_its_bias():
+    """Three samples 10 % off, of errors of 10 %, are chance; three hundred are not."""
+    residuals = made_residuals(1000, sigma=0.1)
+    for count, least, most in ((3, -0.02, 0.02), (300, 0.07, 0.13)):
+        few = {**residuals, "terrain_class": np.where(np.arange(1000) % 3 * 1000 + np.arange(1000) // 3 < count, 5, 4)}
+        power, _ = centring_of(_with_power(few, 1.1, few["terrain_class"] == 5)).apply(np.ones(1), np.ones(1), np.array([5]))
+        assert least < power[0] - 1.0 < most
+
+
+def test_an_end_that_two_metres_share_is_an_error_of_neither_together():
+    """Where one metre is too long its neighbour is too short: ten in a row err like the two outer ends alone."""
+    residuals, rng = made_residuals(8000), np.random.default_rng(1)
+    residuals["power_watt"] = 150.0 * (1.0 + 0.1 * np.diff(rng.normal(size=8001)))
+    found = errors_of(residuals)["energy"]
+    assert found.correlation[0] == pytest.approx(-0.5, abs=0.05)
+    assert _width(found, 10) == pytest.approx(2.0 * 1.645 * 0.1 * np.sqrt(2.0) / 10.0, rel=0.3)
+
+
+def test_two_runs_tell_less_of_a_third_than_twenty_do():
+    few, many = (errors_of(made_residuals(4000, shared=0.3, runs=runs))["energy"] for runs in (3, 40))
+    assert (few.runs, many.runs) == (3, 40)
+    assert many.of_run == pytest.approx(0.3, rel=0.4)
+    errors = made_residuals(4000, shared=0.3, runs=3)["power_watt"][:3999] / 150.0
+    means = errors.reshape(3, -1).mean(axis=1)  # Student's t with two degrees of freedom is 2.92
+    assert few.of_run == pytest.approx(means.var(ddof=1) / errors.var() * (2.92 / 1.645) ** 2, rel=0.05)
+
+
+@pytest.mark.parametrize("count", [25, 60])
+def test_small_data_still_average_out(count):
+    found = errors_of(made_residuals(count, runs=1))["energy"]
+    assert _width(found, 100) < 0.6 * _width(found, 1)
 
 
 def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
@@ -60,6 +101,7 @@ def test_a_class_with_enough_held_out_samples_has_errors_of_its_own():
     ends = [errors.of_pieces(np.array([100.0]), np.array([number], np.uint8)) for number in (4, 5, 7)]
     grass, mud, other = ((high - low)[0] for low, high in ends)
     assert grass < other < mud
+    assert mud > 4.0 * grass
 
 
 def test_pieces_without_a_cost_add_nothing():

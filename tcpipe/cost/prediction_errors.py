@@ -1,0 +1,301 @@
+"""How wrong a model's time and energy are, of a metre and of a path, from how wrong it was on samples that it did not learn from.
+
+Held-out samples have a label and a prediction. Of them are taken, in this order (docs/adr, What a prediction's error is made of):
+
+* the **bias** of each terrain class: what all its metres took over what was said of them, less one, as far as it is beyond chance. With
+  b the ratio of a class, b0 that of all and s its standard error over blocks of the drives, b0 + (b - b0) max(0, 1 - s² / (b - b0)²)
+  (James and Stein's positive part; Efron and Morris, JASA 70, 1975). Predictions are multiplied by it, so that they are centred.
+* the **spread** of one metre, a + c |prediction|, with a factor of the class that few samples hardly move from 1.
+* the **correlation** of two metres of one run by their distance, from the semivariogram g of the errors over their spread
+  (Cressie, *Statistics for Spatial Data*, 1993, section 2.4): 1 - g(distance) / g(other runs). A segment's end is the next one's
+  beginning, so that of neighbours may be negative; beyond, it never rises, and distances with few pairs are taken together. What is left
+  at the greatest distance is each run's own; few runs tell it as Student's t.
+
+With a_i the spreads and s_i the errors of the biases, a path errs by z sqrt(sum_ij a_i a_j rho_ij + (sum_i s_i)²): less, of itself, the
+longer it is, and never less than a run differs from another.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import isotonic_regression, nnls
+from scipy.special import stdtrit
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Residuals = Mapping[str, NDArray[np.generic]]
+
+COVERAGE = 0.9
+"""Share of drives that an interval is to hold."""
+
+FEWEST = 20
+"""Held-out samples without which nothing is said of errors."""
+
+_TAIL = (1.0 - COVERAGE) / 2.0
+_Z = 1.6448536269514722
+"""Half-width of a normal interval of `COVERAGE`, in standard deviations."""
+_CLASSES = 256
+_HALFWAY = 20.0
+"""Samples of a class by which its spread is half its own, half that of all, as a geometric mean."""
+_ENOUGH_RUNS, _BLOCK = 10, 20
+"""Runs are what errs alike in a bias; of fewer, so many consecutive held-out samples of one."""
+_MOST_BIAS = 0.5
+_LAGS_M: Floats = np.concatenate([[0.0, 1.5], 2.0 ** np.arange(1.5, 13.0)])
+"""Edges of the distances by which pairs are sorted: neighbours, and doubling to 6 km."""
+_FEWEST_PAIRS = 100
+_STEPS = np.unique(np.round(2.0 ** np.arange(0.0, 12.0, 0.5)).astype(np.int64))
+"""How many rows further the other of a pair stands: all distances are met, pairs grow with the rows, not with their square."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bias:
+    """Factors, less one, of a quantity by class id, and their standard errors, shape (256,) each."""
+
+    value: Floats
+    std: Floats
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Errors of one quantity's centred predictions.
+
+    Attributes
+    ----------
+    floor, share : the spread of a metre of all ground is ``floor`` + ``share`` |prediction|.
+    of_class : by what it is multiplied, by class id, shape (256,).
+    low, high : 5 % and 95 % quantiles of the errors over their spread.
+    bias_std : standard error of the class's bias, of the prediction, shape (256,).
+    lag_m, correlation : of two metres so far apart on one run, from each lag to the next.
+    of_run : the last of them, each run's own, raised for how few runs told it.
+    runs, samples : that were held out.
+    """
+
+    floor: float
+    share: float
+    of_class: Floats
+    low: float
+    high: float
+    bias_std: Floats
+    lag_m: Floats
+    correlation: Floats
+    of_run: float
+    runs: int
+    samples: int
+
+    def spread(self, predicted: Floats, class_id: NDArray[np.integer]) -> Floats:
+        """Return the standard deviation of each prediction, shape (N,)."""
+        return np.asarray((self.floor + self.share * np.abs(predicted)) * self.of_class[class_id])
+
+    def of_pieces(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
+        """Return the interval of each piece, shape (N,) each."""
+        spread = self.spread(predicted, class_id)
+        return predicted + self.low * spread, predicted + self.high * spread
+
+    def of_sum(self, predicted: Floats, class_id: NDArray[np.integer]) -> tuple[float, float]:
+        """Return the interval of the sum over pieces of about a metre, in order along the path; shape (N,), NaN counts as none."""
+        known = np.isfinite(predicted)
+        said = np.where(known, predicted, 0.0)
+        spread = np.where(known, self.spread(said, class_id), 0.0)
+        middle, alone = float(said.sum()), float((spread**2).sum())
+        if not alone:
+            return middle, middle
+        variance = max(self._variance(spread), alone / spread.size)
+        common = float((np.abs(said) * self.bias_std[class_id]).sum())
+        like_one = min(variance / float(spread.sum()) ** 2, 1.0)  # errors of a single metre are no normal ones, sums nearly
+        ends = (np.array([self.low, self.high]) * like_one + np.array([-_Z, _Z]) * (1.0 - like_one)) / _Z
+        width = _Z * np.sqrt(variance + common**2)
+        return middle + width * float(ends[0]), middle + width * float(ends[1])
+
+    def _variance(self, spread: Floats) -> float:
+        """Return sum_ij a_i a_j rho_ij."""
+        spectrum = np.fft.rfft(spread, 2 * spread.size)
+        pairs = np.fft.irfft(np.abs(spectrum) ** 2, 2 * spread.size)[: spread.size]  # sums of a_i a_j by lag
+        at = np.searchsorted(self.lag_m, np.arange(spread.size, dtype=np.float64), side="right") - 1
+        rho = self.correlation[at]
+        rho = rho + (self.of_run - self.correlation[-1])  # what few runs leave open is in every pair
+        return float(pairs[0] * (1.0 + self.of_run - self.correlation[-1]) + 2.0 * (pairs[1:] @ rho[1:]))
+
+
+@dataclass(frozen=True, slots=True)
+class Centring:
+    """What power and velocity are corrected by, so that time and energy of a class's metres are right on average."""
+
+    duration: Bias
+    energy: Bias
+
+    def apply(self, power_watt: Floats, velocity_mps: Floats, class_id: NDArray[np.integer]) -> tuple[Floats, Floats]:
+        """Return centred power [W] and velocity [m/s], shape (N,) each."""
+        slower, more = 1.0 + self.duration.value[class_id], 1.0 + self.energy.value[class_id]
+        return np.asarray(power_watt * more / slower), np.asarray(velocity_mps / slower)
+
+
+_NOTHING = Bias(np.zeros(_CLASSES), np.zeros(_CLASSES))
+
+
+def centring_of(residuals: Residuals) -> Centring:
+    """Return by what a model's power and velocity are centred; by nothing with fewer than `FEWEST` held-out samples of both."""
+    held = _Held.of(residuals)
+    if held is None:
+        return Centring(_NOTHING, _NOTHING)
+    return Centring(*(_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
+
+
+def errors_of(residuals: Residuals) -> dict[str, Errors] | None:
+    """Return the errors of ``power``, ``velocity``, ``duration`` and ``energy`` a metre; None with fewer than `FEWEST` held-out samples.
+
+    Parameters
+    ----------
+    residuals : one row a held-out sample: run_id, start_ns, terrain_class, power_watt, velocity_mps, and both as predicted.
+    """
+    held = _Held.of(residuals)
+    if held is None:
+        return None
+    centring = Centring(*(_bias(held.said[name], held.true[name], held) for name in ("duration", "energy")))
+    power, velocity = centring.apply(held.said["power"], held.said["velocity"], held.class_id)
+    said = {"power": power, "velocity": velocity, "duration": 1.0 / velocity, "energy": power / velocity}
+    std = {"duration": centring.duration.std, "energy": centring.energy.std}
+    nothing = np.zeros(_CLASSES)
+    return {name: _errors(of, held.true[name], held, std.get(name, nothing)) for name, of in said.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class _Held:
+    """Held-out samples in the order of driving: what was true and said of each quantity, shape (N,), and where."""
+
+    true: Mapping[str, Floats]
+    said: Mapping[str, Floats]
+    class_id: Ints
+    run: Ints
+    way_m: Floats
+    """Along its run."""
+
+    @classmethod
+    def of(cls, residuals: Residuals) -> _Held | None:
+        names = ("power_watt", "velocity_mps", "power_predicted_watt", "velocity_predicted_mps")
+        if not set(names) <= residuals.keys():
+            return None
+        power, velocity, said_power, said_velocity = (residuals[name].astype(np.float64) for name in names)
+        usable = np.isfinite(power + said_power) & (velocity > 0.0) & (said_velocity > 0.0)
+        if np.count_nonzero(usable) < FEWEST:
+            return None
+        run = np.unique(residuals["run_id"], return_inverse=True)[1].reshape(-1)
+        start_ns = residuals["start_ns"].astype(np.int64)
+        rows = np.lexsort((start_ns, run))
+        rows = rows[usable[rows]]
+        pace, of_run = velocity[rows], run[rows]
+        step_m = pace[:-1] * np.diff(start_ns[rows]) * 1e-9  # a segment's pace is its chord over its time: neighbours are a chord apart
+        way_m = np.concatenate([[0.0], np.cumsum(np.where(np.diff(of_run) == 0, step_m, 0.0))])
+        true, said = (
+            {"power": p[rows], "velocity": v[rows], "duration": 1.0 / v[rows], "energy": p[rows] / v[rows]}
+            for p, v in ((power, velocity), (said_power, said_velocity))
+        )
+        class_id = np.nan_to_num(residuals["terrain_class"][rows].astype(np.float64)).astype(np.int64)
+        return cls(true, said, class_id, of_run, way_m)
+
+
+def _bias(said: Floats, true: Floats, held: _Held) -> Bias:
+    """Return the bias of all ground, and of each class as far as it is beyond chance."""
+    block = held.run
+    if np.unique(block).size < _ENOUGH_RUNS:
+        block = np.cumsum(np.r_[True, np.diff(held.run) != 0] | (np.arange(said.size) % _BLOCK == 0)) - 1
+    everywhere, error = _ratio(said, true, block)
+    everywhere *= max(0.0, 1.0 - (error / everywhere) ** 2) if everywhere else 0.0
+    value, std = np.full(_CLASSES, everywhere), np.full(_CLASSES, error)
+    for number in np.unique(held.class_id).tolist():
+        own = held.class_id == number
+        found, chance = _ratio(said[own], true[own], block[own])
+        beyond = found - everywhere
+        kept = max(0.0, 1.0 - (chance / beyond) ** 2) if beyond else 0.0
+        value[number] = everywhere + kept * beyond
+        std[number] = np.sqrt(kept * chance**2 + (1.0 - kept) * error**2)
+    return Bias(np.clip(value, -_MOST_BIAS, _MOST_BIAS), std)
+
+
+def _ratio(said: Floats, true: Floats, block: Ints) -> tuple[float, float]:
+    """Return what was true over what was said, less one, and its standard error over blocks; a single block tells no error but itself."""
+    whole = float(np.abs(said).sum())
+    if not whole:
+        return 0.0, 0.0
+    found = float((true - said).sum()) / whole
+    of_block = np.bincount(np.unique(block, return_inverse=True)[1], weights=true - said - found * np.abs(said))
+    several = of_block.size
+    if several < 2:
+        return found, abs(found)
+    return found, float(np.sqrt((of_block**2).sum() * several / (several - 1.0))) / whole
+
+
+def _errors(said: Floats, true: Floats, held: _Held, bias_std: Floats) -> Errors:
+    error = true - said
+    design = np.column_stack([np.ones_like(said), np.abs(said)])
+    (floor, share), _ = nnls(design, np.abs(error))
+    plain = np.maximum(design @ [floor, share], 1e-12)
+    scale = max(float(np.sqrt(np.mean((error / plain) ** 2))), 1e-9)
+    standard, of_class = error / (scale * plain), np.ones(_CLASSES)
+    for number in np.unique(held.class_id).tolist():
+        own = standard[held.class_id == number]
+        of_class[number] = max(float(np.mean(own**2)), 1e-4) ** (0.5 * own.size / (own.size + _HALFWAY))
+    standard = standard / of_class[held.class_id]
+    low, high = np.quantile(standard, (_TAIL, 1.0 - _TAIL)).tolist()
+    lag_m, correlation = _correlation(standard, held)
+    runs = int(np.unique(held.run).size)
+    of_run = max(_of_run(error, scale * plain * of_class[held.class_id], held.run), float(correlation[-1]))
+    return Errors(
+        float(floor) * scale, float(share) * scale, of_class, min(low, 0.0), max(high, 0.0), bias_std,
+        lag_m, correlation, of_run, runs, standard.size,
+    )  # fmt: skip
+
+
+def _of_run(error: Floats, spread: Floats, run: Ints) -> float:
+    """Return the variance of a new run's mean error over its spread, raised as Student's t wants it: a normal interval holds it then."""
+    means = (np.bincount(run, weights=error) / np.maximum(np.bincount(run, weights=spread), 1e-300))[np.unique(run)]
+    if means.size < 2:
+        return 0.0
+    quantile = float(stdtrit(means.size - 1.0, 1.0 - _TAIL))
+    return float(means.var(ddof=1)) * (quantile / _Z) ** 2
+
+
+def _correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
+    """Return lags and the correlation from each on."""
+    sill = _between_runs(standard, held.run)
+    half, far_m = _pairs(standard, held)
+    bins = np.searchsorted(_LAGS_M, far_m, side="right") - 1
+    count = np.bincount(bins, minlength=_LAGS_M.size)
+    total = np.bincount(bins, weights=half, minlength=_LAGS_M.size)
+    edges, sums, counts = [0.0], [0.0], [0.0]
+    for lag, pairs, value in zip(_LAGS_M, count, total, strict=True):
+        if counts[-1] >= _FEWEST_PAIRS:
+            edges, sums, counts = [*edges, float(lag)], [*sums, 0.0], [*counts, 0.0]
+        sums[-1], counts[-1] = sums[-1] + float(value), counts[-1] + float(pairs)
+    if counts[-1] < _FEWEST_PAIRS and len(counts) > 1:  # the rest is with the distance before
+        edges, sums, counts = edges[:-1], [*sums[:-2], sums[-2] + sums[-1]], [*counts[:-2], counts[-2] + counts[-1]]
+    pairs = np.array(counts)
+    rho = 1.0 - np.array(sums) / np.maximum(pairs, 1.0) / sill
+    rho[pairs == 0] = 0.0
+    if rho.size > 1:
+        rho[1:] = np.clip(isotonic_regression(rho[1:], weights=np.maximum(pairs[1:], 1.0), increasing=False).x, 0.0, 1.0)
+    return np.array(edges), np.clip(rho, -0.5, 1.0)
+
+
+def _between_runs(standard: Floats, run: Ints) -> float:
+    """Return half the mean squared difference of errors of two runs; of one run alone, their variance."""
+    count = np.bincount(run).astype(np.float64)
+    total, squares = np.bincount(run, weights=standard), np.bincount(run, weights=standard**2)
+    pairs = count.sum() ** 2 - (count**2).sum()
+    if not pairs:
+        return max(float(standard.var()), 1e-12)
+    apart = (squares * (count.sum() - count)).sum() * 2.0 - 2.0 * (total.sum() ** 2 - (total**2).sum())
+    return max(float(apart / pairs / 2.0), 1e-12)
+
+
+def _pairs(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
+    """Return half the squared difference of rows of one run, and how far apart they were driven [m]."""
+    half, far_m = [np.empty(0)], [np.empty(0)]
+    for step in _STEPS[_STEPS < standard.size]:
+        same = held.run[step:] == held.run[:-step]
+        half.append(0.5 * np.square(standard[step:] - standard[:-step])[same])
+        far_m.append((held.way_m[step:] - held.way_m[:-step])[same])
+    return np.concatenate(half), np.concatenate(far_m)
