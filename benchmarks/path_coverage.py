@@ -1,6 +1,6 @@
 """How often 90 % intervals of a table model hold what further drives measure: metres, and paths of 10, 30 and 100 m.
 
-    python benchmarks/path_coverage.py [--train 10] [--metres 700] [--further 24] [--seeds 3]
+    python benchmarks/path_coverage.py [--train 10] [--metres 700] [--further 24] [--trainings 1]
 
 Drives wander over the paper's simulated site. They are simulated as labels, metre by metre, not as logs: time and energy of the plant
 at 11 points of a metre, with the hidden resistance of the place, a level of the run's own (5 % of the resistance, 2 % of the speed), the
@@ -22,6 +22,7 @@ from tcpipe.cost.prediction_errors import Errors, centring_of, errors_of
 from tcpipe.learning.forest import Forest, grow
 from tcpipe.planning.pieces import cut_path
 from tcpipe.simulation import scenario
+from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import Leg, Wander
 from tcpipe.simulation.world import World
 
@@ -31,6 +32,16 @@ LENGTHS = (1, 10, 30, 100)
 POINTS = 11
 END_STD_M, RUN_RESISTANCE, RUN_SPEED = 0.02, 0.05, 0.02
 QUANTITIES = ("duration", "energy")
+
+
+@dataclass(frozen=True)
+class Held:
+    """Share of paths that intervals hold, the 95 % interval of that over drives, and the median half-width [of the prediction]."""
+
+    share: float
+    low: float
+    high: float
+    half_width: float
 
 
 @dataclass(frozen=True)
@@ -54,11 +65,11 @@ def wandering(world: World, rng: np.random.Generator, metres: float) -> Floats:
         if world.terrain_class(np.array(start[0] + site.west_m), np.array(start[1] + site.south_m)) >= 4:
             plan = Wander(metres, start, odd_manoeuvres=False).plan(world, rng)
             points = np.array([start, *(at for leg in plan if isinstance(leg, Leg) for at in leg.waypoints_m)])
-            pieces = cut_path(points + [site.west_m, site.south_m], chord_m=1.0, scale=1.0)
+            pieces = cut_path(points + np.array([site.west_m, site.south_m]), chord_m=1.0, scale=1.0)
             return np.stack([pieces.start_xy_m, pieces.end_xy_m], axis=1)[:-1]
 
 
-def drive(world: World, robot: object, rng: np.random.Generator, *, metres: float, run: str) -> Drive:
+def drive(world: World, robot: SimulatedRobot, rng: np.random.Generator, *, metres: float, run: str) -> Drive:
     """Return a drive's labels."""
     ends = wandering(world, rng, metres)
     share = np.linspace(0.0, 1.0, POINTS)
@@ -68,17 +79,23 @@ def drive(world: World, robot: object, rng: np.random.Generator, *, metres: floa
     slope = np.arctan(east * np.cos(course) + north * np.sin(course))
     cross = np.arctan(north * np.cos(course) - east * np.sin(course))
     classes = world.terrain_class(x, y)
-    ground = robot.ground_table()[classes]  # type: ignore[attr-defined]
-    fluctuation = robot.resistance_noise * rng.standard_normal(x.shape) * 0.4  # type: ignore[attr-defined]
-    resistance = ground[..., 2] * world.resistance_factor(x, y) * (1.0 + RUN_RESISTANCE * rng.standard_normal() + fluctuation)
-    pace = 1.0 + RUN_SPEED * rng.standard_normal()
-    wheel = pace * robot.max_velocity_mps * robot.speed_factor(ground[..., 0], np.sin(slope))  # type: ignore[attr-defined]
-    velocity = wheel * (1.0 - robot.slip(ground[..., 1], np.sin(slope))) * np.cos(slope)  # type: ignore[attr-defined]
-    still = np.zeros_like(slope)
-    mechanical = robot.wheel_power_watt(  # type: ignore[attr-defined]
-        wheel_velocity_mps=wheel, acceleration_mps2=still, yaw_rate_radps=still, slope_rad=slope, rolling_resistance=resistance
+    ground = robot.ground_table()[classes]
+    fluctuation = robot.resistance_noise * rng.standard_normal(x.shape) * 0.4
+    resistance = (
+        ground[..., 2] * world.resistance_factor(x, y) * (1.0 + RUN_RESISTANCE * rng.standard_normal() + fluctuation)
     )
-    power = robot.propulsion_watt(mechanical, wheel)  # type: ignore[attr-defined]
+    pace = 1.0 + RUN_SPEED * rng.standard_normal()
+    wheel = pace * robot.max_velocity_mps * robot.speed_factor(ground[..., 0], np.sin(slope))
+    velocity = wheel * (1.0 - robot.slip(ground[..., 1], np.sin(slope))) * np.cos(slope)
+    still = np.zeros_like(slope)
+    mechanical = robot.wheel_power_watt(
+        wheel_velocity_mps=wheel,
+        acceleration_mps2=still,
+        yaw_rate_radps=still,
+        slope_rad=slope,
+        rolling_resistance=resistance,
+    )
+    power = robot.propulsion_watt(mechanical, wheel)
     length = 1.0 + np.diff(END_STD_M * rng.standard_normal(len(x) + 1))  # of ground in what was taken for a metre
     duration, energy = length * np.mean(1.0 / velocity, axis=1), length * np.mean(power / velocity, axis=1)
     begun = np.concatenate([[0.0], np.cumsum(duration)[:-1]])
@@ -94,8 +111,12 @@ def drive(world: World, robot: object, rng: np.random.Generator, *, metres: floa
 def trained(drives: list[Drive]) -> tuple[Forest, dict[str, NDArray[np.generic]]]:
     """Return a table of all metres, and what the other folds said of each."""
     features = np.concatenate([of.features for of in drives])
-    labels = np.column_stack([np.concatenate([getattr(of, name) for of in drives]) for name in ("power_watt", "velocity_mps")])
-    folds = np.random.default_rng(0).permuted(np.arange(5).repeat(200_000))[np.concatenate([of.block for of in drives]) % 1_000_000]
+    labels = np.column_stack(
+        [np.concatenate([getattr(of, name) for of in drives]) for name in ("power_watt", "velocity_mps")]
+    )
+    folds = np.random.default_rng(0).permuted(np.arange(5).repeat(200_000))[
+        np.concatenate([of.block for of in drives]) % 1_000_000
+    ]
     grown = grow(features, labels, np.ones_like(labels), folds)
     return grown.forest, {
         "run_id": np.concatenate([[of.run] * len(of.block) for of in drives]),
@@ -124,26 +145,34 @@ def held(errors: dict[str, Errors], said: dict[str, Floats], of: Drive) -> Itera
             yield name, metres, float(np.mean((measured >= low) & (measured <= high))), width
 
 
-def coverage(*, train: int, metres: float, further: int, seed: int) -> dict[tuple[str, int], tuple[float, float, float, float]]:
-    """Return by quantity and length: coverage over further drives, the ends of its 95 % interval, and the median half-width [of all]."""
-    site, rng = scenario("paper"), np.random.default_rng(seed)
-    made = [drive(site.world, site.drives[0].robot, rng, metres=metres, run=f"run{k}") for k in range(train + further)]
-    forest, residuals = trained(made[:train])
-    centring, errors = centring_of(residuals), errors_of(residuals)
-    assert errors is not None
+def coverage(*, train: int, metres: float, further: int, seed: int, sites: int = 1) -> dict[tuple[str, int], Held]:
+    """Return by quantity and length how many paths of further drives are held, over ``sites`` trainings of so many drives each."""
     found: dict[tuple[str, int], list[tuple[float, float]]] = {}
-    for of in made[train:]:
-        power, velocity = centring.apply(*forest.predict(of.features).T, of.class_id)
-        said = {"duration": 1.0 / velocity, "energy": power / velocity}
-        for name, length, share, width in held(errors, said, of):
+    rng = np.random.default_rng(seed)
+    for _ in range(sites):
+        for name, length, share, width in trial(rng, train=train, metres=metres, further=further):
             found.setdefault((name, length), []).append((share, width))
     out = {}
     for key, values in found.items():
         shares, widths = np.array(values).T
         draws = shares[rng.integers(0, len(shares), (2000, len(shares)))].mean(axis=1)
         low, high = np.quantile(draws, (0.025, 0.975)).tolist()
-        out[key] = float(shares.mean()), low, high, float(np.median(widths))
+        out[key] = Held(float(shares.mean()), low, high, float(np.median(widths)))
     return out
+
+
+def trial(
+    rng: np.random.Generator, *, train: int, metres: float, further: int
+) -> Iterator[tuple[str, int, float, float]]:
+    """Train on drives and yield `held` of further ones."""
+    site = scenario("paper")
+    made = [drive(site.world, site.drives[0].robot, rng, metres=metres, run=f"run{k}") for k in range(train + further)]
+    forest, residuals = trained(made[:train])
+    centring, errors = centring_of(residuals), errors_of(residuals)
+    assert errors is not None
+    for of in made[train:]:
+        power, velocity = centring.apply(*forest.predict(of.features).T, of.class_id)
+        yield from held(errors, {"duration": 1.0 / velocity, "energy": power / velocity}, of)
 
 
 def main() -> None:
@@ -151,17 +180,19 @@ def main() -> None:
     parser.add_argument("--train", type=int, default=10)
     parser.add_argument("--metres", type=float, default=700.0)
     parser.add_argument("--further", type=int, default=24)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--trainings", type=int, default=1)
+    parser.add_argument("--seed", type=int, default=0)
     told = parser.parse_args()
-    for seed in range(told.seeds):
-        print(f"seed {seed}: {told.train} drives of {told.metres:.0f} m to train on, {told.further} further ones")
-        for (name, metres), (share, low, high, width) in coverage(
-            train=told.train, metres=told.metres, further=told.further, seed=seed
-        ).items():
-            verdict = "holds 90" if low <= 0.9 <= high else "does NOT hold 90"
-            print(
-                f"  {name:8} {metres:4d} m: {100 * share:5.1f} % ({100 * low:.1f} to {100 * high:.1f}: {verdict}), ± {100 * width:.1f} %"
-            )
+    found = coverage(train=told.train, metres=told.metres, further=told.further, seed=told.seed, sites=told.trainings)
+    print(
+        f"{told.trainings} x {told.train} drives of {told.metres:.0f} m to train on, {told.further} further ones each"
+    )
+    for (name, metres), of in found.items():
+        verdict = "holds 90" if of.low <= 0.9 <= of.high else "does NOT hold 90"
+        percent = [100.0 * value for value in (of.share, of.low, of.high, of.half_width)]
+        print(
+            f"{name:8} {metres:4d} m: {percent[0]:5.1f} % ({percent[1]:.1f} to {percent[2]:.1f}: {verdict}), ± {percent[3]:.1f} %"
+        )
 
 
 if __name__ == "__main__":

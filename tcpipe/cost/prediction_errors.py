@@ -105,7 +105,9 @@ class Errors:
             return middle, middle
         variance = max(self._variance(spread), alone / spread.size)
         common = float((np.abs(said) * self.bias_std[class_id]).sum())
-        like_one = min(variance / float(spread.sum()) ** 2, 1.0)  # errors of a single metre are no normal ones, sums nearly
+        like_one = min(
+            variance / float(spread.sum()) ** 2, 1.0
+        )  # errors of a single metre are no normal ones, sums nearly
         ends = (np.array([self.low, self.high]) * like_one + np.array([-_Z, _Z]) * (1.0 - like_one)) / _Z
         width = _Z * np.sqrt(variance + common**2)
         return middle + width * float(ends[0]), middle + width * float(ends[1])
@@ -187,7 +189,9 @@ class _Held:
         rows = np.lexsort((start_ns, run))
         rows = rows[usable[rows]]
         pace, of_run = velocity[rows], run[rows]
-        step_m = pace[:-1] * np.diff(start_ns[rows]) * 1e-9  # a segment's pace is its chord over its time: neighbours are a chord apart
+        step_m = (
+            pace[:-1] * np.diff(start_ns[rows]) * 1e-9
+        )  # a segment's pace is its chord over its time: neighbours are a chord apart
         way_m = np.concatenate([[0.0], np.cumsum(np.where(np.diff(of_run) == 0, step_m, 0.0))])
         true, said = (
             {"power": p[rows], "velocity": v[rows], "duration": 1.0 / v[rows], "energy": p[rows] / v[rows]}
@@ -276,7 +280,9 @@ def _correlation(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
     rho = 1.0 - np.array(sums) / np.maximum(pairs, 1.0) / sill
     rho[pairs == 0] = 0.0
     if rho.size > 1:
-        rho[1:] = np.clip(isotonic_regression(rho[1:], weights=np.maximum(pairs[1:], 1.0), increasing=False).x, 0.0, 1.0)
+        rho[1:] = np.clip(
+            isotonic_regression(rho[1:], weights=np.maximum(pairs[1:], 1.0), increasing=False).x, 0.0, 1.0
+        )
     return np.array(edges), np.clip(rho, -0.5, 1.0)
 
 
@@ -294,7 +300,7 @@ def _between_runs(standard: Floats, run: Ints) -> float:
 def _pairs(standard: Floats, held: _Held) -> tuple[Floats, Floats]:
     """Return half the squared difference of rows of one run, and how far apart they were driven [m]."""
     half, far_m = [np.empty(0)], [np.empty(0)]
-    for step in _STEPS[_STEPS < standard.size]:
+    for step in _STEPS[standard.size > _STEPS]:
         same = held.run[step:] == held.run[:-step]
         half.append(0.5 * np.square(standard[step:] - standard[:-step])[same])
         far_m.append((held.way_m[step:] - held.way_m[:-step])[same])

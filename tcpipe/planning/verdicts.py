@@ -28,8 +28,8 @@ BATCH = 4_096
 class Verdicts:
     """What is said of N metres, shape (N,): `Reason` bits, predictions (NaN without a cost), and what the ground is.
 
-    Predictions are centred (`tcpipe.cost.prediction_errors`). ``velocity_mps`` is horizontal, whichever velocity the model predicts: a metre of the map takes its inverse. ``height_m`` is that of
-    the metre's middle, NaN where the map has none.
+    Predictions are centred (`tcpipe.cost.prediction_errors`). ``velocity_mps`` is horizontal, whichever velocity the model predicts: a
+    metre of the map takes its inverse. ``height_m`` is that of the metre's middle, NaN where the map has none.
     """
 
     reasons: Bits

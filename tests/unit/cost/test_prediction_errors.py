@@ -63,7 +63,9 @@ def test_a_few_samples_of_a_class_do_not_make_its_bias():
     residuals = made_residuals(1000, sigma=0.1)
     for count, least, most in ((3, -0.02, 0.02), (300, 0.07, 0.13)):
         few = {**residuals, "terrain_class": np.where(np.arange(1000) % 3 * 1000 + np.arange(1000) // 3 < count, 5, 4)}
-        power, _ = centring_of(_with_power(few, 1.1, few["terrain_class"] == 5)).apply(np.ones(1), np.ones(1), np.array([5]))
+        power, _ = centring_of(_with_power(few, 1.1, few["terrain_class"] == 5)).apply(
+            np.ones(1), np.ones(1), np.array([5])
+        )
         assert least < power[0] - 1.0 < most
 
 
