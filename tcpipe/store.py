@@ -9,6 +9,7 @@
       runs/<run_id>/run.json                   source, robot, tags, topics, damage
       runs/<run_id>/streams/<role>.parquet     L1, and checksums.json
       runs/<run_id>/<recipe_id>/               manifest.json, track.parquet, segments.parquet, rejections.parquet
+      index/                                   runs.parquet, logs.parquet: what the documents say, made again at will
 
 A recipe directory appears by one rename, manifest inside: if it is there, it is complete.
 """
@@ -16,11 +17,13 @@ A recipe directory appears by one rename, manifest inside: if it is there, it is
 from __future__ import annotations
 
 import logging
+import os
 import re
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,8 +31,19 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
+from tcpipe.formats.index_files import (
+    RunFacts,
+    SeenLog,
+    facts_of,
+    file_state,
+    known_log,
+    read_logs,
+    read_runs,
+    write_logs,
+    write_runs,
+)
 from tcpipe.formats.json_files import digest, plain, typed
-from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.parquet import highest, lowest, read_table, write_table
 from tcpipe.formats.places import local_output
 from tcpipe.formats.record_files import Sighting, Superseded, put_record, read_record, read_records, record_name
 from tcpipe.formats.run_documents import Manifest, ManifestHead, RunJson, StreamInfo
@@ -42,7 +56,6 @@ from tcpipe.formats.seals import (
     write_checksums,
     write_sealed,
 )
-from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     LABELLED_SEGMENTS,
@@ -60,6 +73,7 @@ T = TypeVar("T")
 logger = logging.getLogger("tcpipe")
 
 RUN_FILES = ("track.parquet", "segments.parquet", "rejections.parquet")
+RUN, MANIFEST = "run.json", "manifest.json"
 
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _SIGNS = ("runs/*/run.json", "maps/*.zarr", "records/logs/*/*.json", "records/failed/*.json")
@@ -78,13 +92,13 @@ class RunDirectory:
     run_id: str
     recipe_id: str
     path: Path
-    manifest: Manifest
+    facts: RunFacts
+    """What the index has of it: enough to choose by."""
 
     @property
-    def energy_budget(self) -> EnergyBudget | None:
-        """The noise floor of its labels' energy; None without energies."""
-        label = self.manifest.info.findings.facts.label
-        return None if label is None else label.energy_budget
+    def manifest(self) -> Manifest:
+        """The whole manifest; `StoreError` if it is not as it was written."""
+        return _manifest(self.path / MANIFEST, self.facts.state)
 
     def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
         """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
@@ -121,6 +135,10 @@ class Ingestions:
     """By directory of an ingestion: what is not as it was written."""
     superseded: Mapping[str, str] = field(default_factory=dict)
     """Runs whose log was completed or repaired, which are in none of the others, and the run that took their place."""
+    rows: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
+    """Of the index, by run and recipe: of all that are finished, those of superseded runs too."""
+    stale: bool = False
+    """Whether the index has to be written again."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,27 +180,87 @@ class Store:
         return list(self.ingestions(run_id).finished)
 
     def ingestions(self, run_id: str | None = None) -> Ingestions:
-        """Return what there is of all runs, or of one; every manifest is read once, and proved."""
+        """Return what there is of all runs, or of one.
+
+        A manifest is read and proved, unless the index has what it says and its file is as it was then.
+        """
         superseded = self.superseded() if run_id is None else {}
+        known = read_runs(self.index_path) if run_id is None else {}
         finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[Path, str]()
+        rows = dict[tuple[str, str], RunFacts]()
         for name in [run_id] if run_id is not None else self.run_ids():
-            if name in superseded:
-                continue
-            for path in sorted((self.runs_path / name).glob("*/")):
-                if path.name == "streams" or path.name.startswith(TEMPORARY_PREFIX):
-                    continue
+            for path in self._recipes(name):
                 try:
-                    found = _ingestion(path)
+                    found = _ingestion(path, known.get((name, path.name)))
                 except StoreError as error:
-                    damaged[path] = error.problems[0]
+                    damaged.update({} if name in superseded else {path: error.problems[0]})
                     continue
-                if isinstance(found, RunDirectory):
+                if isinstance(found, ManifestHead):
+                    others.update({} if name in superseded else {name: found})
+                    continue
+                rows[name, path.name] = replace(found.facts, superseded_by=superseded.get(name))
+                if name not in superseded:
                     finished.append(found)
-                else:
-                    others[name] = found
         current = {run.run_id for run in finished}
         outdated = {name: head for name, head in others.items() if name not in current}
-        return Ingestions(tuple(finished), outdated, damaged, superseded)
+        return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=rows != known)
+
+    def _recipes(self, run_id: str) -> list[Path]:
+        """Return the directories of a run's ingestions, by recipe."""
+        directory = self.runs_path / run_id
+        with suppress(OSError), os.scandir(directory) as entries:
+            here = [entry.name for entry in entries if entry.is_dir()]
+            names = (name for name in here if name != "streams" and not name.startswith(TEMPORARY_PREFIX))
+            return [directory / name for name in sorted(names)]
+        return []
+
+    @property
+    def index_path(self) -> Path:
+        """Directory of the index."""
+        return self.root / "index"
+
+    def keep_index(self, found: Ingestions) -> None:
+        """Write down what was found of all runs, where that is not what the index had."""
+        if found.stale:
+            write_runs(self.index_path, found.rows.values())
+
+    def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
+        """Compare segments and tracks with what the manifests have of them; return by run what is wrong.
+
+        Files that are as they were when they were compared before are not read again.
+        """
+        damaged, rows = dict[str, str](), read_runs(self.index_path)
+        before = dict(rows)
+        for run in runs:
+            names = ("segments.parquet", "track.parquet")
+            try:
+                now = " ".join(file_state((run.path / name).stat()) for name in names)
+                if now != run.facts.proved:
+                    run.prove(*names)
+                    rows[run.run_id, run.recipe_id] = replace(run.facts, proved=now)
+            except (OSError, StoreError) as error:
+                damaged[run.run_id] = error.problems[0] if isinstance(error, StoreError) else f"{run.path}: {error}"
+        if rows != before:
+            write_runs(self.index_path, rows.values())
+        return damaged
+
+    def seen_logs(self) -> dict[str, list[Sighting]]:
+        """Return what is remembered of all logs, by lineage; a record that the index has is not read, while its file is as it was."""
+        known, rows = read_logs(self.index_path), dict[tuple[str, str], SeenLog]()
+        for lineage, name, state in _record_files(self.records_path, "logs"):
+            row = known.get((lineage, name))
+            if row is None or row.state != state:
+                sighting = self.recall(f"{lineage}/{name}", Sighting)
+                if sighting is None:
+                    continue
+                row = SeenLog(lineage, name, state, sighting)
+            rows[lineage, name] = row
+        if rows != known:
+            write_logs(self.index_path, rows.values())
+        seen: dict[str, list[Sighting]] = {}
+        for row in rows.values():
+            seen.setdefault(row.lineage, []).append(row.sighting)
+        return seen
 
     def superseded(self) -> dict[str, str]:
         """Return the runs whose log was completed or repaired, and by which run."""
@@ -198,8 +276,11 @@ class Store:
 
     def run_ids(self) -> list[str]:
         """Return the names of all runs, finished or not."""
-        here = (path for path in self.runs_path.glob("*") if path.is_dir())
-        return sorted(path.name for path in here if not path.name.startswith(TEMPORARY_PREFIX))
+        with suppress(OSError), os.scandir(self.runs_path) as entries:
+            return sorted(
+                entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(TEMPORARY_PREFIX)
+            )
+        return []
 
     @contextmanager
     def claimed_run(self, stem: str, sha256: str) -> Iterator[str]:
@@ -342,22 +423,64 @@ class Store:
         return path
 
 
-def _ingestion(path: Path) -> RunDirectory | ManifestHead:
-    """Read an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone."""
-    name = path / "manifest.json"
-    document = read_sealed(name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
-    if document.get("data_model_version") not in READ_VERSIONS:
-        return typed(document, ManifestHead, name)
-    manifest = typed(document, Manifest, name)
-    run = RunDirectory(path.parent.name, path.name, path, manifest)
-    if (manifest.run_id, manifest.recipe_id) != (run.run_id, run.recipe_id):
-        raise StoreError(
-            f"{name}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {run.run_id}/{run.recipe_id}"
-        )
-    gone = [file for file in RUN_FILES if not (path / file).is_file()]
+def _ingestion(path: Path, row: RunFacts | None = None) -> RunDirectory | ManifestHead:
+    """Return an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone.
+
+    ``row`` is what the index has of it.
+    """
+    name = path / MANIFEST
+    with os.scandir(path) as entries:
+        here = {entry.name: entry.stat() for entry in entries if entry.name in (MANIFEST, *RUN_FILES)}
+    state = file_state(here[MANIFEST]) if MANIFEST in here else ""
+    if row is None or row.state != state:
+        document = read_sealed(name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
+        if document.get("data_model_version") not in READ_VERSIONS:
+            return typed(document, ManifestHead, name)
+        manifest = typed(document, Manifest, name)
+        if (manifest.run_id, manifest.recipe_id) != (path.parent.name, path.name):
+            raise StoreError(
+                f"{name}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {path.parent.name}/{path.name}"
+            )
+        row = _with_span(facts_of(manifest, state), path / "segments.parquet")
+    gone = [file for file in RUN_FILES if file not in here]
     if gone:
         raise StoreError(f"{path / gone[0]}: is gone; ingest the log again")
-    return run
+    return RunDirectory(path.parent.name, path.name, path, _with_log(row, path.parent / RUN))
+
+
+@lru_cache(maxsize=64)
+def _manifest(path: Path, state: str) -> Manifest:  # noqa: ARG001  a file of another state is read again
+    return read_sealed_as(path, Manifest)
+
+
+def _with_span(row: RunFacts, segments: Path) -> RunFacts:
+    """Return a row with when its segments begin and end, from the statistics of their file; without where it has none."""
+    with suppress(StoreError):
+        if row.segments:
+            return replace(row, start_ns=lowest(segments, "start_ns"), end_ns=highest(segments, "end_ns"))
+    return row
+
+
+def _with_log(row: RunFacts, path: Path) -> RunFacts:
+    """Return what the index has of an ingestion with what its run.json says now; None of one that cannot be believed."""
+    try:
+        state = file_state(path.stat())
+        if row.log is not None and row.log.state == state:
+            return row
+        known = known_log(read_sealed_as(path, RunJson), state)
+    except (OSError, StoreError):
+        known = None
+    return replace(row, log=known if known and is_named_after(row.run_id, known.source.sha256) else None)
+
+
+def _record_files(root: Path, kind: str) -> Iterator[tuple[str, str, str]]:
+    """Yield the directory, name and state of every record that lies in a directory of a kind."""
+    with suppress(OSError), os.scandir(root / kind) as directories:
+        for directory in sorted((entry for entry in directories if entry.is_dir()), key=lambda entry: entry.name):
+            with os.scandir(directory.path) as entries:
+                for entry in sorted(entries, key=lambda entry: entry.name):
+                    if entry.name.endswith(".json") and not entry.name.startswith(TEMPORARY_PREFIX):
+                        yield f"{kind}/{directory.name}", entry.name.removesuffix(".json"), file_state(entry.stat())
 
 
 def add_by_hash(runs: dict[str, list[str]], run_id: str) -> None:

@@ -93,3 +93,27 @@ def read_schema(path: Path) -> pa.Schema:
         return pq.read_schema(path)
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
+
+
+def lowest(path: Path, column: str) -> int:
+    """Return the lowest value of a column of whole numbers, from the statistics in the footer; `StoreError` where they lack."""
+    return min(_statistics(path, column))[0]
+
+
+def highest(path: Path, column: str) -> int:
+    """Return the highest value of a column of whole numbers, as `lowest`."""
+    return max(of[1] for of in _statistics(path, column))
+
+
+def _statistics(path: Path, column: str) -> list[tuple[int, int]]:
+    """Return the lowest and the highest value of a column in every row group that has rows."""
+    try:
+        about = pq.read_metadata(path)
+        groups = [about.row_group(index) for index in range(about.num_row_groups)]
+        at = about.schema.to_arrow_schema().get_field_index(column)
+        found = [group.column(at).statistics for group in groups if at >= 0 and group.num_rows]
+    except (OSError, pa.ArrowException) as error:
+        raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
+    if not found or not all(of is not None and of.has_min_max for of in found):
+        raise StoreError(f"{path}: has no statistics of {column}")
+    return [(int(of.min), int(of.max)) for of in found]

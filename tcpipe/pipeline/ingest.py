@@ -16,12 +16,13 @@ from typing import Literal, TypeVar
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
-from tcpipe.formats.record_files import record_name
+from tcpipe.formats.record_files import Sighting, Superseded, record_name
 from tcpipe.formats.robot_files import profiles_of
-from tcpipe.pipeline.ingest_run import ingest_one, made_before
+from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
 from tcpipe.pipeline.known_trouble import Trouble
 from tcpipe.pipeline.log_sources import (
@@ -35,7 +36,7 @@ from tcpipe.pipeline.log_sources import (
 )
 from tcpipe.pipeline.supersession import remember_earlier, superseded_by
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store, add_by_hash, open_store
+from tcpipe.store import Ingestions, Store, add_by_hash, open_store
 
 R = TypeVar("R")
 
@@ -138,6 +139,7 @@ def ingest(
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(store, create=True)
         remember_earlier(opened)
+        known = _known(opened, force=force)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
         root = opened.root
         if cluster is not None:  # its workers are elsewhere
@@ -145,22 +147,60 @@ def ingest(
             message_definitions = None if message_definitions is None else message_definitions.absolute()
         common = (root, ruling, robot, dict(tags or {}), force, message_definitions)
         how = (definitions_key(message_definitions), retry_failed, min_age_s)
-        sources = with_hashes(mine, (lambda _: []) if force else opened.sightings)
+        sources = with_hashes(mine, lambda lineage: known.seen.get(lineage, ()))
         tasks = [IngestTask(source, *common, *how) for source in sources]
         if on_found:
             on_found(len(tasks) + len(found.problems))
         results = {}
-        for index, source, result in _results(opened, tasks, found, jobs=jobs, cluster=cluster):
+        for index, source, result in _results(opened, tasks, found, known, jobs=jobs, cluster=cluster):
             results[index] = result
             if on_result:
                 on_result(result)
             if source is not None:
-                _remember(opened, tasks[index], source, result)
+                _remember(opened, tasks[index], source, result, known)
+        _keep_index(opened, known, results.values())
         return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
 
+@dataclass(frozen=True, slots=True)
+class _Known:
+    """What a store holds when the call begins."""
+
+    runs: Ingestions
+    made: Mapping[str, list[RunFacts]]
+    """Finished ingestions, by the sha256 of the log."""
+    seen: Mapping[str, list[Sighting]]
+    """Logs that were seen, by lineage; none where they are to be read again."""
+    parties: frozenset[str]
+    """Runs that another has taken the place of, or did once, and those others."""
+
+    def has_seen(self, source: LogSource, sha256: str) -> bool:
+        """Tell whether this is remembered of the log."""
+        return source.sighting(sha256) in self.seen.get(source.lineage, ())
+
+
+def _known(store: Store, *, force: bool) -> _Known:
+    runs, made = store.ingestions(), dict[str, list[RunFacts]]()
+    for facts in runs.rows.values():
+        if facts.log is not None:
+            made.setdefault(facts.log.source.sha256, []).append(facts)
+    parties = {
+        party for record in store.records("superseded", Superseded) for party in (record.run_id, record.by) if party
+    }
+    return _Known(runs, made, {} if force else store.seen_logs(), frozenset(parties))
+
+
+def _keep_index(store: Store, known: _Known, results: Iterable[IngestResult]) -> None:
+    """Write the index, with what this call made."""
+    if all(result.status in ("unchanged", "waiting") for result in results):
+        store.keep_index(known.runs)
+    elif next(store.root.glob("runs/*/*/*"), None):
+        store.keep_index(store.ingestions())
+        store.seen_logs()
+
+
 def _results(
-    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, *, jobs: int, cluster: str | None
+    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, known: _Known, *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, LogSource | None, IngestResult]]:
     """Yield what became of each path that holds no log, and of each log as it ends, by its place; what needs no work is told first."""
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
@@ -169,22 +209,26 @@ def _results(
     for turn in in_turns([task.source for task in tasks]):
         todo = []
         for index in turn:
-            result = told(tasks[index], partial(_without_work, runs=runs))
+            result = told(tasks[index], partial(_without_work, store=store, known=known, runs=runs))
             if result is None:
                 todo.append(index)
             else:
-                yield index, tasks[index].source, _judged(store, tasks[index].source, result, runs)
+                yield index, tasks[index].source, _judged(store, tasks[index].source, result, runs, known)
         with closing(run_all(ingest_one, [tasks[index] for index in todo], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
                 task = tasks[todo[outcome.index]]
                 source, result = outcome.result or (task.source, died(task.source))
-                yield todo[outcome.index], source, _judged(store, source, result, runs)
+                yield todo[outcome.index], source, _judged(store, source, result, runs, known)
 
 
-def _without_work(task: IngestTask, *, runs: Mapping[str, Sequence[str]]) -> IngestResult | None:
+def _without_work(
+    task: IngestTask, *, store: Store, known: _Known, runs: Mapping[str, Sequence[str]]
+) -> IngestResult | None:
     """Return the result of a log that is in the store, is known to fail, or has to wait; None where there is something to do."""
-    store, source = Store(task.store), task.source
-    run_id = store.run_of(source.sha256, runs) if source.sha256 and not task.force else None
+    source, sha256 = task.source, None if task.force else task.source.sha256
+    if sha256 and (made := as_indexed(task, known.made.get(sha256, ()), sha256)):
+        return made
+    run_id = store.run_of(sha256, runs) if sha256 else None
     if run_id and (made := made_before(store, run_id, task, str(source.sha256))):
         return made
     failed = None if task.force or task.retry_failed else store.recall(task.failure, Trouble)
@@ -193,10 +237,12 @@ def _without_work(task: IngestTask, *, runs: Mapping[str, Sequence[str]]) -> Ing
     return too_young(task)
 
 
-def _judged(store: Store, source: LogSource, result: IngestResult, runs: dict[str, list[str]]) -> IngestResult:
+def _judged(
+    store: Store, source: LogSource, result: IngestResult, runs: dict[str, list[str]], known: _Known
+) -> IngestResult:
     """Return a result with what the store says of it: whether its trouble is news, and which runs it supersedes."""
     notes = result.notes
-    if result.run_id and result.sha256:
+    if result.run_id and result.sha256 and not _is_settled(source, result, known):
         if store.run_of(result.sha256, runs) is None:
             add_by_hash(runs, result.run_id)
         try:
@@ -206,8 +252,14 @@ def _judged(store: Store, source: LogSource, result: IngestResult, runs: dict[st
     trouble = _trouble(source, result)
     if trouble is None:
         return replace(result, notes=notes)
-    known = result.known or (trouble.kind == "damaged" and trouble.is_told(store))
-    return replace(result, notes=notes, known=known, accepted=trouble.is_accepted(store))
+    told_before = result.known or (trouble.kind == "damaged" and trouble.is_told(store))
+    return replace(result, notes=notes, known=told_before, accepted=trouble.is_accepted(store))
+
+
+def _is_settled(source: LogSource, result: IngestResult, known: _Known) -> bool:
+    """Tell whether a log is as it was, and its run has no part in what supersedes what."""
+    unchanged = result.status == "unchanged" and result.run_id not in known.parties
+    return unchanged and result.sha256 is not None and known.has_seen(source, result.sha256)
 
 
 def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
@@ -217,11 +269,11 @@ def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
     return Trouble(content, result.damage, source.origins, result.run_id, "damaged") if result.damage else None
 
 
-def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult) -> None:
+def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult, known: _Known) -> None:
     """Remember what a log holds, and what is wrong with that; where it cannot be written it is told again the next time."""
     trouble = _trouble(source, result)
     try:
-        if result.sha256 and source.files:
+        if result.sha256 and source.files and not known.has_seen(source, result.sha256):
             sighting = source.sighting(result.sha256)
             store.remember(f"{source.lineage}/{record_name(digest(sighting))}", sighting)
         if trouble is not None and trouble.kind == "damaged":
@@ -247,7 +299,8 @@ def _gone_if_empty(store: Path) -> Iterator[None]:
         yield
     finally:
         if made and not any(store.glob("runs/*")):
-            shutil.rmtree(store / "records", ignore_errors=True)
+            for own in ("records", "index"):
+                shutil.rmtree(store / own, ignore_errors=True)
             for path in (store / "runs", *made):
                 with suppress(OSError):
                     path.rmdir()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -10,9 +11,10 @@ from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
+from tcpipe.formats.index_files import KnownLog, RunFacts
 from tcpipe.formats.logs.joined import AnyLog, open_logs
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.recipe_toml import ingest_key, read_key
+from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.run_documents import RunJson
 from tcpipe.pipeline.ingest_documents import manifest_of, run_json_of
@@ -48,7 +50,7 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         sha256 = known_as(store, opened) if opened else str(source.sha256)
         hashed.append(sha256)
         run_id = stack.enter_context(store.claimed_run(source.stem, sha256))
-        same_as = _twin(store, run_id, source)
+        same_as = _twin(store.known_run(run_id), source)
         before = None if task.force or store.known_run(run_id) is None else made_before(store, run_id, task, sha256)
         if before is not None:
             return before
@@ -60,26 +62,24 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         store.write_run_json(run_id, known)
         run = _fuse_and_label(store, run_id, streams, known, task)
         remember_outline(store, run_id, sha256, log)
-    return result_of(source, "done", run, sha256, same_as=same_as)
+    return result_of(source, "done", run.facts, sha256, same_as=same_as)
 
 
 def made_before(store: Store, run_id: str, task: IngestTask, sha256: str) -> IngestResult | None:
     """Return the result of a run that is there as it would be made now, after setting its tags; None where there is none."""
-    finished = _finished(store, run_id, task)
+    finished = next((run.facts for run in store.recipes_of(run_id) if task.is_made_by(run.facts)), None)
     if finished is None:
         return None
-    same_as = _twin(store, run_id, task.source)
-    return result_of(task.source, _retagged(store, run_id, task), finished, sha256, same_as=same_as)
+    return result_of(
+        task.source, _retagged(store, run_id, task), finished, sha256, same_as=_twin(finished.log, task.source)
+    )
 
 
-def _finished(store: Store, run_id: str, task: IngestTask) -> RunDirectory | None:
-    key = ingest_key(task.recipe)
-    for run in store.recipes_of(run_id):
-        made = run.manifest
-        same_robot = made.robot_requested == task.robot or (task.robot and made.robot == task.robot)
-        same_version = made.tcpipe_version == __version__
-        if made.ingest_key == key and same_version and same_robot and made.message_definitions == task.definitions:
-            return run
+def as_indexed(task: IngestTask, made: Sequence[RunFacts], sha256: str) -> IngestResult | None:
+    """Return the result of a run that the index has as it would be made now, tags too; None where there is something to look at."""
+    for facts in made:
+        if facts.log is not None and task.is_made_by(facts) and task.tags.items() <= facts.log.tags.items():
+            return result_of(task.source, "unchanged", facts, sha256, same_as=_twin(facts.log, task.source))
     return None
 
 
@@ -101,7 +101,7 @@ def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson,
 def _tags(store: Store, run_id: str, task: IngestTask) -> dict[str, str]:
     """Return the run's tags: those it has, and those given."""
     known = store.known_run(run_id)
-    before = known.tags if known else next((run.manifest.tags for run in store.recipes_of(run_id)), {})
+    before = known.tags if known else next((run.facts.tags for run in store.recipes_of(run_id)), {})
     return {**before, **task.tags}
 
 
@@ -114,9 +114,8 @@ def _retagged(store: Store, run_id: str, task: IngestTask) -> Status:
     return "done"
 
 
-def _twin(store: Store, run_id: str, source: LogSource) -> str | None:
+def _twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
     """Return where else the same recording was ingested from, if it was."""
-    known = store.known_run(run_id)
     return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
 
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeVar
 
+from tcpipe import __version__
 from tcpipe.errors import TcpipeError, plain_line
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.pipeline.known_trouble import failure_name
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transience import is_transient
 from tcpipe.recipe import Recipe
-from tcpipe.store import RunDirectory
 from tcpipe.tables.findings import EnergyBudget
 
 R = TypeVar("R")
@@ -39,6 +40,12 @@ class IngestTask:
     """Their `definitions_key`."""
     retry_failed: bool = False
     min_age_s: float = 0.0
+
+    def is_made_by(self, made: RunFacts) -> bool:
+        """Tell whether an ingestion of this content is as it would be made now."""
+        same_robot = made.robot_requested == self.robot or (self.robot is not None and made.robot == self.robot)
+        same_version = made.tcpipe_version == __version__ and made.message_definitions == self.definitions
+        return made.ingest_key == ingest_key(self.recipe) and same_version and same_robot
 
     @property
     def failure(self) -> str:
@@ -92,21 +99,18 @@ class LogLine(IngestResult):
     is_news: bool = False
 
 
-def result_of(
-    source: LogSource, status: Status, run: RunDirectory, sha256: str, *, same_as: str | None
-) -> IngestResult:
+def result_of(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
     """Return what became of a log whose run is in the store."""
-    made = run.manifest
     return IngestResult(
         log=source.name,
         status="damaged" if made.damage and status == "done" else status,
-        run_id=run.run_id,
-        recipe_id=run.recipe_id,
+        run_id=made.run_id,
+        recipe_id=made.recipe_id,
         robot=made.robot,
-        segments=made.counts.segments,
-        distance_m=sum(made.ledger_m.values()),
-        kept_m=made.ledger_m.get("kept", 0.0),
-        energy_budget=run.energy_budget,
+        segments=made.segments,
+        distance_m=made.driven_m,
+        kept_m=made.kept_m,
+        energy_budget=made.energy_budget,
         warnings=made.warnings,
         damage=made.damage,
         same_as=same_as,

@@ -218,8 +218,8 @@ def _store(store: Store) -> InspectedStore:
             recast(
                 _ingestion(run),
                 StoredIngestion,
-                warnings=len(run.manifest.warnings),
-                damage=len(run.manifest.damage),
+                warnings=len(run.facts.warnings),
+                damage=len(run.facts.damage),
             )
             for run in runs
         ),
@@ -234,7 +234,7 @@ def _ingestion(run: RunDirectory) -> Ingestion:
     return Ingestion(
         run_id=run.run_id,
         recipe_id=run.recipe_id,
-        robot=run.manifest.robot,
-        segments=run.manifest.counts.segments,
-        distance_m=sum(run.manifest.ledger_m.values()),
+        robot=run.facts.robot,
+        segments=run.facts.segments,
+        distance_m=run.facts.driven_m,
     )

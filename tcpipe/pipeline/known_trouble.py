@@ -110,9 +110,9 @@ def _known(store: Store) -> list[Trouble]:
     """Return all trouble that was told, and the damage of runs that were made before that was remembered."""
     known = [replace(told, kind=kind) for kind in ("failed", "damaged") for told in store.records(kind, Trouble)]
     for run in store.runs():
-        about = store.run_json(run.run_id)
-        if run.manifest.damage and about:
-            known.append(Trouble(about.source.sha256, run.manifest.damage, about.source.paths, run.run_id, "damaged"))
+        if run.facts.damage and run.facts.log:
+            about = run.facts.log.source
+            known.append(Trouble(about.sha256, run.facts.damage, about.paths, run.run_id, "damaged"))
     return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,12 @@ _SAME_DRIVE = 0.5
 
 _METRES_PER_DEG = 111_320.0
 
+_NEVER_NS = 2**61
+"""Beyond any time [ns since 1970], and twice of it is an integer still."""
+
+_WAYS = 64
+"""So many ways are held at once."""
+
 Mask = NDArray[np.bool_]
 
 
@@ -28,6 +35,26 @@ class Once:
     runs: tuple[RunDirectory, ...]
     again: Mapping[str, Mask]
     warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Spans:
+    """From when to when the runs' segments are [ns] and whose they are, (N,); a run of which that is not known is there at any time."""
+
+    start_ns: NDArray[np.int64]
+    end_ns: NDArray[np.int64]
+    robot: NDArray[np.str_]
+
+    def beside(self, index: int) -> list[int]:
+        """Return which earlier runs of the same robot have segments at the time of one."""
+        early = slice(0, index)
+        apart_ns = np.maximum(self.start_ns[early], self.start_ns[index]) - np.minimum(
+            self.end_ns[early], self.end_ns[index]
+        )
+        found: list[int] = np.flatnonzero(
+            (apart_ns <= _SAME_TIME_NS) & (self.robot[early] == self.robot[index])
+        ).tolist()
+        return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,21 +77,27 @@ def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, st
         Hash of each run's log.
 
     """
-    kept: list[tuple[RunDirectory, _Way]] = []
+    runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
+    spans, kept = _spans(runs), dict[int, RunDirectory]()
+
+    @lru_cache(maxsize=_WAYS)
+    def way(index: int) -> _Way:
+        return _way(runs[index])
+
     again: dict[str, Mask] = {}
     warnings: list[str] = []
     by_sha256: dict[str, str] = {}
-    for run in sorted(runs, key=lambda run: (run.run_id, run.recipe_id)):
+    for index, run in enumerate(runs):
         twin = by_sha256.setdefault(sha256_by_run[run.run_id], run.run_id)
         if twin != run.run_id:
             warnings.append(f"run {run.run_id}: the same recording as run {twin}; used once")
             continue
-        mine = _way(run)
-        twice, others = np.zeros(len(mine.start_ns), np.bool_), []
-        for other, theirs in _at_that_time(mine, run, kept):
-            shared = _shared(mine, theirs)
-            twice |= shared
-            others += [other.run_id] if shared.any() else []
+        twice, others = np.zeros(run.facts.segments, np.bool_), []
+        for earlier in spans.beside(index):
+            if earlier in kept:
+                shared = _shared(way(index), way(earlier))
+                twice |= shared
+                others += [kept[earlier].run_id] if shared.any() else []
         if twice.any():
             count = "all" if twice.all() else f"{int(twice.sum())} of"
             warnings.append(
@@ -74,8 +107,22 @@ def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, st
         if twice.all() and len(twice):
             continue
         again[run.run_id] = twice
-        kept.append((run, mine))
-    return Once(tuple(run for run, _ in kept), again, tuple(warnings))
+        kept[index] = run
+    return Once(tuple(kept.values()), again, tuple(warnings))
+
+
+def _spans(runs: Sequence[RunDirectory]) -> _Spans:
+    """Return when the runs have segments; one without segments is nowhere."""
+    start_ns, end_ns = np.empty(len(runs), np.int64), np.empty(len(runs), np.int64)
+    for index, run in enumerate(runs):
+        facts = run.facts
+        if not facts.segments:
+            start_ns[index], end_ns[index] = _NEVER_NS, -_NEVER_NS
+        elif facts.start_ns is None or facts.end_ns is None:
+            start_ns[index], end_ns[index] = -_NEVER_NS, _NEVER_NS
+        else:
+            start_ns[index], end_ns[index] = facts.start_ns, facts.end_ns
+    return _Spans(start_ns, end_ns, np.array([run.facts.robot for run in runs], np.str_))
 
 
 def _way(run: RunDirectory) -> _Way:
@@ -83,17 +130,6 @@ def _way(run: RunDirectory) -> _Way:
     table = run.table("segments", names)
     middle = [(floats(table, f"start_{axis}_deg") + floats(table, f"end_{axis}_deg")) / 2 for axis in ("lon", "lat")]
     return _Way(integers(table, "start_ns"), integers(table, "end_ns"), np.column_stack(middle))
-
-
-def _at_that_time(
-    mine: _Way, run: RunDirectory, kept: Sequence[tuple[RunDirectory, _Way]]
-) -> Iterator[tuple[RunDirectory, _Way]]:
-    """Yield the runs of the same robot that were recorded at the same time."""
-    for other, theirs in kept:
-        if other.manifest.robot == run.manifest.robot and len(mine.start_ns) and len(theirs.start_ns):
-            apart_ns = max(mine.start_ns[0], theirs.start_ns[0]) - min(mine.end_ns[-1], theirs.end_ns[-1])
-            if apart_ns <= _SAME_TIME_NS:
-                yield other, theirs
 
 
 def _shared(mine: _Way, other: _Way) -> Mask:

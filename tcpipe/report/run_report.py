@@ -57,7 +57,7 @@ def run_report(store: Store, run: RunDirectory) -> str:
         sections=[
             *_track_sections(store, run, track),
             *_segment_sections(segments, ledger, label.physics if label else None, manifest.robot),
-            *budget_sections(run.energy_budget),
+            *budget_sections(run.facts.energy_budget),
             *sensor_sections(known, manifest, run.rejections()),
         ],
     )

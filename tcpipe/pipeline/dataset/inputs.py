@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,7 +137,7 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
 
 def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
     """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, warnings and error budget."""
-    told = run.manifest
+    told = run.facts
     return RunSource(
         run_id=run.run_id,
         recipe_id=run.recipe_id,
@@ -146,10 +145,10 @@ def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
         tags=told.tags,
         logs=tuple(Path(path).name for path in log.paths),
         sha256=log.sha256,
-        segments_sha256=told.checksums["segments.parquet"].sha256,
-        driven_m=math.fsum(told.ledger_m.values()),
+        segments_sha256=told.segments_sha256,
+        driven_m=told.driven_m,
         warnings=tuple(told.warnings),
-        energy_budget=run.energy_budget,
+        energy_budget=told.energy_budget,
     )
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from tcpipe.errors import DatasetError, StoreError
 from tcpipe.formats.dataset_card import RunSource
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.run_documents import LogOrigin, Manifest, ManifestHead, RunJson
+from tcpipe.formats.run_documents import LogOrigin, ManifestHead, RunJson
 from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
@@ -38,7 +39,7 @@ class Chosen:
 def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
     found, key = store.ingestions(), ingest_key(recipe)
-    mine = [run for run in found.finished if run.manifest.ingest_key == key]
+    mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_nothing_to_pool(store, found))
     runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
@@ -52,9 +53,9 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     if not runs:
         raise DatasetError(*lines)
     if robot is None:
-        _refuse_unlike(store, [run.run_id for run in runs if run.manifest.robot == GENERIC])
+        _refuse_unlike(store, [run.run_id for run in runs if run.facts.robot == GENERIC])
     settled = {*known, *damaged}
-    others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.manifest, robot, tags)}
+    others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.facts, robot, tags)}
     older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
     others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
     left_out = {*damaged, *others, *older}
@@ -74,8 +75,8 @@ def _remarks(store: Store, found: Ingestions) -> Iterator[str]:
 
 
 def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> list[RunDirectory]:
-    robots = sorted({run.manifest.robot for run in runs})
-    wanted = [run for run in runs if robot is None or run.manifest.robot == robot]
+    robots = sorted({run.facts.robot for run in runs})
+    wanted = [run for run in runs if robot is None or run.facts.robot == robot]
     if not wanted:
         raise DatasetError(f"{store.root}: no run of robot {robot!r}; there are runs of {', '.join(robots)}")
     if robot is None and len(robots) > 1:
@@ -96,10 +97,10 @@ def _refuse_unlike(store: Store, run_ids: Iterable[str]) -> None:
 
 def _tagged(store: Store, runs: list[RunDirectory], tags: Mapping[str, str]) -> list[RunDirectory]:
     """Return the runs that carry all of the tags; `DatasetError` with the tags there are where none does."""
-    chosen = [run for run in runs if tags.items() <= run.manifest.tags.items()]
+    chosen = [run for run in runs if tags.items() <= run.facts.tags.items()]
     if not chosen:
         wanted = " ".join(f"{key}={value}" for key, value in tags.items())
-        there = sorted({f"{key}={value}" for run in runs for key, value in run.manifest.tags.items()})
+        there = sorted({f"{key}={value}" for run in runs for key, value in run.facts.tags.items()})
         raise DatasetError(f"{store.root}: no run is tagged {wanted}; tags there are: {', '.join(there) or 'none'}")
     return chosen
 
@@ -127,20 +128,22 @@ def _proved(
     store: Store, runs: Sequence[RunDirectory]
 ) -> tuple[list[RunDirectory], dict[str, LogOrigin], dict[str, str]]:
     """Return the runs that are as they were written, what is known of their logs, and by run what is wrong with the others."""
-    whole, logs, damaged = list[RunDirectory](), dict[str, LogOrigin](), dict[str, str]()
+    damaged = store.prove(runs)
+    logs = dict[str, LogOrigin]()
     for run in runs:
-        try:
-            known = store.run_json(run.run_id)
-            run.prove("segments.parquet", "track.parquet")
-        except StoreError as error:
-            damaged[run.run_id] = error.problems[0]
-            continue
-        if known is None:
-            damaged[run.run_id] = f"{run.path.parent / 'run.json'}: is gone"
-        else:
-            logs[run.run_id] = known.source
-            whole.append(run)
-    return whole, logs, damaged
+        if run.facts.log is None:
+            damaged[run.run_id] = _wrong_with_log(store, run)
+        elif run.run_id not in damaged:
+            logs[run.run_id] = run.facts.log.source
+    return [run for run in runs if run.run_id in logs], logs, damaged
+
+
+def _wrong_with_log(store: Store, run: RunDirectory) -> str:
+    try:
+        store.run_json(run.run_id)
+    except StoreError as error:
+        return error.problems[0]
+    return f"{run.path.parent / 'run.json'}: is gone"
 
 
 def _missing(store: Store, by_recipe: Mapping[str, str], by_version: Mapping[str, str], total: int) -> list[str]:
@@ -161,7 +164,7 @@ def _known(store: Store, run_id: str) -> RunJson | None:
 
 
 def _belongs(
-    known: RunJson | Manifest | ManifestHead | RunSource | None, robot: str | None, tags: Mapping[str, str]
+    known: RunJson | RunFacts | ManifestHead | RunSource | None, robot: str | None, tags: Mapping[str, str]
 ) -> bool:
     """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
     if known is None:

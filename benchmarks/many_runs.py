@@ -1,0 +1,114 @@
+"""Nights on a store of 10,000 runs: what it costs to ingest nothing, to tell where everything stands, and to choose a dataset's runs.
+
+::
+
+    python benchmarks/many_runs.py DIRECTORY [RUNS]
+
+Logs and runs are copies of one short drive under other names, hashes and times, laid out as ingestion would have; documents have its size.
+"""
+
+import hashlib
+import os
+import re
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from tcpipe.formats.json_files import digest, to_json
+from tcpipe.formats.logs.writing import write_mcap
+from tcpipe.formats.record_files import Sighting, record_name
+from tcpipe.formats.seals import file_checksum, sealed
+from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.pipeline.recordings import each_drive_once
+from tcpipe.recipe import Recipe
+from tcpipe.store import RunDirectory, Store
+
+T = TypeVar("T")
+
+DAY_NS = 86_400 * 10**9
+SEAL = re.compile(r'(?m)^  "document_sha256": "([0-9a-f]{64})"(,?)\n')
+
+
+def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
+    """Return a folder of so many logs and a store that has them all."""
+    logs, store = directory / f"logs-{count}", Store(directory / f"store-{count}")
+    if store.root.exists():
+        return logs, store
+    sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+    from wheel_drives import wheel_drive
+
+    write_mcap(directory / "one.mcap", wheel_drive())
+    (result,) = ingest([directory / "one.mcap"], store=directory / "one", recipe=Recipe()).results
+    one = Store(directory / "one")
+    (run,) = one.recipes_of(result.run_id)
+    logs.mkdir(parents=True)
+    for number in range(count):
+        (logs / f"drive_{number:05d}.mcap").write_bytes(b"%08d" % number)
+    for number, source in enumerate(find_sources([logs], as_one=False, staging=Path()).sources):
+        _copy(run, store, source, number)
+    return logs, store
+
+
+def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> None:
+    sha256 = hashlib.sha256(str(number).encode()).hexdigest()
+    run_id = f"{source.stem}-{sha256[:8]}"
+    place = store.runs_path / run_id / run.recipe_id
+    place.mkdir(parents=True)
+    for name in ("track", "rejections"):
+        os.link(run.path / f"{name}.parquet", place / f"{name}.parquet")
+    segments = run.table("segments")
+    for name in ("start_ns", "end_ns"):
+        at, column = segments.schema.get_field_index(name), pc.add(segments.column(name), number * DAY_NS)
+        segments = segments.set_column(at, segments.schema.field(name), column)
+    pq.write_table(segments, place / "segments.parquet")
+    new, old = file_checksum(place / "segments.parquet"), run.manifest.checksums["segments.parquet"]
+    log = run.facts.log.source
+    names = {run.run_id: run_id, log.sha256: sha256, log.paths[0]: source.origins[0], old.sha256: new.sha256}
+    names |= {f'"size_bytes": {old.size_bytes}': f'"size_bytes": {new.size_bytes}'}
+    for document in (Path(run.recipe_id, "manifest.json"), Path("run.json")):
+        (place.parent / document).write_text(_renamed((run.path.parent / document).read_text(), names))
+    sighting = Sighting(source.origins, source.files, sha256)
+    record = store.records_path / source.lineage / f"{record_name(digest(sighting))}.json"
+    record.parent.mkdir(parents=True)
+    record.write_text(to_json(sealed(sighting)))
+
+
+def _renamed(text: str, names: dict[str, str]) -> str:
+    for old, new in names.items():
+        text = text.replace(old, new)
+    bare = hashlib.sha256(SEAL.sub("", text).encode()).hexdigest()
+    return SEAL.sub(lambda found: f'  "document_sha256": "{bare}"{found[2]}\n', text)
+
+
+def timed(what: str, act: Callable[[], T]) -> T:
+    wall, cpu = time.perf_counter(), time.process_time()
+    found = act()
+    print(f"{what:<32} {time.perf_counter() - wall:6.2f} s wall, {time.process_time() - cpu:6.2f} s CPU", flush=True)
+    return found
+
+
+def once(chosen: Chosen) -> int:
+    return len(each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()}).runs)
+
+
+def main() -> None:
+    directory, count = Path(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 10_000
+    directory.mkdir(parents=True, exist_ok=True)
+    logs, store = timed("synthesise", lambda: many_runs(directory, count))
+    for again in ("first", "again"):
+        summary = timed(f"nothing to ingest, {again}", lambda: ingest([logs], store=store.root, recipe=Recipe()))
+        assert {result.status for result in summary.results} == {"unchanged"}
+    for again in ("first", "again"):
+        chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
+        assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) == count
+
+
+if __name__ == "__main__":
+    main()

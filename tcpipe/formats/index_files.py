@@ -1,0 +1,199 @@
+"""The index of a store: what is asked of all runs and logs at once, as two Parquet tables; made again at will, never the truth (ADR 87).
+
+A row holds what a document says and the state of its file: a document whose file is in another state is read again. Any tool may
+read the tables, as ``runs.parquet`` names the files of every ingestion, by their place in the store.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TypeVar
+
+import pyarrow as pa
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import plain, typed
+from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.record_files import Sighting
+from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
+from tcpipe.tables.findings import EnergyBudget
+
+T = TypeVar("T")
+
+logger = logging.getLogger("tcpipe")
+
+RUNS, LOGS = "runs.parquet", "logs.parquet"
+
+_ABOUT = b"tcpipe_index"
+_VERSION = b"1"
+"""Of these tables: those of another are made again."""
+
+
+@dataclass(frozen=True, slots=True)
+class KnownLog:
+    """What a run's run.json says of its log, and the state of that file."""
+
+    state: str
+    source: LogOrigin
+    tags: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class RunFacts:
+    """What is asked of an ingestion when all of a store are looked at; the manifest has the rest."""
+
+    run_id: str
+    recipe_id: str
+    state: str
+    """Of the manifest's file."""
+    data_model_version: str
+    tcpipe_version: str
+    ingest_key: str
+    robot: str
+    robot_requested: str | None
+    message_definitions: str
+    tags: Mapping[str, str]
+    segments: int
+    driven_m: float
+    kept_m: float
+    warnings: tuple[str, ...]
+    damage: tuple[str, ...]
+    energy_budget: EnergyBudget | None
+    segments_sha256: str
+    start_ns: int | None = None
+    """When the first segment begins [ns since 1970]; None without segments, or where that is not known."""
+    end_ns: int | None = None
+    """When the last segment ends."""
+    proved: str = ""
+    """The state of segments and track when their bytes were compared with the manifest; "" if they never were."""
+    log: KnownLog | None = None
+    """None where run.json is gone or not as it was written."""
+    superseded_by: str | None = None
+    """The run that took the place of this one."""
+    segments_file: str = ""
+    """Where the segments lie in the store."""
+    track_file: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class SeenLog:
+    """A record of a log that was seen, and the state of its file."""
+
+    lineage: str
+    name: str
+    state: str
+    sighting: Sighting
+
+
+def file_state(found: os.stat_result) -> str:
+    """Return what tells a file from one that was written since: size, time of writing, inode."""
+    return f"{found.st_size}-{found.st_mtime_ns}-{found.st_ino}"
+
+
+def facts_of(manifest: Manifest, state: str) -> RunFacts:
+    """Return what the index holds of a manifest."""
+    label, place = manifest.info.findings.facts.label, f"runs/{manifest.run_id}/{manifest.recipe_id}"
+    return RunFacts(
+        run_id=manifest.run_id,
+        recipe_id=manifest.recipe_id,
+        state=state,
+        data_model_version=manifest.data_model_version,
+        tcpipe_version=manifest.tcpipe_version,
+        ingest_key=manifest.ingest_key,
+        robot=manifest.robot,
+        robot_requested=manifest.robot_requested,
+        message_definitions=manifest.message_definitions,
+        tags=manifest.tags,
+        segments=manifest.counts.segments,
+        driven_m=math.fsum(manifest.ledger_m.values()),
+        kept_m=manifest.ledger_m.get("kept", 0.0),
+        warnings=manifest.warnings,
+        damage=manifest.damage,
+        energy_budget=None if label is None else label.energy_budget,
+        segments_sha256=manifest.checksums["segments.parquet"].sha256 if manifest.checksums else "",
+        segments_file=f"{place}/segments.parquet",
+        track_file=f"{place}/track.parquet",
+    )
+
+
+def known_log(known: RunJson, state: str) -> KnownLog:
+    """Return what the index holds of a run.json."""
+    return KnownLog(state, known.source, known.tags)
+
+
+_TEXT, _TEXTS = pa.string(), pa.list_(pa.string())
+_RUN_SCHEMA = pa.schema({
+    "run_id": _TEXT, "recipe_id": _TEXT, "state": _TEXT, "data_model_version": _TEXT, "tcpipe_version": _TEXT, "ingest_key": _TEXT,
+    "robot": _TEXT, "robot_requested": _TEXT, "message_definitions": _TEXT, "tags": pa.map_(_TEXT, _TEXT), "segments": pa.int64(),
+    "driven_m": pa.float64(), "kept_m": pa.float64(), "warnings": _TEXTS, "damage": _TEXTS,
+    "energy_budget": pa.struct({of.name: pa.int64() if of.name == "segments" else pa.float64() for of in fields(EnergyBudget)}),
+    "segments_sha256": _TEXT, "start_ns": pa.int64(), "end_ns": pa.int64(), "proved": _TEXT,
+    "log": pa.struct({
+        "state": _TEXT, "source": pa.struct({"paths": _TEXTS, "sha256": _TEXT, "size_bytes": pa.int64()}), "tags": pa.map_(_TEXT, _TEXT),
+    }),
+    "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT,
+})  # fmt: skip
+_LOG_SCHEMA = pa.schema({
+    "lineage": _TEXT, "name": _TEXT, "state": _TEXT,
+    "sighting": pa.struct({"log": _TEXTS, "size_and_time": pa.list_(pa.list_(pa.int64())), "sha256": _TEXT}),
+})  # fmt: skip
+
+
+def read_runs(directory: Path) -> dict[tuple[str, str], RunFacts]:
+    """Return the rows of ``runs.parquet``, by run and recipe; none where there is no such index, or it cannot be read."""
+    return {(row.run_id, row.recipe_id): row for row in _rows(directory / RUNS, RunFacts)}
+
+
+def read_logs(directory: Path) -> dict[tuple[str, str], SeenLog]:
+    """Return the rows of ``logs.parquet``, by lineage and record; none where there is no such index, or it cannot be read."""
+    return {(row.lineage, row.name): row for row in _rows(directory / LOGS, SeenLog)}
+
+
+def write_runs(directory: Path, rows: Iterable[RunFacts]) -> None:
+    """Write ``runs.parquet``, unless that cannot be: the next call does without."""
+    _write(directory / RUNS, list(rows), _RUN_SCHEMA)
+
+
+def write_logs(directory: Path, rows: Iterable[SeenLog]) -> None:
+    """Write ``logs.parquet``, unless that cannot be."""
+    _write(directory / LOGS, list(rows), _LOG_SCHEMA)
+
+
+def _rows(path: Path, cls: type[T]) -> list[T]:
+    if not path.is_file():
+        return []
+    try:
+        table = read_table(path)
+        if (table.schema.metadata or {}).get(_ABOUT) != _VERSION:
+            return []
+        return typed(table.to_pylist(maps_as_pydicts="strict"), list[cls], path)  # type: ignore[valid-type]
+    except (StoreError, ValueError, pa.ArrowException):
+        logger.info("%s: the index of the store is not readable; it is made again", path)
+        return []
+
+
+def _write(path: Path, rows: Sequence[object], schema: pa.Schema) -> None:
+    values = [plain(row) for row in rows]
+    columns = [_column([row[field.name] for row in values], field.type) for field in schema]
+    table = pa.table(columns, schema=schema.with_metadata({_ABOUT: _VERSION}))
+    with suppress(StoreError):
+        write_table(table, path)
+
+
+def _column(values: list[object], of: pa.DataType) -> pa.Array:
+    return pa.array([_with_pairs(value, of) for value in values], of)
+
+
+def _with_pairs(value: object, of: pa.DataType) -> object:
+    """Return a value with its maps as Arrow takes them: as pairs."""
+    if pa.types.is_map(of) and isinstance(value, Mapping):
+        return sorted(value.items())
+    if pa.types.is_struct(of) and isinstance(value, Mapping):
+        return {field.name: _with_pairs(value.get(field.name), field.type) for field in of}
+    return value
