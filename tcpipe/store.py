@@ -34,6 +34,7 @@ from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exc
 from tcpipe.formats.index_files import (
     RunFacts,
     SeenLog,
+    as_stored,
     facts_of,
     file_state,
     known_log,
@@ -203,7 +204,7 @@ class Store:
                     finished.append(found)
         current = {run.run_id for run in finished}
         outdated = {name: head for name, head in others.items() if name not in current}
-        return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=rows != known)
+        return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=_differ(rows, known))
 
     def _recipes(self, run_id: str) -> list[Path]:
         """Return the directories of a run's ingestions, by recipe."""
@@ -229,19 +230,18 @@ class Store:
 
         Files that are as they were when they were compared before are not read again.
         """
-        damaged, rows = dict[str, str](), read_runs(self.index_path)
-        before = dict(rows)
+        damaged, proved = dict[str, str](), dict[tuple[str, str], RunFacts]()
         for run in runs:
             names = ("segments.parquet", "track.parquet")
             try:
                 now = " ".join(file_state((run.path / name).stat()) for name in names)
                 if now != run.facts.proved:
                     run.prove(*names)
-                    rows[run.run_id, run.recipe_id] = replace(run.facts, proved=now)
+                    proved[run.run_id, run.recipe_id] = replace(run.facts, proved=now)
             except (OSError, StoreError) as error:
                 damaged[run.run_id] = error.problems[0] if isinstance(error, StoreError) else f"{run.path}: {error}"
-        if rows != before:
-            write_runs(self.index_path, rows.values())
+        if proved:
+            write_runs(self.index_path, {**read_runs(self.index_path), **proved}.values())
         return damaged
 
     def seen_logs(self) -> dict[str, list[Sighting]]:
@@ -255,7 +255,7 @@ class Store:
                     continue
                 row = SeenLog(lineage, name, state, sighting)
             rows[lineage, name] = row
-        if rows != known:
+        if _differ(rows, known):
             write_logs(self.index_path, rows.values())
         seen: dict[str, list[Sighting]] = {}
         for row in rows.values():
@@ -471,6 +471,11 @@ def _with_log(row: RunFacts, path: Path) -> RunFacts:
     except (OSError, StoreError):
         known = None
     return replace(row, log=known if known and is_named_after(row.run_id, known.source.sha256) else None)
+
+
+def _differ(rows: Mapping[tuple[str, str], object], known: Mapping[tuple[str, str], object]) -> bool:
+    """Tell whether the index has something else."""
+    return rows != known and {key: as_stored(row) for key, row in rows.items()} != known
 
 
 def _record_files(root: Path, kind: str) -> Iterator[tuple[str, str, str]]:

@@ -13,12 +13,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import plain, typed
+from tcpipe.formats.json_files import is_text, plain, recast, typed
 from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
@@ -36,12 +36,23 @@ _VERSION = b"1"
 
 
 @dataclass(frozen=True, slots=True)
+class KnownSensor:
+    """Of a sensor: what tells one robot from another."""
+
+    topic: str
+    type_name: str
+    frame_id: str
+
+
+@dataclass(frozen=True, slots=True)
 class KnownLog:
     """What a run's run.json says of its log, and the state of that file."""
 
     state: str
     source: LogOrigin
     tags: Mapping[str, str]
+    sensors: Mapping[str, KnownSensor]
+    """By role."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,7 +135,23 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
 
 def known_log(known: RunJson, state: str) -> KnownLog:
     """Return what the index holds of a run.json."""
-    return KnownLog(state, known.source, known.tags)
+    sensors = {role: recast(sensor, KnownSensor) for role, sensor in known.sensors.items()}
+    return KnownLog(state, known.source, known.tags, sensors)
+
+
+def as_stored(row: T) -> T:
+    """Return a row as it can be stored: where a name in it is no text, with escapes, and without a state, so that nobody believes it."""
+    if is_text(row):
+        return row
+    return typed({**_escaped(plain(row)), "state": ""}, type(row), Path(RUNS))
+
+
+def _escaped(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {_escaped(key): _escaped(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_escaped(item) for item in value]
+    return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 
 _TEXT, _TEXTS = pa.string(), pa.list_(pa.string())
@@ -136,6 +163,7 @@ _RUN_SCHEMA = pa.schema({
     "segments_sha256": _TEXT, "start_ns": pa.int64(), "end_ns": pa.int64(), "proved": _TEXT,
     "log": pa.struct({
         "state": _TEXT, "source": pa.struct({"paths": _TEXTS, "sha256": _TEXT, "size_bytes": pa.int64()}), "tags": pa.map_(_TEXT, _TEXT),
+        "sensors": pa.map_(_TEXT, pa.struct({"topic": _TEXT, "type_name": _TEXT, "frame_id": _TEXT})),
     }),
     "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT,
 })  # fmt: skip
@@ -179,7 +207,7 @@ def _rows(path: Path, cls: type[T]) -> list[T]:
 
 
 def _write(path: Path, rows: Sequence[object], schema: pa.Schema) -> None:
-    values = [plain(row) for row in rows]
+    values = [plain(as_stored(row)) for row in rows]
     columns = [_column([row[field.name] for row in values], field.type) for field in schema]
     table = pa.table(columns, schema=schema.with_metadata({_ABOUT: _VERSION}))
     with suppress(StoreError):

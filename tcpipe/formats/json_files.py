@@ -53,6 +53,15 @@ def recast(record: object, cls: Callable[..., T], **more: object) -> T:
     return cls(**(known | more))
 
 
+def is_text(value: object) -> bool:
+    """Tell whether all text in a dataclass is text, and no name of a file that is none."""
+    try:
+        msgspec.json.encode(value)
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def to_json(value: Any) -> str:
     """Return canonical JSON text: sorted keys, two-space indent, final newline; file names that are no text as escapes."""
     text = json.dumps(plain(value), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from tcpipe.formats.index_files import KnownSensor
 from tcpipe.tables.levels import Sensor
 
 Seen = dict[str, tuple[str, str, str]]
 """By role: a sensor's topic, its type and its frame, as far as a run shows them."""
 
 
-def alike(sensors: Mapping[str, Mapping[str, Sensor]]) -> list[tuple[list[str], Seen]]:
+def alike(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tuple[list[str], Seen]]:
     """Return groups of runs, and what is seen of each, so that all sensors within one agree in type, frame and namespace.
 
     A run belongs to the first group with which it shares a role and differs in none: a sensor may be off for a drive.
@@ -40,7 +41,7 @@ def in_words(seen: Seen) -> str:
     return ", ".join(parts) or "no sensor is known"
 
 
-def _seen(sensors: Mapping[str, Sensor]) -> Seen:
+def _seen(sensors: Mapping[str, Sensor | KnownSensor]) -> Seen:
     return {role: (of.topic, of.type_name, of.frame_id.strip("/")) for role, of in sensors.items()}
 
 

@@ -53,7 +53,7 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     if not runs:
         raise DatasetError(*lines)
     if robot is None:
-        _refuse_unlike(store, [run.run_id for run in runs if run.facts.robot == GENERIC])
+        _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
     settled = {*known, *damaged}
     others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.facts, robot, tags)}
     older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
@@ -84,14 +84,14 @@ def _of_one_robot(store: Store, runs: list[RunDirectory], robot: str | None) -> 
     return wanted
 
 
-def _refuse_unlike(store: Store, run_ids: Iterable[str]) -> None:
+def _refuse_unlike(store: Store, runs: Iterable[RunDirectory]) -> None:
     """Raise an error where runs of a robot that no profile knows are of robots whose sensors differ."""
-    groups = alike({run_id: known.sensors if (known := _known(store, run_id)) else {} for run_id in run_ids})
+    groups = alike({run.run_id: run.facts.log.sensors if run.facts.log else {} for run in runs})
     if len(groups) > 1:
         raise DatasetError(
             f"{store.root}: the runs of robot {GENERIC} are not all of one robot: their sensors differ; wanted one: tag each "
             "(tcpipe ingest LOG --tag robot=NAME) and choose it with --tag robot=NAME, or pool them with --robot generic",
-            *(f"{_named(runs)}: {in_words(seen)}" for runs, seen in groups),
+            *(f"{_named(names)}: {in_words(seen)}" for names, seen in groups),
         )
 
 

@@ -81,6 +81,14 @@ def test_a_broken_index_is_made_again_and_a_wrong_one_is_not_believed(store, wha
     assert not store.ingestions().stale
 
 
+def test_a_changed_byte_anywhere_in_the_index_changes_nothing(store):
+    path, right, rng = store.index_path / "runs.parquet", store.ingestions().rows, np.random.default_rng(0)
+    whole = path.read_bytes()
+    for at in rng.integers(0, len(whole), 40):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << int(rng.integers(8)))]) + whole[at + 1 :])
+        assert store.ingestions().rows == right, at
+
+
 def test_a_manifest_that_is_changed_under_the_index_is_told(store):
     (path,) = store.root.glob("runs/b/*/manifest.json")
     path.write_text(path.read_text().replace('"husky"', '"other"'))
@@ -130,6 +138,20 @@ def test_logs_that_were_seen_are_read_once_and_damage_is_named(store, caplog):
     path.write_text(path.read_text().replace("f" * 64, "e" * 64))
     assert store.seen_logs() == {}
     assert f"{path}: is not as it was written" in caplog.text
+
+
+def test_a_name_that_is_no_text_is_in_the_index_and_is_read_from_its_document(store):
+    odd, readable = "/logs/a\udcff.mcap", "/logs/a\\udcff.mcap"
+    known = store.run_json("a")
+    store.write_run_json("a", replace(known, source=replace(known.source, paths=(odd,))))
+    store.remember(f"{LOG}/one", Sighting((odd,), ((10, 20),), "f" * 64))
+    for _ in range(2):
+        found = store.ingestions()
+        store.keep_index(found)
+        assert found.finished[0].facts.log.source.paths == (odd,)
+        assert store.seen_logs()[LOG][0].log == (odd,)
+        assert [row.log.source.paths for row in index_files.read_runs(store.index_path).values()][0] == (readable,)
+    assert not found.stale
 
 
 def test_a_store_that_cannot_be_written_is_read_all_the_same(store, monkeypatch):
