@@ -150,7 +150,7 @@ def test_a_name_that_is_no_text_is_in_the_index_and_is_read_from_its_document(st
         store.keep_index(found)
         assert found.finished[0].facts.log.source.paths == (odd,)
         assert store.seen_logs()[LOG][0].log == (odd,)
-        assert [row.log.source.paths for row in index_files.read_runs(store.index_path).values()][0] == (readable,)
+        assert next(iter(index_files.read_runs(store.index_path).values())).log.source.paths == (readable,)
     assert not found.stale
 
 
