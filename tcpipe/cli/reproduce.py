@@ -16,9 +16,13 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, json_option, quiet_option
 @click.option(
     "--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help="Logs read side by side."
 )
+@click.option(
+    "--hidden", default=1.0, show_default=True, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
+    help="Variance of the resistance that nothing shows, over that of the frozen site.",
+)  # fmt: skip
 @json_option
 @quiet_option
-def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, as_json: bool, quiet: bool) -> None:
+def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, hidden: float, as_json: bool, quiet: bool) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and say which of the paper's claims hold.
 
     Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
@@ -28,5 +32,5 @@ def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, as_json: bo
     from tcpipe.learning.reproduction import reproduce as run
 
     with progress("reproduce", 1, quiet=quiet):
-        result = run(directory, quick=quick, seeds=seeds, jobs=jobs)
+        result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden)
     say_result(result, as_json=as_json)

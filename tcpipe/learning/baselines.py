@@ -61,11 +61,10 @@ def compared(
     logger.info("baselines: %s, fitted on %d samples", ", ".join(predictors), len(train))
     found: list[Compared] = []
     for split, part in sets.items():
-        drawn_by, groups = _groups(part.split, data.card.recipe.split.block_m)
         for name, predict in predictors.items():
             power, velocity = predict(part.split).T
             theirs = costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), ours.chord_m)
-            found += _of_quantities(name, split, part, said[split], theirs, drawn_by, groups, seed)
+            found += beside(name, split, part, said[split], theirs, block_m=data.card.recipe.split.block_m, seed=seed)
     return found, lacking
 
 
@@ -139,11 +138,16 @@ def _groups(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], ND
     return "blocks", np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def _of_quantities(  # noqa: PLR0917
-    name: str, split: str, part: Measured, ours: Costs, theirs: Costs,
-    drawn_by: Literal["runs", "blocks"], groups: NDArray[np.generic], seed: int,
-) -> Iterator[Compared]:  # fmt: skip
-    for quantity, measured in part.costs.items():
+def beside(
+    name: str, split: str, part: Measured, ours: Costs, theirs: Costs, *, block_m: float, seed: int
+) -> Iterator[Compared]:
+    """Yield the errors of a baseline ``name`` in every quantity that it says, with the ratios of the model's to them, of the same samples.
+
+    ``ours`` and ``theirs`` are of the samples of ``part``; the bootstrap with ``seed`` draws runs, or blocks of ``block_m``.
+    """
+    drawn_by, groups = _groups(part.split, block_m)
+    for quantity in theirs:
+        measured = part.costs[quantity]
         large = measured >= LEAST[quantity]
         off, other = (np.abs(costs_of[quantity] - measured) for costs_of in (ours, theirs))
         over = np.where(large, measured, 1.0)

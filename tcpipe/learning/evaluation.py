@@ -31,11 +31,8 @@ from tcpipe.learning.evaluation_facts import (
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import (
     ALL,
-    LEAST,
     Array,
     Errors,
-    combined,
-    errors,
     errors_by_class,
     label_floor,
     mean_of_draws,
@@ -43,6 +40,7 @@ from tcpipe.learning.metrics import (
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
+from tcpipe.learning.wei_isler import FEWEST, OURS, PER_CLASS, Trained, energy_table
 from tcpipe.robots.profiles import Robot
 from tcpipe.terrain.classes import NODATA_ID
 
@@ -56,25 +54,13 @@ INPUT_SETS = (("O", "C", "H"), ("C", "H"), ("O", "H"), ("O", "C"), ("O",), ("C",
 
 LETTERS = {"O": "ortho", "C": "terrain", "H": "height"}
 
-OURS, GRASS_ONLY, PER_CLASS, EXPECTED = (
-    "ours",
-    "Wei & Isler, grass only",
-    "Wei & Isler, a net per class",
-    "expected time",
-)
-
-_MORE_EPOCHS = 2.0
-"""A network of fewer samples takes fewer steps in an epoch, and gets up to so many times more of them."""
-
-_FEWEST = 20
-"""Samples of a class in train that a network of its own needs."""
+EXPECTED = "expected time"
 
 
 PlantCosts = Callable[[Split], dict[str, Array]]
 """Costs of samples by a predictor that knows how they were simulated."""
 
 Sets = dict[str, Measured]
-Trained = Callable[[str, Variant], Model]
 Said = Mapping[str, Mapping[str, Array]]
 """What a model says of each split: costs by quantity, shape (N,) each."""
 
@@ -116,14 +102,14 @@ def evaluate(
     def trained(name: str, variant: Variant) -> Model:
         place = out / NETWORKS / name
         few = len(training_task(data, fitting.fold, variant).fit)
-        longer = min(_MORE_EPOCHS, fitted / few)
-        rules = replace(fitting, epochs=round(longer * fitting.epochs))
+        longer = np.ceil(fitted / fitting.batch) / np.ceil(few / fitting.batch)  # as many steps, not as many epochs
+        rules = replace(fitting, epochs=round(longer * fitting.epochs), patience=round(longer * fitting.patience))
         train(dataset, place, config=rules, variant=variant, disposable=True)
         return load_model(place)
 
     ablation = list(_ablation(ours, sets, config, trained))
     with_networks = config.baselines and fitting.model == "resnet18"
-    energy = _energy(ours, data, sets, said, trained if with_networks else None)
+    energy = energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compared(ours, data, sets, said, seed=config.seed)
     return Evaluation(
         tcpipe_version=__version__,
@@ -133,11 +119,12 @@ def evaluate(
         config=config,
         splits={name: _split_errors(found, said[name], plant) for name, found in sets.items()},
         ablation=tuple(ablation),
-        energy=energy,
+        energy=energy.errors,
+        networks=tuple(energy.compared),
         time=_time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
         baselines=tuple(baselines),
         repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
-        warnings=(*lacking, *_warnings(ours, data, sets), *_left_out(data, sets, energy)),
+        warnings=(*lacking, *_warnings(ours, data, sets), *_left_out(data, sets, energy.errors)),
         plots={name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
     )
 
@@ -203,41 +190,6 @@ def _all_errors(said: Mapping[str, Array], found: Measured) -> dict[str, Errors]
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
 
 
-def _energy(
-    ours: Model, data: Dataset, sets: Sets, said: Said, trained: Trained | None
-) -> dict[str, dict[str, Errors]]:
-    """Return table IV: E by this model, by a height-only network of grass, and by one a class."""
-    found = {OURS: {name: _all_errors(said[name], part)["E"] for name, part in sets.items()}}
-    if trained is None or "height" not in data.card.layers:
-        return found
-    counts = ours.card.seen.class_counts
-    grass = next((entry.id for entry in ours.classes.classes if entry.name == "grass" and counts.get(entry.id)), None)
-    networks: dict[int, Model] = {}
-    for class_id in (class_id for class_id, count in counts.items() if count >= _FEWEST):
-        try:
-            variant = Variant(channels=("height",), classes=(class_id,), energy_only=True)
-            networks[class_id] = trained(f"wei_isler_class_{class_id}", variant)
-        except DatasetError as error:
-            logger.info("no network for class %d alone: %s", class_id, error.problems[0])
-    if grass in networks:
-        said_by_grass = {name: predicted_costs(networks[grass], part.split) for name, part in sets.items()}
-        found[GRASS_ONLY] = {name: _all_errors(said_by_grass[name], part)["E"] for name, part in sets.items()}
-    if networks:
-        found[PER_CLASS] = {name: _by_own_network(networks, part) for name, part in sets.items()}
-    return found
-
-
-def _by_own_network(networks: Mapping[int, Model], found: Measured) -> Errors:
-    """Return the errors of E with each class's samples predicted by its own network; classes without one are not counted."""
-    parts = []
-    for class_id, network in networks.items():
-        here = np.flatnonzero(found.class_ids == class_id)
-        if len(here):
-            energy = predicted_costs(network, found.split.take(here))["E"]
-            parts.append(errors(energy, found.costs["E"][here], LEAST["E"]))
-    return combined(parts)
-
-
 def _fastest_mps(robot: str, data: Dataset) -> float | None:
     """Return a robot's greatest speed [m/s], as the recipe of the dataset or else the package knows it."""
     known = {**shipped_profiles().robots, **data.card.recipe.robots}
@@ -288,7 +240,7 @@ def _left_out(data: Dataset, sets: Sets, energy: Mapping[str, Mapping[str, Error
         if PER_CLASS in energy and (without := len(found.split) - energy[PER_CLASS][name].count):
             yield (
                 f"{without} of {len(found.split)} samples of {name} are of classes with too few training samples for a network of "
-                f"their own (fewer than {_FEWEST}, or none in a fold) and are not in the figures of '{PER_CLASS}'"
+                f"their own (fewer than {FEWEST}, or none in a fold) and are not in table IV"
             )
 
 

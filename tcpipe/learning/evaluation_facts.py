@@ -137,7 +137,9 @@ class Evaluation:
     splits: Mapping[str, SplitErrors]
     ablation: tuple[AblationRow, ...]
     energy: Mapping[str, Mapping[str, Errors]]
-    """Table IV: errors of E by predictor and split."""
+    """Table IV: errors of E by predictor and split, of the same samples."""
+    networks: tuple[Compared, ...] = ()
+    """Those of the networks of Wei and Isler, with the ratios of the model's to them."""
     time: Mapping[str, Mapping[str, Errors]]
     """Table V: errors of T by predictor and split."""
     baselines: tuple[Compared, ...] = ()

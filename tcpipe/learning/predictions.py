@@ -32,6 +32,13 @@ class Measured:
     names: Mapping[int, str]
     """Of the classes that occur, by id."""
 
+    def take(self, rows: NDArray[np.int64]) -> Measured:
+        """Return some of the samples."""
+        costs, deviations = (
+            {name: values[rows] for name, values in of.items()} for of in (self.costs, self.deviations)
+        )
+        return Measured(self.split.take(rows), costs, deviations, self.class_ids[rows], self.names)
+
 
 def measured(split: Split, names: Mapping[int, str]) -> Measured:
     """Return what was measured; samples without a label are left out.

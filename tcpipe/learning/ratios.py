@@ -25,6 +25,12 @@ class Ratio:
     low: float | None
     high: float | None
 
+    def __str__(self) -> str:
+        """Return the ratio with its interval."""
+        if self.value is None:
+            return "–"
+        return f"{self.value:.2f}" + ("" if self.low is None else f" ({self.low:.2f} to {self.high:.2f})")
+
 
 def ratio_of_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *, power: float, seed: int) -> Ratio:
     """Return the ratio of two mean losses over the same samples, raised to ``power``, with its interval.
