@@ -53,7 +53,7 @@ FULL = Experiment("paper", FitConfig(epochs=40, patience=8), EvaluateConfig(draw
 """The paper's size: fits 90 minutes on two cores."""
 
 QUICK = Experiment(
-    "paper_quick", FitConfig(epochs=6, patience=6, batch=32, learning_rate=1e-3, width=16), EvaluateConfig(draws=2)
+    "paper_quick", FitConfig(epochs=4, patience=4, batch=32, learning_rate=1e-3, width=16), EvaluateConfig(draws=2)
 )
 """Two minutes on two cores: everything runs, and nothing is learned well enough to believe a figure."""
 
