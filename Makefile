@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-mutants check check-and-train kernels lock schemas docs clean
+.PHONY: help demo test test-dagster test-mutants check check-and-train kernels lock schemas docs clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -62,6 +62,15 @@ kernels: .venv/installed-dev
 	$(BIN)/tcpipe ingest .venv/tiny/site/logs --recipe .venv/tiny/ukf.toml --store .venv/tiny/ukf --quiet
 	@rm -rf .venv/tiny
 
+# The definitions for Dagster, executed (docs/how-to/dagster.md); its pins want an environment of their own.
+.venv-dagster/installed: pyproject.toml
+	$(PYTHON) -m venv .venv-dagster
+	.venv-dagster/bin/python -m pip --disable-pip-version-check install --quiet --no-compile dagster==1.13.27 hypothesis pytest pytest-randomly --editable '.[tables]'
+	@touch $@
+
+test-dagster: .venv-dagster/installed
+	.venv-dagster/bin/python -m pytest tests/schedulers --override-ini filterwarnings=default
+
 # Changes of the rooms of numbers, one at a time: does a test notice? docs/explanation/mutants.md; an hour and more on one core.
 # MUTANTS="--rooms motion path --draw 0" tries less.
 MUTANTS ?=
@@ -91,4 +100,4 @@ docs: .venv/installed
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf .venv .venv-mutants tcpipe-demo
+	rm -rf .venv .venv-dagster .venv-mutants tcpipe-demo

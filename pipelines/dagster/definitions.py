@@ -1,0 +1,211 @@
+"""tcpipe under Dagster: ``dagster dev -f pipelines/dagster/definitions.py``.
+
+Every log is a partition, found by a sensor; the assets are ``run`` (of one log), ``dataset`` and ``model``. What tcpipe says of them is
+their metadata, what it finds wrong is an asset check. The commands do the work: nothing is relied upon but their exit codes and their
+``--json`` answers. Where things lie is told by the environment:
+
+    TCPIPE_LOGS      folder or URL of the recordings (default: recordings)
+    TCPIPE_STORE     store with the maps (tcpipe-store)
+    TCPIPE_DATASET   (dataset)    TCPIPE_SPLIT   region.geojson, optional
+    TCPIPE_MODEL     (model)      TCPIPE_RECIPE  optional
+"""
+
+import base64
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+import dagster as dg
+
+from tcpipe.pipeline.log_sources import LogSource, find_sources
+
+Answer = Mapping[str, Any]
+
+LOGS = dg.DynamicPartitionsDefinition(name="logs")
+
+_DONE = {0, 3}
+"""Exit codes with a result: done; done, and something in it wants to be looked at."""
+
+
+def _place(name: str, default: str) -> str:
+    return os.environ.get(name, default)
+
+
+def _answers(command: str, *arguments: str, codes: Collection[int] = _DONE) -> list[Answer]:
+    """Run a command; return what it prints as JSON, or fail with its own words."""
+    line = [sys.executable, "-m", "tcpipe", command, *arguments, "--json"]
+    done = subprocess.run(line, capture_output=True, text=True, check=False)
+    if done.returncode not in codes or not done.stdout.strip():
+        said = done.stderr.strip() or done.stdout.strip()
+        raise dg.Failure(description=said, metadata={"exit code": done.returncode, "command": " ".join(line[2:])})
+    text, found, decoder = done.stdout.strip(), [], json.JSONDecoder()
+    while text:
+        value, end = decoder.raw_decode(text)
+        found.append(value)
+        text = text[end:].lstrip()
+    return found
+
+
+def _sources() -> dict[str, LogSource]:
+    """Return the logs that there are, by partition: where each lies in the folder."""
+    with tempfile.TemporaryDirectory() as staging:
+        found = find_sources([_place("TCPIPE_LOGS", "recordings")], as_one=False, staging=Path(staging))
+    return {source.place: source for source in found.sources}
+
+
+def _listed(lines: list[str]) -> dg.MetadataValue:
+    return dg.MetadataValue.md("\n".join(f"- {line}" for line in lines) or "none")
+
+
+def _ledger(ledger_m: Mapping[str, float]) -> dg.MetadataValue:
+    """Return where every metre went, as a table."""
+    rows = sorted(ledger_m.items(), key=lambda row: -row[1])
+    return dg.MetadataValue.md(
+        "| metres | |\n|---:|---|\n"
+        + "\n".join(f"| {metres:.1f} | {name.replace('_', ' ')} |" for name, metres in rows if metres)
+    )
+
+
+def _picture(path: Path) -> dict[str, dg.MetadataValue]:
+    """Return a PNG as something that the page shows, nothing where there is none."""
+    if not path.is_file():
+        return {}
+    data = base64.b64encode(path.read_bytes()).decode()
+    return {"map": dg.MetadataValue.md(f"![map](data:image/png;base64,{data})")}
+
+
+def _check(name: str, problems: list[str], *, warn: bool = False, **counts: int) -> dg.AssetCheckResult:
+    severity = dg.AssetCheckSeverity.WARN if warn else dg.AssetCheckSeverity.ERROR
+    metadata = {"problems": _listed(problems), **counts}
+    return dg.AssetCheckResult(check_name=name, passed=not problems, severity=severity, metadata=metadata)
+
+
+def _verified(path: str) -> dg.AssetCheckResult:
+    """Re-read what was made."""
+    (found,) = _answers("verify", path, codes={0, 1})
+    return _check("as_written", found["problems"], **found["read"])
+
+
+@dg.asset(
+    partitions_def=LOGS,
+    group_name="tcpipe",
+    kinds={"parquet"},
+    check_specs=[
+        dg.AssetCheckSpec("as_written", asset="run", description="Every byte is as it was written (tcpipe verify)."),
+        dg.AssetCheckSpec(
+            "nothing_doubtful", asset="run", description="Nothing is damaged, no sensor is missing or contradicted."
+        ),
+    ],
+)
+def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
+    """Labelled segments of one log, in the store."""
+    source = _sources().get(context.partition_key)
+    if source is None:
+        raise dg.Failure(f"{context.partition_key}: this log is no longer below {_place('TCPIPE_LOGS', 'recordings')}")
+    result = _answers("ingest", *source.origins)[-1]["results"][0]
+    if result["status"] in ("failed", "waiting"):
+        raise dg.Failure("\n".join([*result["problems"], *result["notes"]]) or result["status"])
+    budget = result["energy_budget"]
+    return dg.MaterializeResult(
+        metadata={
+            "run": result["run_id"],
+            "recipe": result["recipe_id"],
+            "status": result["status"],
+            "robot": result["robot"],
+            "segments": result["segments"],
+            "driven_m": result["distance_m"],
+            "in_segments_m": result["kept_m"],
+            **({"energy_floor": budget["total"]} if budget else {}),
+        },
+        check_results=[
+            _verified(f"{_place('TCPIPE_STORE', 'tcpipe-store')}/runs/{result['run_id']}"),
+            _check("nothing_doubtful", [*result["damage"], *result["warnings"]], warn=True),
+        ],
+    )
+
+
+@dg.asset(
+    deps=[run],
+    group_name="tcpipe",
+    kinds={"zarr", "parquet"},
+    check_specs=[
+        dg.AssetCheckSpec(
+            "as_written", asset="dataset", description="Every byte is as it was written (tcpipe verify)."
+        ),
+        dg.AssetCheckSpec("as_asked_for", asset="dataset", description="No run is left out, no split is empty."),
+        dg.AssetCheckSpec(
+            "held_out", asset="dataset", description="No patch of test or unseen shares ground with one of train."
+        ),
+    ],
+)
+def dataset() -> dg.MaterializeResult:
+    """Patches and labels of all runs, split by region."""
+    out = _place("TCPIPE_DATASET", "dataset")
+    region = os.environ.get("TCPIPE_SPLIT")
+    (made,) = _answers("build-dataset", out, *(["--split", region] if region else []))
+    doubtful = made["doubtful"]
+    shared = [
+        f"{part['overlapping_pairs']} patches of {part['split']} overlap one of train"
+        for part in made["audit"]
+        if part["overlapping_pairs"]
+    ]
+    return dg.MaterializeResult(
+        metadata={
+            "status": made["status"],
+            "samples": made["samples"],
+            **{f"{name}_samples": count for name, count in made["splits"].items()},
+            **({"doubtful_share": doubtful["share"]} if doubtful else {}),
+            "where_every_metre_went": _ledger(made["ledger_m"]),
+            "warnings": _listed(made["warnings"]),
+            "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),
+            **_picture(Path(out) / "overview.png"),
+        },
+        check_results=[
+            _verified(out),
+            _check("as_asked_for", made["problems"], warn=True),
+            _check("held_out", shared, warn=True),
+        ],
+    )
+
+
+@dg.asset(deps=[dataset], group_name="tcpipe", kinds={"lightgbm"})
+def model() -> dg.MaterializeResult:
+    """Trees on features of the dataset's patches."""
+    data, out = _place("TCPIPE_DATASET", "dataset"), _place("TCPIPE_MODEL", "model")
+    (trained,) = _answers("train", data, out, "--model", "table")
+    return dg.MaterializeResult(metadata={"model": dg.MetadataValue.json(dict(trained))})
+
+
+nightly = dg.define_asset_job(
+    "nightly", dg.AssetSelection.assets(dataset, model), description="Dataset and model of all runs."
+)
+one_log = dg.define_asset_job("one_log", dg.AssetSelection.assets(run), description="One log to labelled segments.")
+
+
+@dg.sensor(job=one_log, minimum_interval_seconds=300, default_status=dg.DefaultSensorStatus.RUNNING)
+def new_logs(context: dg.SensorEvaluationContext) -> dg.SensorResult:
+    """Ask for a run of every log that is new, or was written to since."""
+    sources = _sources()
+    known = set(context.instance.get_dynamic_partitions("logs"))
+    return dg.SensorResult(
+        run_requests=[
+            dg.RunRequest(partition_key=place, run_key=f"{place}:{source.files_digest}")
+            for place, source in sources.items()
+        ],
+        dynamic_partitions_requests=[LOGS.build_add_request(sorted(set(sources) - known))]
+        if set(sources) - known
+        else [],
+    )
+
+
+defs = dg.Definitions(
+    assets=[run, dataset, model],
+    jobs=[nightly, one_log],
+    sensors=[new_logs],
+    schedules=[dg.ScheduleDefinition(name="every_night", job=nightly, cron_schedule="0 4 * * *")],
+)
