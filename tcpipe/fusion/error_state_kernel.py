@@ -163,9 +163,9 @@ def filter_block(
     turn_rate, force : mean angular velocity and specific force since the event before, shape (E, 3).
     turn_rate_now : angular velocity at the event, shape (E, 3).
     output : row of ``outputs`` that the event fills, or -1.
-    levers : lever arm by kind, shape (8, 3). densities : process noise by mode, shape (4, 21), see `predict`.
+    levers : lever arm by kind, shape (9, 3). densities : process noise by mode, shape (4, 21), see `predict`.
     gates : threshold of the squared normalised innovation by kind; infinite where there is no gate.
-    lock_out : by kind (8, 4): refusals in a row, and seconds since the last accepted one, after which the gate reopens; the seconds
+    lock_out : by kind (9, 4): refusals in a row, and seconds since the last accepted one, after which the gate reopens; the seconds
         where no other sensor that tells velocity has been accepted for 2 s; 1 where the fixes' error is lifted, not the pose.
     kept_error, error_noise, error_level : what remains of the fixes' error since the event before, the variances added to it [m²],
         shape (E, 3), and those that it has in the long run, shape (E, 3).

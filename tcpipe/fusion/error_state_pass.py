@@ -14,7 +14,7 @@ from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.error_state_kernel import OFF_M, SURELY, filter_block, most_drift
 from tcpipe.fusion.fix_errors import FixErrors
 from tcpipe.fusion.gates import chi_square_gate
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState, Measurements
+from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
 from tcpipe.fusion.process import glides, process_noise, scale_stds, turn_scale_std, turns_by_course
 from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.smoother_kernel import smooth_block
@@ -30,9 +30,14 @@ _KEPT_BLOCKS = 12
 
 _Store = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 
-ROLES = {kernel.GNSS_POSITION: GNSS, kernel.WHEEL_VELOCITY: WHEELS, kernel.VISUAL_VELOCITY: VISUAL}
+ROLES = {
+    kernel.GNSS_POSITION: GNSS,
+    kernel.WHEEL_VELOCITY: WHEELS,
+    kernel.VISUAL_VELOCITY: VISUAL,
+    kernel.GNSS_VELOCITY: DOPPLER,
+}
 DOF = {kernel.GNSS_POSITION: 3, kernel.WHEEL_VELOCITY: 1, kernel.VISUAL_VELOCITY: 3, kernel.STANDING: 3}
-DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2}
+DOF |= {kernel.STANDING_RATE: 3, kernel.SIDEWAYS: 2, kernel.LEVEL: 2, kernel.GNSS_VELOCITY: 3}
 _LEAST_ERROR_M = 1e-4
 _NO_ERROR = np.empty(0)
 _ANY_YAW_STD_RAD = np.pi / np.sqrt(3.0)
@@ -46,7 +51,9 @@ _LOCK_OUT = {
 }
 _DOUBTED, _DEAF = (5.0, 2.0, 2.0, 1.0), (_NEVER, _NEVER, _NEVER, 0.0)
 """Refusals in a row, and seconds since the last accepted measurement, after which a gate reopens; the seconds where no other sensor
-of velocity is heard. `_DOUBTED`: the same of fixes whose error is part of the state; the 1 says that it is lifted, and not the pose."""
+of velocity is heard. `_DOUBTED`: the same of fixes whose error is part of the state; the 1 says that it is lifted, and not the pose.
+That of the receiver's velocity never reopens: the fixes tell where the filter is wrong."""
+_WITHOUT_PLACE = (kernel.WHEEL_VELOCITY, kernel.VISUAL_VELOCITY, kernel.GNSS_VELOCITY)
 
 
 @dataclass(slots=True)
@@ -94,7 +101,7 @@ class FilterPass:
         self.verdict = np.zeros(count, np.int8)
         self.repairs = 0.0
         self.displacement_variance_m2 = np.full((timeline.output.max() + 1, len(DISPLACEMENT_LAGS_S)), np.nan)
-        self.gates = np.full(8, np.inf)
+        self.gates = np.full(kernel.KINDS, np.inf)
         for kind in (*ROLES, kernel.STANDING, kernel.STANDING_RATE):
             self.gates[kind] = chi_square_gate(DOF[kind], gate_probability)
         self._levers = _lever_arms(measurements)
@@ -171,7 +178,7 @@ class FilterPass:
     def explained(self, spans: Spans, usual: float) -> Explained:
         """Return what remains unexplained if the fixes err in ``spans``; ``usual`` is the squared innovation of a fix that is right."""
         fixes = self._innovations(kernel.GNSS_POSITION)
-        others = [self._innovations(kind) for kind in (kernel.WHEEL_VELOCITY, kernel.VISUAL_VELOCITY)]
+        others = [self._innovations(kind) for kind in _WITHOUT_PLACE]
         return explained(spans, fixes, others, usual)
 
     def usual(self) -> float:
@@ -300,10 +307,11 @@ def _carries(m: Measurements) -> bool:
 
 
 def _lever_arms(measurements: Measurements) -> NDArray[np.float64]:
-    """Return the lever arm by kind of event [m], shape (8, 3)."""
-    levers = np.zeros((8, 3))
+    """Return the lever arm by kind of event [m], shape (9, 3)."""
+    levers = np.zeros((kernel.KINDS, 3))
     for kind, source in (
         (kernel.GNSS_POSITION, measurements.gnss),
+        (kernel.GNSS_VELOCITY, measurements.gnss),
         (kernel.WHEEL_VELOCITY, measurements.wheels),
         (kernel.SIDEWAYS, measurements.wheels),
         (kernel.VISUAL_VELOCITY, measurements.visual),
@@ -314,8 +322,8 @@ def _lever_arms(measurements: Measurements) -> NDArray[np.float64]:
 
 
 def _lock_out(measurements: Measurements) -> NDArray[np.float64]:
-    """Return by kind of event when its gate reopens, as `filter_block` takes it, shape (8, 4)."""
-    lock_out = np.full((8, 4), _NEVER)
+    """Return by kind of event when its gate reopens, as `filter_block` takes it, shape (9, 4)."""
+    lock_out = np.full((kernel.KINDS, 4), _NEVER)
     for kind, limits in _LOCK_OUT.items():
         lock_out[kind] = (*limits, 0.0)
     if measurements.visual is None or measurements.imu is None:  # what is left cannot overrule GNSS for long
@@ -379,7 +387,7 @@ def _start(
             fix_error_m2,
         )
     )
-    return _Memory(x, P, np.zeros(8), np.zeros(8), np.zeros(6))
+    return _Memory(x, P, np.zeros(kernel.KINDS), np.zeros(kernel.KINDS), np.zeros(6))
 
 
 def lags_of(output_ns: NDArray[np.int64]) -> list[int]:

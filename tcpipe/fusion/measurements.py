@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-GNSS, IMU, WHEELS, VISUAL = "gnss", "imu", "wheel_odometry", "visual_odometry"
+GNSS, IMU, WHEELS, VISUAL, DOPPLER = "gnss", "imu", "wheel_odometry", "visual_odometry", "gnss_velocity"
 """Roles, as they stand in the rejections table."""
 
 NO_LEVER_ARM = (0.0, 0.0, 0.0)
@@ -42,6 +42,22 @@ class Positions:
     variance_m2: NDArray[np.float64]
     lever_arm_m: tuple[float, float, float] = NO_LEVER_ARM
     unclaimed: NDArray[np.bool_] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class GroundVelocities:
+    """A receiver's own velocity: that of the antenna of its fixes over ground, from Doppler.
+
+    Attributes
+    ----------
+    stamp_ns : [ns], shape (N,), int64, increasing.
+    velocity_enu_mps : [m/s], shape (N, 3), east, north, up; up is 0 where it is not told, its variance vast.
+    variance_m2ps2 : [m²/s²], shape (N, 3); floored, never unknown.
+    """
+
+    stamp_ns: NDArray[np.int64]
+    velocity_enu_mps: NDArray[np.float64]
+    variance_m2ps2: NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,18 +123,19 @@ class Measurements:
     """All measurements of one stretch of one clock epoch without a long gap; a role that the log lacks is None.
 
     At least one of ``gnss``, ``wheels`` and ``visual`` is there. ``nonholonomic_std_mps``: sideways and vertical body velocity are
-    zero to within this.
+    zero to within this. ``doppler`` goes with ``gnss``, whose antenna it is of.
     """
 
     gnss: Positions | None = None
+    doppler: GroundVelocities | None = None
     imu: InertialMeasurements | None = None
     wheels: BodyVelocities | None = None
     visual: BodyVelocities | None = None
     nonholonomic_std_mps: float = 0.15
 
-    def sensors(self) -> dict[str, Positions | InertialMeasurements | BodyVelocities]:
+    def sensors(self) -> dict[str, Positions | GroundVelocities | InertialMeasurements | BodyVelocities]:
         """Return the sensors that are there, by role."""
-        every = {GNSS: self.gnss, IMU: self.imu, WHEELS: self.wheels, VISUAL: self.visual}
+        every = {GNSS: self.gnss, DOPPLER: self.doppler, IMU: self.imu, WHEELS: self.wheels, VISUAL: self.visual}
         return {role: sensor for role, sensor in every.items() if sensor is not None}
 
     def odometries(self) -> dict[str, BodyVelocities]:
@@ -153,7 +170,7 @@ class InitialState:
     heading_from: str = "unknown"
 
 
-_Source = TypeVar("_Source", Positions, BodyVelocities, InertialMeasurements)
+_Source = TypeVar("_Source", Positions, GroundVelocities, BodyVelocities, InertialMeasurements)
 
 
 def part(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
@@ -161,6 +178,7 @@ def part(whole: Measurements, start_ns: int, end_ns: int) -> Measurements:
     return replace(
         whole,
         gnss=_part(whole.gnss, start_ns, end_ns),
+        doppler=_part(whole.doppler, start_ns, end_ns),
         imu=_part(whole.imu, start_ns, end_ns),
         wheels=_part(whole.wheels, start_ns, end_ns),
         visual=_part(whole.visual, start_ns, end_ns),

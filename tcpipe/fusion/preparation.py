@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Positions
+from tcpipe.fusion.measurements import BodyVelocities, GroundVelocities, InertialMeasurements, Positions
 from tcpipe.fusion.pose_increments import along_pose_axes, has_twist, in_child_axes, increments
 from tcpipe.fusion.signals import median_period_ns, white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
@@ -90,6 +90,22 @@ def positions(
     fixes = enu_from_geodetic(lon[usable], lat[usable], alt[usable], datum_deg_m=datum_deg_m)
     prepared = Prepared(stamp_ns[~_is_fix(lon, lat, alt)], repeated, replaced)
     return Positions(stamp_ns[usable], fixes, variance, lever_arm_m, unclaimed if unclaimed.any() else None), prepared
+
+
+def ground_velocities(
+    stamp_ns: NDArray[np.int64], columns: Columns, *, default_std_mps: float
+) -> tuple[GroundVelocities, Prepared]:
+    """Prepare a receiver's velocities (columns of the role gnss_velocity); unknown variances: ``default_std_mps``, twice that for up."""
+    velocity = _matrix(columns, [f"{axis}_velocity_mps" for axis in ("east", "north", "up")])
+    variance = _matrix(columns, [f"{axis}_var_m2ps2" for axis in ("east", "north", "up")])
+    measured = np.asarray(np.isfinite(velocity[:, :2]).all(1) & ~(np.abs(velocity) >= _MAX_VELOCITY_MPS).any(1))
+    usable, repeated = _usable(stamp_ns, measured)
+    velocity, variance = velocity[usable], variance[usable]
+    default = np.square(default_std_mps * np.array([1.0, 1.0, 2.0]))
+    variance, replaced = _variances(variance, default, _VELOCITY_FLOOR_MPS**2)
+    variance[np.isnan(velocity[:, 2]), 2] = _NO_TRUST
+    made = GroundVelocities(stamp_ns[usable], np.nan_to_num(velocity), variance)
+    return made, Prepared(stamp_ns[~measured], repeated, replaced)
 
 
 def body_velocities(
@@ -264,4 +280,4 @@ def _variances(
     return filled, int((~known).any(1).sum())
 
 
-__all__ = ["Columns", "Prepared", "body_velocities", "find_datum", "inertial", "positions"]
+__all__ = ["Columns", "Prepared", "body_velocities", "find_datum", "ground_velocities", "inertial", "positions"]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
-from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
+from tcpipe.fusion.measurements import BodyVelocities, GroundVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import in_gap, median_period_ns, seconds, slopes, white_noise
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
@@ -183,7 +183,8 @@ def _held_density(measurements: Measurements) -> _Density:
     """
     sources = [source for source in measurements.odometries().values() if source.stamp_ns.size > 2]
     slope = [slopes(s.stamp_ns, s.velocity_mps[:, 0], _ACCELERATION_WINDOW_S) for s in sources]
-    unknown = _unseen_density(None if sources else measurements.gnss)
+    doppler = None if sources else measurements.doppler
+    unknown = _shown_density(doppler) if doppler else _unseen_density(None if sources else measurements.gnss)
 
     def density(at_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         found = np.full(at_ns.size, np.nan)
@@ -211,6 +212,16 @@ def _unseen_density(gnss: Positions | None) -> _Density:
     unseen = _UNKNOWN * min(1.0, (_fix_velocity_std_mps(gnss) / _UNSEEN_MPS) ** 2)
     density = np.minimum(np.maximum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * found, unseen), _UNKNOWN)
     stamp_ns = gnss.stamp_ns
+    return lambda at_ns: _interpolated(stamp_ns, density, at_ns)
+
+
+def _shown_density(doppler: GroundVelocities) -> _Density:
+    """Without odometry: the square of the acceleration that a receiver's own velocity shows, as far as it is not its noise."""
+    stamp_ns, window_s = doppler.stamp_ns, max(_FIX_WINDOW_S, _FIXES * 1e-9 * median_period_ns(doppler.stamp_ns))
+    if stamp_ns.size < _FIXES:
+        return lambda at_ns: np.full(at_ns.size, _UNKNOWN)
+    shown = sum(np.square(slopes(stamp_ns, axis, window_s)) for axis in doppler.velocity_enu_mps[:, :2].T)
+    density = np.minimum(_UNSEEN_STEADY + _UNSEEN_LASTS_S * np.asarray(shown), _UNKNOWN)
     return lambda at_ns: _interpolated(stamp_ns, density, at_ns)
 
 

@@ -10,6 +10,7 @@ Constraints are events of our own making:
   error of this constraint (side slip, a lever arm to the turning centre) lasts, so it must not be counted as white at 50 Hz with a
   small deviation: that locks GNSS out. Its information is that of 0.15 m/s ten times a second, whatever the wheels' rate; so is that of
   the wheels themselves, as far as they claim a larger variance than they scatter by: such an error, slip, lasts as well.
+- a receiver's own velocity errs alike for a second (its filter, multipath): it counts once a second, whatever its rate.
 - standing (`tcpipe.fusion.standing`): zero velocity, and the gyroscope shows its bias, five times a second.
 - level, where no accelerometer tells up from down: roll and pitch are small. A slope lasts, so 20° are counted once in four seconds: as 40°
   once a second.
@@ -35,6 +36,7 @@ _UNSEEN_TURN_S = 1.0
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _STANDING_NS = 200_000_000
 _STANDING_STD_MPS = 0.01
+_DOPPLER_LASTS_S = 1.0
 _LEVEL_NS = 1_000_000_000
 _LEVEL_STD_RAD = 0.7
 _MIN_INPUT_GAP_NS = 100_000_000
@@ -138,15 +140,21 @@ def _measured(measurements: Measurements) -> list[_Part]:
         parts.append(_wheels(wheels, measurements.nonholonomic_std_mps))
     if visual is not None and visual.stamp_ns.size:
         flat = measurements.imu is None and visual.turn_rate_radps is None
-        variance = visual.variance_m2ps2 + (_unseen_turn_variance(visual) if flat else 0.0)
+        variance = visual.variance_m2ps2 + (_unseen_turn_variance(visual.stamp_ns, visual.lever_arm_m) if flat else 0.0)
         parts.append((visual.stamp_ns, kernel.VISUAL_VELOCITY, visual.velocity_mps, variance))
+    doppler = measurements.doppler
+    if gnss is not None and doppler is not None and doppler.stamp_ns.size:
+        variance = doppler.variance_m2ps2 * max(1.0, _DOPPLER_LASTS_S * 1e9 / median_period_ns(doppler.stamp_ns))
+        if measurements.imu is None and (visual is None or visual.turn_rate_radps is None):
+            variance = variance + _unseen_turn_variance(doppler.stamp_ns, gnss.lever_arm_m)
+        parts.append((doppler.stamp_ns, kernel.GNSS_VELOCITY, doppler.velocity_enu_mps, variance))
     return parts
 
 
-def _unseen_turn_variance(visual: BodyVelocities) -> NDArray[np.float64]:
-    """Variance [m²/s²], shape (3,), of what a camera off base_link sees of turns that no sensor tells; they last, as the ground does."""
-    rate_hz = 1e9 / median_period_ns(visual.stamp_ns)
-    x, y, z = np.square(visual.lever_arm_m)
+def _unseen_turn_variance(stamp_ns: NDArray[np.int64], lever_arm_m: tuple[float, float, float]) -> NDArray[np.float64]:
+    """Variance [m²/s²], shape (3,), of what a sensor off base_link sees of turns that no sensor tells; they last, as the ground does."""
+    rate_hz = 1e9 / median_period_ns(stamp_ns)
+    x, y, z = np.square(lever_arm_m)
     lasting: NDArray[np.float64] = np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * max(1.0, rate_hz * _UNSEEN_TURN_S)
     return lasting
 

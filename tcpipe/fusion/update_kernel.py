@@ -9,6 +9,7 @@ from tcpipe.compiled import kernel
 from tcpipe.fusion.state_kernel import (
     CENTRE_WEIGHT,
     GNSS_POSITION,
+    GNSS_VELOCITY,
     LEVEL,
     NX,
     STANDING,
@@ -70,6 +71,9 @@ def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: 
             out[0] = v0 * s
             out[1] = v1 * s
             out[2] = v2 * s
+        elif kind == GNSS_VELOCITY:
+            for i in range(3):
+                out[i] = x[3 * i] * v0 + x[3 * i + 1] * v1 + x[3 * i + 2] * v2
         else:
             out[0] = v1
             out[1] = v2

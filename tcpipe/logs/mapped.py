@@ -33,9 +33,9 @@ def _three(name: str, message: str, unit: str, *, needed: str = "") -> dict[str,
     return {f"{name}_{axis}": MappedField(f"{message}.{axis}", unit, axis in needed) for axis in "xyz"}
 
 
-def _std(message: str, names: Sequence[str], size: int) -> dict[str, MappedField]:
-    """Return the deviations of a position, the first three of the diagonal of a covariance of so many rows."""
-    return {f"{name}_std": MappedField(message, "m", std_of=row * (size + 1)) for row, name in enumerate(names)}
+def _std(message: str, names: Sequence[str], size: int, unit: str = "m") -> dict[str, MappedField]:
+    """Return the deviations of a vector, the first three of the diagonal of a covariance of so many rows."""
+    return {f"{name}_std": MappedField(message, unit, std_of=row * (size + 1)) for row, name in enumerate(names)}
 
 
 def _orientation(message: str) -> dict[str, MappedField]:
@@ -61,6 +61,13 @@ MAPPED: dict[str, dict[str, MappedField]] = {
         **_std("position_covariance", ("east", "north", "up"), 3),
         "status": MappedField("status.status", "1"),
     },
+    "gnss_velocity": {
+        **{
+            name: MappedField(f"twist.twist.linear.{axis}", "m/s", needed=axis != "z")
+            for name, axis in zip(("east", "north", "up"), "xyz", strict=True)
+        },
+        **_std("twist.covariance", ("east", "north", "up"), 6, "m/s"),
+    },
     "imu": {
         **_three("angular_velocity", "angular_velocity", "rad/s", needed="xyz"),
         **_three("linear_acceleration", "linear_acceleration", "m/s2", needed="xyz"),
@@ -79,6 +86,7 @@ MAPPED: dict[str, dict[str, MappedField]] = {
 
 MAPPED_TYPES = {
     "gnss": roles.NAV_SAT_FIX,
+    "gnss_velocity": roles.TWIST_WITH_COVARIANCE_STAMPED,
     "imu": roles.IMU,
     "wheel_odometry": roles.ODOMETRY,
     "visual_odometry": roles.ODOMETRY,
@@ -151,11 +159,11 @@ def message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[s
     for name, field in MAPPED[role].items():
         if field.std_of is not None:
             if name in values:
-                made.setdefault(field.message, np.zeros((rows, 36 if role == "pose" else 9)))
+                made.setdefault(field.message, np.zeros((rows, 9 if role == "gnss" else 36)))
                 made[field.message][:, field.std_of] = values[name] ** 2
         elif name in values:
             made[field.message] = values[name]
-        elif role == "gnss" and name == "altitude":
+        elif (role, name) in {("gnss", "altitude"), ("gnss_velocity", "up")}:
             made[field.message] = np.full(rows, np.nan)
         elif name.startswith("orientation_"):
             made[field.message] = zero if name[-1] != "w" else np.ones(rows)

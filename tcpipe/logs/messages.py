@@ -7,7 +7,7 @@ comments fix units, frames and what -1 and 0 mean), REP-103, REP-105, REP-145.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe.geometry.rotation import normalized
 from tcpipe.logs import roles
-from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, read_gga, with_date
+from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, read_gga, read_over_ground, with_date
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ def read_messages(columns: Columns, role: str, type_name: str) -> Readings:
     ----------
     columns : ``log_time_ns`` and the message's fields by dotted name, shape (N,); covariances as shape (N, k); frames and sentences as
         arrays of str.
-    role : gnss, imu, wheel_odometry, visual_odometry, command or pose (power is read by `tcpipe.power.readings`).
+    role : gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, command or pose (power is read by `tcpipe.power.readings`).
     type_name : ``package/msg/Name``.
     """
     return _READERS[role, type_name]({name: _possible(name, values) for name, values in columns.items()})
@@ -280,6 +280,108 @@ def _apart(own_time_ns: Ints, stamps_ns: Ints | None) -> tuple[str, ...]:
     return (f'{what}, unless the recipe says [read.time] gnss = "header"',)
 
 
+def _ground_velocity(velocity: Floats, variances: Floats, status: NDArray[Any] | int = -1) -> dict[str, NDArray[Any]]:
+    """Return the columns of velocities east, north, up (N, 3) and their variances."""
+    axes = ("east", "north", "up")
+    return {
+        **{f"{axis}_velocity_mps": velocity[:, i] for i, axis in enumerate(axes)},
+        **{f"{axis}_var_m2ps2": variances[:, i] for i, axis in enumerate(axes)},
+        "fix_status": np.broadcast_to(status, velocity.shape[:1]).astype(np.int8),
+    }
+
+
+_HELD_COURSE_MPS = 0.3
+"""Below this receivers hold the course they last had, or tell any: the velocity is then anywhere on a circle of that radius."""
+_SLOW_STD_MPS = 0.1
+
+
+def _by_course(speed: Floats, course_rad: Floats, var: Floats) -> tuple[Floats, Floats]:
+    """Return velocities east and north (N, 2) from speed [m/s] and course (clockwise from north), and their variances, (N, 2)."""
+    slow = speed < _HELD_COURSE_MPS
+    velocity = speed[:, None] * np.column_stack((np.sin(course_rad), np.cos(course_rad)))
+    circle = speed**2 / 2 + np.where(np.isfinite(var), var, _SLOW_STD_MPS**2)
+    return np.where(slow[:, None], 0.0, velocity), np.repeat(np.where(slow, circle, var)[:, None], 2, axis=1)
+
+
+def _read_velocity_sentences(columns: Columns) -> Readings:
+    texts = [str(sentence) for sentence in columns["sentence"]]
+    told, gga = read_over_ground(texts), read_gga(texts)
+    of_told = {name: values[told.row] for name, values in columns.items()}
+    at_ns = of_told[LOG_TIME].astype(np.int64)
+    time_of_day_ns = told.time_of_day_ns
+    if (
+        told.row.size and gga.row.size and (time_of_day_ns < 0).all()
+    ):  # VTG has no time: that of the fix which came with it
+        beside_ns = columns[LOG_TIME].astype(np.int64)[gga.row]
+        after = np.clip(np.searchsorted(beside_ns, at_ns), 1, max(1, gga.row.size - 1))
+        before_is_nearer = at_ns - beside_ns[after - 1] <= beside_ns[np.minimum(after, gga.row.size - 1)] - at_ns
+        nearest = np.where(before_is_nearer, after - 1, np.minimum(after, gga.row.size - 1))
+        near = np.abs(beside_ns[nearest] - at_ns) < _BESIDE_NS
+        time_of_day_ns = np.where(near, gga.time_of_day_ns[nearest], -1)
+    over_ground, variances = _by_course(told.speed_mps, told.course_rad, np.full(told.row.size, np.nan))
+    unknown = np.full((told.row.size, 1), np.nan)
+    values = _ground_velocity(np.hstack((over_ground, unknown)), np.hstack((variances, unknown)), told.status)
+    drops = {
+        "broken": told.broken,
+        "no_fix": told.status < 0,
+        "not_finite": ~np.isfinite(over_ground.sum(-1)),
+    }
+    found = _kept(of_told, values, drops, notes={"course_unknown": int((told.speed_mps < _HELD_COURSE_MPS).sum())})
+    own_time_ns = with_date(time_of_day_ns[found.row], found.log_time_ns)
+    others = len(texts) - len(told.row)
+    dropped = {**({"no_velocity": others} if others else {}), **found.dropped}
+    return replace(found, row=told.row[found.row], dropped=dropped, own_time_ns=own_time_ns)
+
+
+_BESIDE_NS = 500_000_000
+
+
+def _read_gps_fix(columns: Columns) -> Readings:
+    speed, climb, err_speed, err_climb, err_track = (
+        columns[name].astype(np.float64) if name in columns else np.full(len(columns[LOG_TIME]), np.nan)
+        for name in ("speed", "climb", "err_speed", "err_climb", "err_track")
+    )
+    course = np.radians(columns["track"].astype(np.float64))
+    std = np.fmax(
+        np.where(err_speed > 0, err_speed, np.nan), np.where(err_track > 0, speed * np.radians(err_track), np.nan)
+    )
+    over_ground, variances = _by_course(speed, course, (std / _STDS_OF_95) ** 2)
+    climb_var = np.where(err_climb > 0, (err_climb / _STDS_OF_95) ** 2, np.nan)
+    climb = climb if np.any(climb) else np.full_like(climb, np.nan)
+    velocity = np.column_stack((over_ground, climb))
+    status = columns["status.status"].astype(np.int64) if "status.status" in columns else np.zeros(speed.size, np.int64)
+    values = _ground_velocity(velocity, np.column_stack((variances, climb_var)), np.clip(status, -1, 2))
+    drops = {"no_fix": status < 0, "not_finite": ~np.isfinite(over_ground.sum(-1)) | (speed < 0)}
+    return _kept(columns, values, drops)
+
+
+_STDS_OF_95 = 2.0
+"""gps_common/GPSFix: errors are told at 95 per cent confidence."""
+
+
+def _read_velocity_twist(columns: Columns) -> Readings:
+    """Return the linear part as east, north, up, as the drivers of receivers write it; one that has no north is of the body."""
+    with_covariance = "twist.twist.linear.x" in columns
+    prefix = "twist.twist" if with_covariance else "twist"
+    velocity = _vector(columns, f"{prefix}.linear")
+    variances = _variances(columns, "twist.covariance", 0, 7, 14)
+    unmeasured = _unmeasured(columns, "twist.covariance", np.hstack((velocity, velocity)))[:, :3]
+    if "twist.covariance" in columns:
+        first = columns["twist.covariance"][:, 0]
+        unmeasured[:, 0] = (first == -1) | (first >= _UNMEASURED_VAR)
+    of_body = bool(len(velocity) >= _FEWEST_ZEROS and np.any(velocity[:, 0]) and not np.any(velocity[:, 1]))
+    velocity[unmeasured[:, 2], 2] = variances[unmeasured[:, 2], 2] = np.nan
+    drops = {
+        "not_measured": unmeasured[:, :2].any(1) & (not of_body),
+        "not_finite": ~np.isfinite(velocity[:, :2].sum(-1)),
+        "of_the_body": np.full(len(velocity), of_body),
+    }
+    warnings = (
+        ("its second axis is zero throughout: that is a velocity of the body, not over ground",) if of_body else ()
+    )
+    return _kept(columns, _ground_velocity(velocity, variances), drops, warnings=warnings)
+
+
 def _read_imu(columns: Columns) -> Readings:
     rate = _vector(columns, "angular_velocity")
     force = _vector(columns, "linear_acceleration")
@@ -380,6 +482,10 @@ def _read_pose(columns: Columns) -> Readings:
 _READERS: dict[tuple[str, str], Callable[[Columns], Readings]] = {
     ("gnss", roles.NAV_SAT_FIX): _read_nav_sat_fix,
     ("gnss", roles.NMEA_SENTENCE): _read_nmea,
+    ("gnss_velocity", roles.NMEA_SENTENCE): _read_velocity_sentences,
+    ("gnss_velocity", roles.TWIST_STAMPED): _read_velocity_twist,
+    ("gnss_velocity", roles.TWIST_WITH_COVARIANCE_STAMPED): _read_velocity_twist,
+    **{("gnss_velocity", type_name): _read_gps_fix for type_name in roles.GPS_FIXES},
     ("imu", roles.IMU): _read_imu,
     ("command", roles.TWIST): _read_command,
     ("command", roles.TWIST_STAMPED): _read_command,
@@ -412,6 +518,7 @@ def _quat_of(prefix: str) -> tuple[str, ...]:
 _FIELDS: dict[str, tuple[str, ...]] = {
     roles.NAV_SAT_FIX: (*_STAMP, "latitude", "longitude", "altitude", "status.status", "position_covariance_type"),
     roles.NMEA_SENTENCE: ("sentence",),
+    **dict.fromkeys(roles.GPS_FIXES, (*_STAMP, "speed", "track")),
     roles.IMU: (*_STAMP, *_fields_of("angular_velocity.", "linear_acceleration."), *_quat_of("orientation")),
     roles.ODOMETRY: (
         *_STAMP,

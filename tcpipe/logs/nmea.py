@@ -1,8 +1,10 @@
-"""NMEA 0183 GGA sentences: a GNSS position without a date and above the geoid.
+"""NMEA 0183: GGA, a GNSS position without a date and above the geoid; RMC and VTG, speed and course over ground.
 
 Layout: ``$ttGGA,hhmmss.ss,ddmm.mm,N|S,dddmm.mm,E|W,quality,satellites,hdop,altitude,M,separation,M,age,station*checksum``;
 the checksum is the exclusive or of all bytes between ``$`` and ``*``. Height above the ellipsoid = altitude + separation.
-Source: NMEA 0183 v4.11, sentence GGA.
+``$ttRMC,hhmmss.ss,A|V,ddmm.mm,N|S,dddmm.mm,E|W,speed [knots],course [deg],ddmmyy,variation,E|W,mode``;
+``$ttVTG,course [deg true],T,course [deg magnetic],M,speed [knots],N,speed [km/h],K,mode``; the mode is missing before v2.3.
+Source: NMEA 0183 v4.11, sentences GGA, RMC, VTG.
 """
 
 from __future__ import annotations
@@ -28,6 +30,10 @@ STATUS_AND_STD_OF_QUALITY: dict[int, tuple[int, float]] = {
 }
 """GGA quality to NavSatStatus and horizontal standard deviation at HDOP 1 [m]; others (none, estimated, manual, simulated) are no fix."""
 
+KNOT_MPS = 1852.0 / 3600.0
+_STATUS_OF_MODE = {"": 0, "A": 0, "P": 0, "D": 1, "R": 2, "F": 2}
+"""Mode to NavSatStatus; others (estimated, manual, simulated, none) are no measurement."""
+_RMC_OR_VTG = re.compile(r"\$([A-Z]{2}(RMC|VTG),[^*$\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
 _GGA = re.compile(r"\$([A-Z]{2}GGA,[^*$\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
 _TIME = re.compile(r"(\d{2})(\d{2})(\d{2})(?:\.(\d{1,9}))?\Z")
 
@@ -75,6 +81,60 @@ def read_gga(sentences: Sequence[str]) -> Gga:
         table[:, 5],
         np.array([value is None for value in values], bool),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class OverGround:
+    """Sentences that tell speed and course, shape (N,): where they stood, and what they say; NaN where a field is empty.
+
+    ``time_of_day_ns`` is UTC since midnight, -1 where there is none (VTG); ``course_rad`` clockwise from true north; ``status`` is -1
+    where the receiver does not stand for it; ``broken`` marks a wrong checksum or an unreadable field.
+    """
+
+    row: NDArray[np.int64]
+    time_of_day_ns: NDArray[np.int64]
+    speed_mps: Floats
+    course_rad: Floats
+    status: NDArray[np.int64]
+    broken: NDArray[np.bool_]
+
+
+def read_over_ground(sentences: Sequence[str]) -> OverGround:
+    """Return the RMC sentences, which have a time, or where there are none the VTG sentences."""
+    found = [(row, match) for row, text in enumerate(sentences) if (match := _RMC_OR_VTG.search(text)) is not None]
+    kind = "RMC" if any(match[2] == "RMC" for _, match in found) else "VTG"
+    told = [(row, _over_ground(match[1], kind, match[3])) for row, match in found if match[2] == kind]
+    none = (-1, np.nan, np.nan, -1)
+    times, speed, course, status = (
+        zip(*(none if fields is None else fields for _, fields in told), strict=True) if told else ((),) * 4
+    )
+    return OverGround(
+        np.array([row for row, _ in told], np.int64),
+        np.array(times, np.int64),
+        np.array(speed, np.float64),
+        np.radians(np.array(course, np.float64)),
+        np.array(status, np.int64),
+        np.array([fields is None for _, fields in told], bool),
+    )
+
+
+def _over_ground(body: str, kind: str, checksum: str | None) -> tuple[int, float, float, int] | None:
+    """Return time of day [ns], speed [m/s], course [deg] and status; None where the sentence is broken."""
+    if checksum is not None and int(checksum, 16) != _checksum(body):
+        return None
+    parts = [part.strip() for part in body.split(",")] + [""] * 3
+    try:
+        if kind == "RMC":
+            status = _STATUS_OF_MODE.get(parts[12], -1) if parts[2] == "A" else -1
+            return _time_of_day_ns(parts[1]), _number(parts[7]) * KNOT_MPS, _number(parts[8]), status
+        speed = _number(parts[5]) * KNOT_MPS if parts[5] else _number(parts[7]) / 3.6
+        return -1, speed, _number(parts[1]), _STATUS_OF_MODE.get(parts[9], -1)
+    except (ValueError, IndexError):
+        return None
+
+
+def _number(text: str) -> float:
+    return float(text) if text else np.nan
 
 
 def _fields(body: str, checksum: str | None) -> tuple[int, tuple[float, ...]] | None:

@@ -16,6 +16,7 @@ from typing import TypeVar
 from tcpipe.logs.coverage import LITTLE_SPAN, LITTLE_SPAN_OF_POWER, coverage, covering_little
 from tcpipe.logs.robots import find_robot
 from tcpipe.logs.several_robots import namespaces_of_robots
+from tcpipe.logs.topic_texts import LISTED, listing, short_list
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
 from tcpipe.robots.profiles import Profiles
@@ -29,6 +30,7 @@ TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 TWIST_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/TwistWithCovarianceStamped"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE_STAMPED = "geometry_msgs/msg/PoseWithCovarianceStamped"
+GPS_FIXES = ("gps_common/msg/GPSFix", "gps_msgs/msg/GPSFix")
 TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 _MEASURED_TWISTS = (ODOMETRY, TWIST_WITH_COVARIANCE_STAMPED, TWIST_STAMPED)
@@ -38,6 +40,7 @@ ROLE_TYPES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
     "wheel_odometry": _MEASURED_TWISTS,
     "visual_odometry": _MEASURED_TWISTS,
+    "gnss_velocity": (TWIST_WITH_COVARIANCE_STAMPED, *GPS_FIXES, TWIST_STAMPED, NMEA_SENTENCE),
     "power": FLOAT_TYPES,
     "command": (TWIST_STAMPED, TWIST),
     "pose": (POSE_WITH_COVARIANCE_STAMPED, ODOMETRY, POSE_STAMPED),
@@ -147,7 +150,7 @@ def assign_roles(
     decided = _Decisions(types, propulsion, known.refusals())
     if namespace is not None and not any(topic.type_name not in TRANSFORMS for topic in listed.values()):
         decided.problems.append(
-            f"recipe read.namespace: no topic lies below {namespace}; the log holds {_listing(every.values())}"
+            f"recipe read.namespace: no topic lies below {namespace}; the log holds {listing(every.values())}"
         )
     _take_chosen(decided, listed, wanted, mapped)
     taken = {name for role in decided.roles.values() for name in role.topics}
@@ -160,7 +163,7 @@ def assign_roles(
         for role, candidates in _candidates(decided, free, settled)
         if role not in decided.roles and role not in settled
     }
-    poses = found.pop("pose", [])
+    poses, velocities = found.pop("pose", []), found.pop("gnss_velocity", [])
     robots = namespaces_of_robots({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
     if robots:
         decided.problems += _which_robot(robots)
@@ -169,6 +172,10 @@ def assign_roles(
         for role, candidates in found.items():
             _decide(decided, role, candidates)
     _decide_pose(decided, poses, taken="gnss" in {*decided.roles, *decided.undecided} or "pose" in wanted)
+    if "gnss_velocity" not in settled:
+        _decide_velocity(decided, velocities + _sentences(decided, listed.values(), ignored))
+    elif "gnss_velocity" in decided.roles and "gnss" not in decided.roles:
+        decided.problems.append(f"recipe read.topics.gnss_velocity: {_NO_FIXES}")
     problems = decided.problems + (_without_motion(decided, list(listed.values())) or _questions(decided))
     return RoleAssignment(
         name,
@@ -224,6 +231,41 @@ def _decide_pose(decided: _Decisions, candidates: Ranked, *, taken: bool) -> Non
             decided.left_out[topic.name] = f"{why} that it is another estimator's output"
 
 
+_NO_FIXES = "it goes with the fixes of its receiver, and no topic plays gnss"
+
+
+def _decide_velocity(decided: _Decisions, candidates: Ranked) -> None:
+    """Let the velocity play that comes from the receiver of the fixes; one that nobody can tell to be of it stays out, and is said."""
+    fixes = decided.roles["gnss"].topics[0] if "gnss" in decided.roles else ""
+    near = [(rank, why, topic) for rank, why, topic in candidates if _receiver(topic.name) == _receiver(fixes)]
+    best = _best("gnss_velocity", near or candidates) if candidates and fixes else []
+    why = best[0][0] if best else ""
+    if len(best) == 1:
+        topic = best[0][1]
+        decided.left_out.pop(topic.name, None)
+        decided.passed_over.get("gnss", {}).pop(topic.name, None)
+        why = why or ("the receiver's sentences" if topic.type_name == NMEA_SENTENCE else f"the only {topic.type_name}")
+        decided.roles["gnss_velocity"] = PlayedRole("gnss_velocity", (topic.name,), topic.type_name, why)
+    taken = {name for role in decided.roles.values() for name in role.topics}
+    reason = (
+        f"{best[0][1].name} fits gnss_velocity better" if len(best) == 1 else "several could" if fixes else _NO_FIXES
+    )
+    for _, _, topic in candidates:
+        if topic.name not in taken and topic.type_name != NMEA_SENTENCE:
+            decided.pass_over("gnss_velocity", topic, reason)
+
+
+def _sentences(decided: _Decisions, topics: Iterable[Topic], ignored: Sequence[str]) -> Ranked:
+    """Return the topics of NMEA sentences, which may tell places and velocities at once."""
+    rank = (ROLE_TYPES["gnss_velocity"].index(NMEA_SENTENCE),)
+    of_type = [topic for topic in topics if topic.type_name == NMEA_SENTENCE]
+    return [(rank, "", topic) for topic in of_type if _is_usable(decided, topic, ignored)]
+
+
+def _receiver(name: str) -> str:
+    return name.rpartition("/")[0]
+
+
 def _take_chosen(
     decided: _Decisions, topics: Mapping[str, Topic], chosen: Mapping[str, Sequence[str]], mapped: Collection[str]
 ) -> None:
@@ -238,7 +280,7 @@ def _take_chosen(
             decided.undecided.add(role)
             decided.problems.append(
                 f"recipe read.topics.{role} names {', '.join(missing)}, which the log does not hold; "
-                f"it holds {_listing(topics.values(), decided.types[role])}"
+                f"it holds {listing(topics.values(), decided.types[role])}"
             )
         for name in wanted:
             if topics[name].type_name not in decided.types[role] and role not in mapped:
@@ -280,6 +322,7 @@ _OF_GNSS = re.compile(r"gps|gnss|navsat|fix$|utm|ublox|novatel|septentrio|rtk")
 _VISUAL = re.compile(
     r"zed|visual|vo$|vio$|svo|rtabmap|orb$|orbslam|stereo|camera|cam$|realsense|t265|rgbd|vins|mono|okvis|vslam"
 )
+_NOT_DOPPLER = re.compile(rf"{_FUSED.pattern}|ins$|odom|wheel|cmd")
 _NO_SENSOR = ((_FUSED, "another estimator's output, not a sensor"), (_OF_GNSS, "made from GNSS"))
 _OTHER_IMU = re.compile(r"odom|zed|camera|realsense|t265|d435|d455|oak|ouster|os_?cloud|velodyne|livox|lidar|phone")
 _WHEEL = re.compile(r"wheel|velocity|base|platform|drive|diff|encoder|odom")
@@ -334,6 +377,11 @@ def _sort_gnss(topic: Topic) -> Sorted:
     return "gnss", (ROLE_TYPES["gnss"].index(topic.type_name),), ""
 
 
+def _sort_gps_fix(topic: Topic) -> Sorted:
+    role, _, why = _sort_gnss(topic)
+    return role and "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), why
+
+
 def _sort_imu(topic: Topic) -> Sorted:
     if word := _says(_OTHER_IMU, topic.name):
         return "imu", (1,), f"its name ({word}) says that it is another device's or made from odometry"
@@ -346,8 +394,6 @@ def _sort_odometry(topic: Topic) -> Sorted:
     if topic.type_name == ODOMETRY and _says(_SLAM, name) and not _says(_VISUAL, name):
         return _sort_pose(topic)
     kind = ROLE_TYPES["wheel_odometry"].index(topic.type_name)
-    if topic.type_name == TWIST_STAMPED and _says(_COMMAND, name):
-        return _sort_command(topic)
     for pattern, what in _NO_SENSOR:
         if word := _says(pattern, name):
             return None, (), f"its name ({word}) says that it is {what}"
@@ -357,6 +403,16 @@ def _sort_odometry(topic: Topic) -> Sorted:
     if topic.type_name != ODOMETRY and not explicit and not _says(_WHEEL, name):
         return None, (), "its name does not say what it measures"
     return "wheel_odometry", (int(not explicit), kind), "its name says wheels" if explicit else ""
+
+
+def _sort_twist(topic: Topic) -> Sorted:
+    """Sort a twist without a pose: of a command, of a receiver (over ground), else of an odometry."""
+    name, word = topic.name, _says(_OF_GNSS, topic.name)
+    if topic.type_name == TWIST_STAMPED and _says(_COMMAND, name):
+        return _sort_command(topic)
+    if word and not _says(_NOT_DOPPLER, name):
+        return "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), f"its name says {word}"
+    return _sort_odometry(topic)
 
 
 def _sort_pose(topic: Topic) -> Sorted:
@@ -415,10 +471,12 @@ def _bare_power(decided: _Decisions, topics: Iterable[Topic]) -> Ranked:
 
 _SORTERS: dict[str, Callable[[Topic], Sorted]] = {
     **dict.fromkeys(ROLE_TYPES["gnss"], _sort_gnss),
+    **dict.fromkeys(GPS_FIXES, _sort_gps_fix),
     **dict.fromkeys(ROLE_TYPES["command"], _sort_command),
     **dict.fromkeys(ROLE_TYPES["imu"], _sort_imu),
     **dict.fromkeys((POSE_STAMPED, POSE_WITH_COVARIANCE_STAMPED), _sort_pose),
-    **dict.fromkeys(_MEASURED_TWISTS, _sort_odometry),
+    ODOMETRY: _sort_odometry,
+    **dict.fromkeys((TWIST_STAMPED, TWIST_WITH_COVARIANCE_STAMPED), _sort_twist),
 }
 
 
@@ -433,12 +491,12 @@ def _decide(decided: _Decisions, role: str, candidates: Ranked) -> None:
     thin = _thin(role, others, topics)
     if len(first) == 1:
         better = "it covers more" if thin and len(thin) == len(others) else "it fits better"
-        better = f"{better} than {_names(others)}" if others else f"the only {topics[0].type_name}"
+        better = f"{better} than {short_list(others)}" if others else f"the only {topics[0].type_name}"
         why = first[0][0] or better
     elif role == "power" and _are_sides(rails := _rails(topics)):
         why = f"{len(rails)} sides of one robot, summed" if len(rails) > 1 else "voltage and current on two topics"
     else:
-        decided.ambiguous.append(f"role {role} is ambiguous, {len(first)} topics could play it: {_listing(topics)}")
+        decided.ambiguous.append(f"role {role} is ambiguous, {len(first)} topics could play it: {listing(topics)}")
         decided.recipe_lines.append(_recipe_line(role, names))
         decided.undecided.add(role)
         return
@@ -503,9 +561,9 @@ def _without_motion(decided: _Decisions, topics: Sequence[Topic]) -> list[str]:
     if could:
         name = next(iter(could))
         role = "gnss" if types[name] in ROLE_TYPES["gnss"] else "wheel_odometry"
-        reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:_LISTED])
+        reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
         lines.append(f'left out: {reasons}; to use one all the same: [read.topics] {role} = ["{name}"]')
-    return [*lines, *_undecodable(topics), f"the log holds {_listing(topics)}"]
+    return [*lines, *_undecodable(topics), f"the log holds {listing(topics)}"]
 
 
 def _undecodable(topics: Iterable[Topic]) -> Iterable[str]:
@@ -515,14 +573,9 @@ def _undecodable(topics: Iterable[Topic]) -> Iterable[str]:
         if topic.problem is not None and topic.message_count != 0:
             by_reason.setdefault(topic.problem, []).append(topic)
     if by_reason:
-        reasons = "; ".join(f"{_names(topics)}: {why}" for why, topics in list(by_reason.items())[:_LISTED])
-        more = f"; {len(by_reason) - _LISTED} more reasons" if len(by_reason) > _LISTED else ""
+        reasons = "; ".join(f"{short_list(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
+        more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
         yield f"topics that hold data which cannot be decoded: {reasons}{more}"
-
-
-def _names(topics: Sequence[Topic]) -> str:
-    shown = ", ".join(topic.name for topic in topics[:_LISTED])
-    return f"{shown} and {len(topics) - _LISTED} more" if len(topics) > _LISTED else shown
 
 
 def _is_motion(type_name: str) -> bool:
@@ -536,8 +589,8 @@ def _warnings(decided: _Decisions, topics: Iterable[Topic]) -> Iterable[str]:
     if "power" not in there:
         yield "no topic plays power: there will be a track but no energy"
     for role, passed in decided.passed_over.items():
-        shown = ", ".join(f"{name} ({why})" for name, why in list(passed.items())[:_LISTED])
-        yield f"{role}: left out: {shown}" + (f" and {len(passed) - _LISTED} more" if len(passed) > _LISTED else "")
+        shown = ", ".join(f"{name} ({why})" for name, why in list(passed.items())[:LISTED])
+        yield f"{role}: left out: {shown}" + (f" and {len(passed) - LISTED} more" if len(passed) > LISTED else "")
     yield from _undecodable(topics)
 
 
@@ -551,25 +604,3 @@ def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[
         and topic.message_count != 0
     ]
     return tuple(sorted(names, key=lambda name: (not name.endswith("tf_static"), name)))
-
-
-_LISTED = 8
-
-
-def _listing(topics: Iterable[Topic], types: Sequence[str] | None = None) -> str:
-    """Return topics as ``/name (type, n messages, rate)``, the longest lists cut; those of ``types`` only, where there are any."""
-    every = list(topics)
-    of_type = [topic for topic in every if types is not None and topic.type_name in types]
-    chosen = of_type or every
-    shown = ", ".join(_described(topic) for topic in chosen[:_LISTED])
-    more = f", and {len(chosen) - _LISTED} more" if len(chosen) > _LISTED else ""
-    return shown + more if chosen else "no topic at all"
-
-
-def _described(topic: Topic) -> str:
-    parts = [topic.type_name]
-    if topic.message_count is not None:
-        parts.append(f"{topic.message_count} messages")
-        if topic.start_ns is not None and topic.end_ns is not None and topic.end_ns > topic.start_ns:
-            parts.append(f"{(topic.message_count - 1) / (topic.end_ns - topic.start_ns) * 1e9:.3g} Hz")
-    return f"{topic.name} ({', '.join(parts)})"

@@ -117,7 +117,8 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
 
 def _indexed(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
     """Return what the index tells of a topic."""
-    played = next(((name, role.why) for name, role in cast.roles.items() if topic.name in role.topics), None)
+    mine = {name: role.why for name, role in cast.roles.items() if topic.name in role.topics}
+    played = (", ".join(mine), "; ".join(mine.values())) if mine else None
     if topic.name in cast.transforms:
         played = "transforms", "places the sensors"
     role, why = played or (None, cast.left_out.get(topic.name) or topic.problem)

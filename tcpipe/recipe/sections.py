@@ -21,8 +21,8 @@ from tcpipe.tables.findings import LEFT_OUT
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 
-Role = Literal["gnss", "imu", "wheel_odometry", "visual_odometry", "power", "command", "pose"]
-MappedRole = Literal["gnss", "imu", "wheel_odometry", "visual_odometry", "command", "pose"]
+Role = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "power", "command", "pose"]
+MappedRole = Literal["gnss", "gnss_velocity", "imu", "wheel_odometry", "visual_odometry", "command", "pose"]
 """Roles whose messages can be mapped; power has tables of its own, [[power_sources]]."""
 MadeFrom = Literal["imu", "wheel_odometry", "visual_odometry"]
 Fraction = Annotated[float, Ge(0), Le(1)]
@@ -69,7 +69,7 @@ class ReadConfig:
     __pydantic_config__ = _STRICT
 
     topics: dict[Role, list[str]] = field(default_factory=dict)
-    """Topics by role (gnss, imu, wheel_odometry, visual_odometry, power, command, pose), where they cannot be found by type and profile."""
+    """Topics by role (gnss, gnss_velocity, imu, wheel_odometry, visual_odometry, power, command, pose), where their types do not tell."""
     ignore_topics: list[str] = field(default_factory=list)
     """Topics that play no role whatever their type."""
     fields: dict[MappedRole, dict[str, str]] = field(default_factory=dict, metadata=LEFT_OUT)
@@ -121,6 +121,8 @@ class FuseConfig:
     """No GNSS standard deviation is taken below this, whatever the receiver says [m]."""
     gnss_default_std_m: Deviation = 0.05
     """Horizontal standard deviation where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
+    gnss_velocity_std_mps: Deviation = field(default=0.1, metadata=LEFT_OUT)
+    """Standard deviation of a receiver's own velocity where it gives none (NMEA never does) [m/s]; vertical is twice as large."""
     wheel_std_mps: Deviation = 0.05
     """Standard deviation of wheel velocity where the source gives none [m/s]."""
     visual_std_mps: Deviation = 0.05

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.formats.logs.writing import MessageStream
-from tcpipe.simulation.sensors import Gnss, Imu, Mounting, Power, Reading, Sensors, Visual, Wheels
+from tcpipe.simulation.sensors import Doppler, Gnss, Imu, Mounting, Power, Reading, Sensors, Visual, Wheels
 
 Dialect = Literal["ros1", "ros2"]
 PowerType = Literal["husky_status", "clearpath_power", "battery_state", "battery_states"]
@@ -18,6 +18,7 @@ PowerType = Literal["husky_status", "clearpath_power", "battery_state", "battery
 TOPICS: dict[Dialect, dict[str, str]] = {
     "ros1": {
         "gnss": "/navsat/fix",
+        "doppler": "/navsat/fix_velocity",
         "imu": "/imu/data",
         "wheels": "/husky_velocity_controller/odom",
         "visual": "/zed2/zed_node/odom",
@@ -27,6 +28,7 @@ TOPICS: dict[Dialect, dict[str, str]] = {
     },
     "ros2": {
         "gnss": "/a200_0000/sensors/gps_0/fix",
+        "doppler": "/a200_0000/sensors/gps_0/fix_velocity",
         "imu": "/a200_0000/sensors/imu_0/data",
         "wheels": "/a200_0000/platform/odom",
         "visual": "/a200_0000/zed/zed_node/odom",
@@ -69,17 +71,20 @@ def streams(
 def _messages(topic: str, reading: Reading, sensor: object, recorder: Recorder, geoid_m: float) -> list[MessageStream]:
     match sensor:
         case Gnss():
-            return [_gnss(topic, reading) if recorder.gnss == "fix" else _nmea(reading, geoid_m)]
+            made = [_gnss(topic, reading) if recorder.gnss == "fix" else _nmea(reading, geoid_m)]
+        case Doppler():
+            made = [_doppler(topic, reading)]
         case Imu():
-            return [_imu(topic, reading, sensor)]
+            made = [_imu(topic, reading, sensor)]
         case Wheels():
-            return [_wheels(topic, reading, sensor)]
+            made = [_wheels(topic, reading, sensor)]
         case Visual():
-            return [_visual(topic, reading, sensor)]
+            made = [_visual(topic, reading, sensor)]
         case Power():
-            return _power(topic, reading, recorder.power)
+            made = _power(topic, reading, recorder.power)
         case _:
-            return [_command(topic, reading, recorder.dialect)]
+            made = [_command(topic, reading, recorder.dialect)]
+    return made
 
 
 def _stream(
@@ -105,6 +110,12 @@ def _gnss(topic: str, reading: Reading) -> MessageStream:
     columns |= {"position_covariance": values["covariance"], "position_covariance_type": values["covariance_type"]}
     columns |= {"status.status": values["status"]}
     return _stream(topic, "sensor_msgs/msg/NavSatFix", reading, _FRAMES["gnss"], columns, status__service=1)
+
+
+def _doppler(topic: str, reading: Reading) -> MessageStream:
+    columns = _vector("twist.twist.linear", reading.values["velocity_enu_mps"])
+    columns |= {"twist.covariance": reading.values["covariance"]}
+    return _stream(topic, "geometry_msgs/msg/TwistWithCovarianceStamped", reading, _FRAMES["gnss"], columns)
 
 
 def _nmea(reading: Reading, geoid_m: float) -> MessageStream:

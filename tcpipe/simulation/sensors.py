@@ -77,6 +77,20 @@ class Gnss:
 
 
 @dataclass(frozen=True, slots=True)
+class Doppler:
+    """The receiver's own velocity: east, north, up of its antenna."""
+
+    rate_hz: float = 10.0
+    std_mps: float = 0.03
+    """White, east and north; twice that up."""
+    lasting_std_mps: float = 0.04
+    """Of the part that the receiver's filter and multipath make last."""
+    lasts_s: float = 1.5
+    mounting: Mounting = Mounting((0.1, 0.0, 0.9))
+    delay_s: float = 0.06
+
+
+@dataclass(frozen=True, slots=True)
 class Wheels:
     """Wheel odometry; its pose is its own dead reckoning."""
 
@@ -167,19 +181,22 @@ class Sensors:
     visual: Visual | None = field(default_factory=Visual)
     power: Power | None = field(default_factory=Power)
     command: Command | None = field(default_factory=Command)
+    doppler: Doppler | None = None
 
     def mounted(self, faults: Faults) -> Sensors:
         """Return the sensors where they really sit: at base_link unless the fault that moves them is on."""
         moved = self
         if self.gnss is not None and not faults.gnss_lever_arm:
             moved = replace(moved, gnss=replace(self.gnss, mounting=AT_BASE_LINK))
+        if self.doppler is not None and not faults.gnss_lever_arm:
+            moved = replace(moved, doppler=replace(self.doppler, mounting=AT_BASE_LINK))
         if self.imu is not None and not faults.imu_mounting:
             moved = replace(moved, imu=replace(self.imu, mounting=AT_BASE_LINK))
         return moved
 
 
 def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: Noise) -> dict[str, Reading]:
-    """Return what all sensors said of a drive, by sensor (gnss, imu, wheels, visual, power, command); ``sensors`` as mounted."""
+    """Return what all sensors said of a drive, by sensor (gnss, imu, wheels, visual, power, command, doppler); ``sensors`` as mounted."""
     readings: dict[str, Reading] = {}
     if sensors.gnss is not None:
         readings["gnss"] = read_gnss(truth, site, sensors.gnss, faults, noise)
@@ -193,6 +210,8 @@ def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: No
         readings["power"] = read_power(truth, sensors.power, faults, noise)
     if sensors.command is not None:
         readings["command"] = read_command(truth, sensors.command, faults, noise)
+    if sensors.doppler is not None:
+        readings["doppler"] = read_doppler(truth, sensors.doppler, faults, noise)
     readings = {name: _offset(name, reading, sensors, faults) for name, reading in readings.items()}
     if faults.clock_step:
         middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
@@ -245,6 +264,26 @@ def read_gnss(truth: Truth, site: Site, sensor: Gnss, faults: Faults, noise: Noi
         )
     log_time = _log_times(stamp, sensor.delay_s, faults, noise("gnss.delay"))
     return _repeated(_kept(Reading(said, log_time, values), keep), faults, noise("gnss.duplicates"))
+
+
+def read_doppler(truth: Truth, sensor: Doppler, faults: Faults, noise: Noise) -> Reading:
+    """Return velocity_enu_mps of the antenna, (N, 3), and what the receiver claims of it, covariance (N, 36)."""
+    stamp = _sample_times(truth, sensor.rate_hz, noise("gnss.phase"))
+    place = truth.enu_m + rotate(truth.quat_xyzw, np.array(sensor.mounting.xyz_m))
+    velocity = _interpolated(np.gradient(place, truth.stamp_ns * 1e-9, axis=0), truth, stamp)
+    axes = np.array([1.0, 1.0, 2.0])
+    if faults.gnss_noise:
+        kept = float(np.exp(-1.0 / (sensor.rate_hz * sensor.lasts_s)))
+        white = noise("doppler.lasting").standard_normal((3, stamp.size))
+        lasting = np.stack([correlated_noise(np.ascontiguousarray(row), kept) for row in white], axis=-1)
+        scatter = noise("doppler.noise").standard_normal((stamp.size, 3))
+        velocity = velocity + axes * (sensor.lasting_std_mps * lasting + sensor.std_mps * scatter)
+    covariance = np.zeros((stamp.size, 36))
+    covariance[:, [0, 7, 14]] = np.square(axes * np.hypot(sensor.std_mps, sensor.lasting_std_mps))
+    covariance[:, [21, 28, 35]] = -1.0  # a receiver measures no turns
+    return _finish(
+        stamp, sensor.delay_s, {"velocity_enu_mps": velocity, "covariance": covariance}, faults, noise, name="doppler"
+    )
 
 
 def read_wheels(truth: Truth, sensor: Wheels, faults: Faults, noise: Noise) -> Reading:

@@ -15,7 +15,7 @@ from tcpipe.fusion import preparation
 from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.odometry_scale import Scale
 from tcpipe.fusion.checks.stamp_jitter import steadied
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.fusion.preparation import Prepared
 from tcpipe.recipe import FuseConfig
 from tcpipe.tables.arrays import rows_where
@@ -52,7 +52,7 @@ class FusionInputs:
 
 def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
     """Turn the motion streams into measurements, one set a clock epoch."""
-    tables = {role: streams.tables[role] for role in (GNSS, IMU, WHEELS, VISUAL) if role in streams.tables}
+    tables = {role: streams.tables[role] for role in (GNSS, DOPPLER, IMU, WHEELS, VISUAL) if role in streams.tables}
     datum = None
     if GNSS in tables:
         fixes = FloatColumns(tables[GNSS])
@@ -65,6 +65,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
         inputs.remarks += remarks
         inputs.measurements[epoch] = Measurements(
             gnss=gnss,
+            doppler=found.get(DOPPLER),
             imu=found.get(IMU),
             wheels=found.get(WHEELS),
             visual=found.get(VISUAL),
@@ -89,6 +90,8 @@ def _prepare(role: str, table: pa.Table, sensor: Sensor, config: FuseConfig, inp
             default_std_m=config.gnss_default_std_m,
             floor_std_m=config.gnss_std_floor_m,
         )
+    elif role == DOPPLER:
+        made, prepared = preparation.ground_velocities(stamp_ns, columns, default_std_mps=config.gnss_velocity_std_mps)
     elif role == IMU:
         made, prepared = preparation.inertial(
             stamp_ns,

@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from tcpipe.fusion.checks.doppler import doubt_of_velocity
 from tcpipe.fusion.checks.sensors import CommandedSpeed, Refusal, check_sensors
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, Measurements
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.tables.arrays import rows_where
@@ -28,7 +29,16 @@ def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, F
     checks = check_sensors(
         inputs.measurements[epoch], command=command_of(streams, epoch), stated=stated, felt=_felt(streams)
     )
-    return left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
+    sane, found = left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
+    doubt = doubt_of_velocity(sane.measurements[epoch])
+    if doubt is None:
+        return sane, found
+    sane, found = left_out(sane, found, [Refusal(DOPPLER, doubt.why)], streams)
+    given_s = streams.findings.facts.time_offset_s.get(DOPPLER, 0.0)
+    mend = f"; its clock is set by the recipe, under [read.time_offset_s]: {DOPPLER} = {given_s - (doubt.late_s or 0.0):.2f}"
+    return sane, found if doubt.late_s is None else replace(
+        found, warnings=(*found.warnings[:-1], found.warnings[-1] + mend)
+    )
 
 
 def left_out(
@@ -48,6 +58,7 @@ def _without(refused: frozenset[str], m: Measurements) -> Measurements:
     return replace(
         m,
         gnss=None if GNSS in refused else m.gnss,
+        doppler=None if refused & {GNSS, DOPPLER} else m.doppler,
         imu=None if IMU in refused else m.imu,
         wheels=None if WHEELS in refused else m.wheels,
         visual=None if VISUAL in refused else m.visual,

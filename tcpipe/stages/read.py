@@ -44,17 +44,17 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     if assignment.problems:
         raise RoleError(*assignment.problems)
     # 2. Messages to SI columns; what cannot be used is counted.
-    played = [topic for role in assignment.roles.values() for topic in role.topics]
+    played = dict.fromkeys(topic for role in assignment.roles.values() for topic in role.topics)
     tables = log.tables([*played, *assignment.static_transforms])
     every, power, unread = read_sources(tables, log.topics, assignment, config, known=known)
     # 3. Every stamp on one clock, every epoch common to all.
     clocks = settle_clocks(
-        {source.topic: _times(source, config) for source in every if len(source.readings.row)},
+        {source.key: _times(source, config) for source in every if len(source.readings.row)},
         clock_published=any(topic.type_name == CLOCK and topic.message_count for topic in log.topics.values()),
     )
     timelines = clocks.timelines
     # 4. One checked table a role, and where its sensor sits.
-    sources = [source for source in every if source.topic in timelines]
+    sources = [source for source in every if source.key in timelines]
     streams: dict[str, pa.Table] = {
         role: role_table(role, sources, timelines, power) for role in dict.fromkeys(source.role for source in sources)
     }

@@ -38,7 +38,7 @@ def read_findings(
     simulated = clocks.simulated.remark() if clocks.simulated else None
     warnings = [*assignment.warnings, *([simulated] if simulated else []), *power.warnings]
     for source in sources:
-        warnings += _warnings(source, timelines.get(source.topic))
+        warnings += _warnings(source, timelines.get(source.key))
     warnings += [
         f"clock: header minus log time steps by {step.step_s:+.3f} s at log time {step.log_time_ns} ns on {', '.join(step.topics)}: "
         "a new epoch begins there, and nothing is integrated across it"
@@ -61,7 +61,7 @@ def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]
     rows = len(source.columns["log_time_ns"])
     yield from (f"{name}: {text}" for text in source.readings.warnings)
     dropped = source.readings.dropped | (timeline.dropped if timeline is not None else {})
-    unexpected = {reason: count for reason, count in dropped.items() if reason != "not_gga"}
+    unexpected = {reason: count for reason, count in dropped.items() if reason not in {"not_gga", "no_velocity"}}
     if sum(unexpected.values()) > _MANY_DROPPED * rows:
         counts = ", ".join(f"{reason} {count}" for reason, count in unexpected.items())
         lost = f"{name}: {sum(unexpected.values())} of {rows} messages are not used ({counts})"
@@ -89,8 +89,8 @@ def _role_facts(
     timelines: Mapping[str, Timeline],
     sensor: Sensor,
 ) -> RoleFacts:
-    played = [source for source in sources if source.role == role and source.topic in timelines]
-    topics = {source.topic: _topic_facts(source, timelines[source.topic]) for source in played}
+    played = [source for source in sources if source.role == role and source.key in timelines]
+    topics = {source.topic: _topic_facts(source, timelines[source.key]) for source in played}
     return RoleFacts(assignment.roles[role].why, sensor.frame_id, sensor.placed_by, topics)
 
 

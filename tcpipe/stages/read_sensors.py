@@ -18,7 +18,8 @@ from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_sources import TopicReadings
 from tcpipe.tables.levels import Sensor
 
-_WITHOUT_PLACE = ("power", "command")
+_WITHOUT_PLACE = ("power", "command", "gnss_velocity")
+"""A receiver's velocity is that of its antenna, which the fixes place."""
 
 
 def place_sensors(
@@ -63,7 +64,7 @@ def place_sensors(
             xyz_m=(float(pose.xyz_m[0]), float(pose.xyz_m[1]), float(pose.xyz_m[2])),
             quat_xyzw=tuple(float(component) for component in pose.quat_xyzw),  # type: ignore[arg-type]
             placed_by=placed_by,
-            time_source=timelines[of_role[role][0].topic].source,
+            time_source=timelines[of_role[role][0].key].source,
         )
     return sensors, warnings
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import pyarrow as pa
@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from tcpipe.errors import RoleError
 from tcpipe.logs.imu_units import imu_in_si
 from tcpipe.logs.mapped import MAPPED_TYPES, mapped_message
-from tcpipe.logs.messages import Readings, needed_fields, read_messages
+from tcpipe.logs.messages import Readings, frames, needed_fields, read_messages
 from tcpipe.logs.odometry_scale import scaled
+from tcpipe.logs.placements import is_base
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.power.readings import PowerReadings
@@ -33,6 +34,14 @@ class TopicReadings:
     type_name: str
     columns: Mapping[str, NDArray[Any]]
     readings: Readings
+
+    @property
+    def key(self) -> str:
+        """What tells it from others: a topic may tell places and velocities at once."""
+        return f"{self.topic} ({VELOCITY})" if self.role == VELOCITY else self.topic
+
+
+VELOCITY: Role = "gnss_velocity"
 
 
 def read_sources(
@@ -55,10 +64,10 @@ def read_sources(
     power : the rails, empty where there is no power or it was refused.
     warnings : topics that play a role but cannot be decoded.
     """
-    role_of = {topic: cast("Role", role.name) for role in assignment.roles.values() for topic in role.topics}
+    played = [(cast("Role", role.name), topic) for role in assignment.roles.values() for topic in role.topics]
     warnings: list[str] = []
-    arrays: dict[str, Mapping[str, NDArray[Any]]] = {}
-    for topic, role in role_of.items():
+    arrays: dict[tuple[Role, str], Mapping[str, NDArray[Any]]] = {}
+    for role, topic in played:
         if topic not in tables:
             warnings.append(f"{role}: {topic} cannot be decoded and plays no part (see the log's damage)")
             continue
@@ -67,27 +76,49 @@ def read_sources(
         if missing := [name for name in needed if name not in found]:
             warnings.append(f"{role}: {topic} plays no part, its messages have no field {', '.join(missing)}")
         else:
-            arrays[topic] = found
-    types = {topic: topics[topic].type_name for topic in arrays}
+            arrays[role, topic] = found
+    types = {topic: topics[topic].type_name for _, topic in arrays}
     power = power_of_topics(
-        {topic: (types[topic], arrays[topic]) for topic in arrays if role_of[topic] == "power"},
+        {topic: (types[topic], columns) for (role, topic), columns in arrays.items() if role == "power"},
         assignment,
         config,
         known=known,
     )
     sources = []
-    for topic, columns in arrays.items():
-        role = role_of[topic]
+    for (role, topic), columns in arrays.items():
         if role != "power":
             readings = read_messages(columns, role, _type_of(topics[topic], role, config))
             if role == "imu":
                 readings = imu_in_si(readings, config.imu_units)
+            elif role == VELOCITY and role not in config.topics:
+                readings = _over_ground(readings, frames(columns, types[topic]))
             elif role in config.odometry_scale:
                 readings = scaled(readings, config.odometry_scale[role])
             sources.append(TopicReadings(topic, role, types[topic], columns, readings))
         elif topic in power.rails:
             sources.append(TopicReadings(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))
     return sources, power, warnings
+
+
+def _over_ground(readings: Readings, named: Mapping[str, int]) -> Readings:
+    """Return a receiver's velocities, none where its messages say that they are in the body's frame."""
+    frame = next(iter(named), "")
+    if not is_base(frame):
+        return readings
+    why = (
+        f"its frame is {frame!r}: of the body, or of the antenna over ground, nobody can tell, so it is not used; if it is east, "
+        f"north, up, name it in the recipe, under [read.topics]: {VELOCITY}"
+    )
+    none = {name: values[:0] for name, values in readings.columns.items()}
+    header_ns = None if readings.header_ns is None else readings.header_ns[:0]
+    return replace(
+        readings,
+        row=readings.row[:0],
+        log_time_ns=readings.log_time_ns[:0],
+        header_ns=header_ns,
+        columns=none,
+        warnings=(why,),
+    )
 
 
 def _type_of(topic: Topic, role: Role, config: ReadConfig) -> str:

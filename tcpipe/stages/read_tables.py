@@ -23,7 +23,7 @@ def role_table(
     parts = []
     for source in sources:
         if source.role == role:
-            parts += list(_parts(source, timelines[source.topic], power))
+            parts += list(_parts(source, timelines[source.key], power))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     order = np.lexsort((columns["stamp_ns"], columns["epoch"]))
     return STREAMS[role].table(**{name: values[order] for name, values in columns.items()})

@@ -44,6 +44,7 @@ _METADATA_KEY = b"tcpipe"
 
 _F64 = pa.float64()
 _I64 = pa.int64()
+_ENU = ("east", "north", "up")
 
 _STAMP = Column("stamp_ns", _I64, "ns", "time of measurement, UTC, since 1970 (or since the epoch of simulated time)")
 _LOG_TIME = Column("log_time_ns", _I64, "ns", "time the recorder received the message")
@@ -171,6 +172,23 @@ VISUAL_ODOMETRY = _odometry(
     "visual_odometry", "Visual odometry: a body twist, or poses to be used as increments, in its own child frame."
 )
 
+GNSS_VELOCITY = TableSchema(
+    "gnss_velocity",
+    "L1",
+    "Velocity of the antenna over ground as its receiver tells it (Doppler).",
+    (
+        _STAMP,
+        _LOG_TIME,
+        _EPOCH,
+        *(Column(f"{axis}_velocity_mps", _F64, "m/s", f"velocity {axis}", "enu", axis == "up") for axis in _ENU),
+        *(
+            Column(f"{axis}_var_m2ps2", _F64, "m2/s2", f"its variance {axis}; null: not told", "enu", True)
+            for axis in _ENU
+        ),
+        Column("fix_status", pa.int8(), "1", "NavSatStatus as in gnss; -1 where the message tells none"),
+    ),
+)
+
 POWER = TableSchema(
     "power",
     "L1",
@@ -224,7 +242,7 @@ POSE = TableSchema(
 )
 
 STREAMS: dict[str, TableSchema] = {
-    schema.name: schema for schema in (GNSS, IMU, WHEEL_ODOMETRY, VISUAL_ODOMETRY, POWER, COMMAND, POSE)
+    schema.name: schema for schema in (GNSS, GNSS_VELOCITY, IMU, WHEEL_ODOMETRY, VISUAL_ODOMETRY, POWER, COMMAND, POSE)
 }
 """Schema of each role's table."""
 

@@ -8,6 +8,7 @@ what         the sensor's                                 the track's
 position     median place of the fixes, east and north    antenna at their stamps
 displacement median of its later fixes less the earlier   the same of the antenna
 displacement integral of an odometry's velocity           way along its own axes (wheels: forward only)
+displacement integral of the receiver's own velocity      the same of the antenna
 turn         integral of a rate about the vertical axis   change of attitude about it
 ============ ============================================ =====================================================
 
@@ -31,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.gates import chi_square_gate
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
+from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
 from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
@@ -235,6 +236,14 @@ def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64])
 
     if m.gnss is not None:
         yield from _fixes(found, rotation, m.gnss, windows, way_std)
+    if m.gnss is not None and m.doppler is not None:
+        said = means(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2]) * step_s
+        antenna = (found.position_enu_m + rotation @ np.asarray(m.gnss.lever_arm_m))[:, :2]
+        moved = _sums(said - np.diff(antenna, axis=0), windows)
+        # It errs alike for a second: so long each of its errors lasts.
+        std = np.hypot(_LASTING_MPS * _WINDOW_S, np.sqrt(np.median(m.doppler.variance_m2ps2[:, :2]) * _WINDOW_S))
+        difference = _ahead_and_aside(moved, rotation[windows.sum(1) // 2])
+        yield Comparison(DOPPLER, "displacement", difference, np.full(way_std.size, std), way_std)
     if m.imu is not None:
         rate = means(m.imu.stamp_ns, m.imu.angular_velocity_radps[:, 2:]) * step_s
         noise = m.imu.gyro_std_radps * np.sqrt(median_period_ns(m.imu.stamp_ns) * 1e-9)
@@ -329,12 +338,16 @@ def _fixes(
         _medians(fix_s[fed], off[fed], claim[fed], *half) for half in ((begin, middle), (middle, end))
     )
     moved = 2.0 * (last - first)
-    ahead = rotation[windows.sum(1) // 2, :2, 0]
-    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
-    along = np.sum(moved * ahead, axis=1)
-    aside = moved[:, 1] * ahead[:, 0] - moved[:, 0] * ahead[:, 1]
     claimed = 2.0 * np.hypot(first_std, last_std)
-    yield Comparison(GNSS, "displacement", np.column_stack((along, aside)), claimed, way_std)
+    difference = _ahead_and_aside(moved, rotation[windows.sum(1) // 2])
+    yield Comparison(GNSS, "displacement", difference, claimed, way_std)
+
+
+def _ahead_and_aside(moved: Floats, rotation: Floats) -> Floats:
+    """Return horizontal displacements (W, 2) along and aside of bodies whose attitudes are (W, 3, 3)."""
+    ahead = rotation[:, :2, 0] / np.linalg.norm(rotation[:, :2, 0], axis=1, keepdims=True)
+    aside = moved[:, 1] * ahead[:, 0] - moved[:, 0] * ahead[:, 1]
+    return np.column_stack((np.sum(moved * ahead, axis=1), aside))
 
 
 def _medians(at_s: Floats, values: Floats, claim: Floats, begin_s: Floats, end_s: Floats) -> tuple[Floats, Floats]:

@@ -183,11 +183,11 @@ def _signals(m: Measurements, power: PowerSignal | None, at_ns: NDArray[np.int64
         yield from _against_imu(m.imu, twists, m.gnss, at_ns)
     speeds = {role: averaged(np.abs(of[:, :1]), _ODOMETRY_S) for role, of in twists.items()}
     if len(twists) == 2:
-        yield VISUAL, WHEELS, SPEED, *_where_it_changes(speeds[VISUAL], speeds[WHEELS])
+        yield VISUAL, WHEELS, SPEED, *where_it_changes(speeds[VISUAL], speeds[WHEELS])
     for role, twist in twists.items():
         if m.gnss is not None:
             seen = averaged(averaged(_antenna_speed(twist, m.gnss.lever_arm_m), FIXES_S), FIXES_S)
-            yield GNSS, role, SPEED, *_where_it_changes(np.abs(fix_velocity(m.gnss, at_ns))[:, None], seen)
+            yield GNSS, role, SPEED, *where_it_changes(np.abs(fix_velocity(m.gnss, at_ns))[:, None], seen)
     if power is not None and twists:
         role = next(iter(twists))
         yield POWER, role, "power of speed, acceleration and turning", *_power(power, twists[role], at_ns)
@@ -224,7 +224,7 @@ def _changes(speed: Floats, force: Floats) -> tuple[Floats, Floats]:
     return np.where(lively, rate, np.nan), _quick(force)
 
 
-def _where_it_changes(target: Floats, seen: Floats) -> tuple[Floats, Floats]:
+def where_it_changes(target: Floats, seen: Floats) -> tuple[Floats, Floats]:
     """Return two speeds (M, 1) without their slow parts, the first only near changes of the second."""
     quick = _quick(seen)
     return np.where(_beside(np.abs(quick[:, 0]) > _CHANGES_MPS), _quick(target)[:, 0], np.nan), quick

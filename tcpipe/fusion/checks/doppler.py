@@ -1,0 +1,126 @@
+"""A receiver's own velocity against the fixes of the same receiver, before it is fused: it helps, so where it is in doubt it stays out.
+
+Its integral over windows is held against the displacement of the fixes. Windows are as long as it takes for the way in them to be far
+longer than the fixes are noisy. Zero while the fixes move is a frozen one; a way as long as theirs in other directions is that of another
+frame; one that is late or early against the odometry, or the fixes, is off by what the robot's velocity changes meanwhile.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tcpipe.fusion.checks.clock_offsets import where_it_changes
+from tcpipe.fusion.checks.gridded_motion import FIXES_S, fix_velocity, on_grid, twist_on_grid
+from tcpipe.fusion.checks.lags import Floats, Lag, averaged, find_lag
+from tcpipe.fusion.checks.windows import liveliest_ns
+from tcpipe.fusion.measurements import GroundVelocities, Measurements, Positions
+from tcpipe.fusion.signals import in_gap, integral, median_period_ns, seconds
+
+_WINDOWS_S = (4.0, 8.0, 16.0, 32.0, 64.0)
+_FEWEST_WINDOWS = 3
+_CLEARLY = 4.0
+_MOVES_M = 1.0
+_OFF = 0.25
+_STANDS = 0.1
+_LATE_S, _SURE, _MAX_STD_S, _MIN_EXPLAINED = 0.05, 4.0, 0.03, 0.5
+_MAX_GAP_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """Why a receiver's velocity is not fused; ``late_s`` where its stamps alone are off [s]."""
+
+    why: str
+    late_s: float | None = None
+
+
+def doubt_of_velocity(m: Measurements) -> Doubt | None:
+    """Return why the receiver's velocity of a clock epoch is not to be fused; None where the fixes confirm it."""
+    if m.doppler is None:
+        return None
+    if m.gnss is None:
+        return Doubt("no fixes of its receiver are fused, and nothing else tells its frame")
+    windows = _ways(m.gnss, m.doppler)
+    if windows is None:
+        return Doubt("the fixes do not show where it goes, so nothing tells that it is east, north, up")
+    return _frame(*windows) or _lateness(m)
+
+
+def _ways(gnss: Positions, doppler: GroundVelocities) -> tuple[NDArray[np.complex128], NDArray[np.complex128]] | None:
+    """Return the way by the fixes and by the velocity in windows [m], east and i times north; None where the fixes show too little."""
+    noise_m = float(np.sqrt(2.0 * np.median(gnss.variance_m2[:, :2])))
+    zero = int(gnss.stamp_ns[0])
+    fix_s = seconds(gnss.stamp_ns, zero)
+    east_north = np.array([1.0, 1j])
+    longest_ns = max(_MAX_GAP_NS, 3 * median_period_ns(doppler.stamp_ns))
+    for window_s in _WINDOWS_S:
+        last = np.searchsorted(fix_s, fix_s + window_s)
+        first = np.flatnonzero(last < fix_s.size)
+        last = last[first]
+        whole = ~in_gap(doppler.stamp_ns, gnss.stamp_ns[first], gnss.stamp_ns[last], longest_ns=longest_ns)
+        first, last = first[whole], last[whole]
+        by_fixes = (gnss.position_enu_m[last, :2] - gnss.position_enu_m[first, :2]) @ east_north
+        far = np.abs(by_fixes) > max(_MOVES_M, _CLEARLY * noise_m)
+        apart = max(1, round(window_s * 1e9 / median_period_ns(gnss.stamp_ns)))
+        if far.sum() < _FEWEST_WINDOWS * apart:
+            continue
+        total = integral(seconds(doppler.stamp_ns, zero), doppler.velocity_enu_mps[:, :2], fix_s) @ east_north
+        return by_fixes[far], (total[last] - total[first])[far]
+    return None
+
+
+def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128]) -> Doubt | None:
+    """Return what is wrong with the directions or the size of the velocity."""
+
+    def off(told: NDArray[np.complex128]) -> float:
+        return float(np.median(np.abs(by_fixes - told) / np.abs(by_fixes)))
+
+    if off(by_velocity) <= _OFF:
+        return None
+    size = float(np.median(np.abs(by_velocity) / np.abs(by_fixes)))
+    if size < _STANDS:
+        return Doubt("it is zero while the fixes move")
+    if off(1j * np.conj(by_velocity)) <= _OFF:
+        return Doubt("north and east are exchanged against the fixes (north, east, down?)")
+    if abs(size - 1.0) <= _OFF:
+        return Doubt("it is as fast as the fixes but goes elsewhere (a velocity of the body, or in another frame?)")
+    return Doubt(
+        f"it goes {size:.2g} times as far as the fixes, {100 * off(by_velocity):.0f} % of the way off (another unit or frame?)"
+    )
+
+
+def _lateness(m: Measurements) -> Doubt | None:
+    """Return by how much its stamps are off, where the first odometry, or without one the fixes, surely show it."""
+    at_ns = liveliest_ns(m)
+    if at_ns is None or m.doppler is None or m.gnss is None:
+        return None
+    speed = np.linalg.norm(on_grid(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns), axis=1)[:, None]
+    odometry = next(iter(m.odometries().values()), None)
+    seen = np.abs(fix_velocity(m.gnss, at_ns))[:, None] if odometry is None else _antenna(m, at_ns)
+    smooth_s = FIXES_S if odometry is None else _SMOOTH_S
+    lag = find_lag(*where_it_changes(averaged(speed, smooth_s), averaged(seen, smooth_s)))
+    if lag is None or not _is_sure(lag):
+        return None
+    against = "the fixes" if odometry is None else next(iter(m.odometries()))
+    how = "late" if lag.offset_s > 0 else "early"
+    return Doubt(
+        f"its stamps are {abs(lag.offset_s):.2f} s {how} against {against} (± {2 * lag.std_s:.2f} s)", lag.offset_s
+    )
+
+
+_SMOOTH_S = 0.3
+
+
+def _antenna(m: Measurements, at_ns: NDArray[np.int64]) -> Floats:
+    """Return the antenna's speed by the first odometry [m/s], shape (M, 1)."""
+    forward, yaw_rate = twist_on_grid(next(iter(m.odometries().values())), at_ns).T
+    ahead, left, _ = (0.0, 0.0, 0.0) if m.gnss is None else m.gnss.lever_arm_m
+    return np.asarray(np.hypot(forward - yaw_rate * left, yaw_rate * ahead)[:, None])
+
+
+def _is_sure(lag: Lag) -> bool:
+    known = lag.std_s <= _MAX_STD_S and lag.explained >= _MIN_EXPLAINED
+    return known and abs(lag.offset_s) > max(_LATE_S, _SURE * lag.std_s)
