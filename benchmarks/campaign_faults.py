@@ -1,7 +1,7 @@
 """What the campaign tries: sets of sensors, rates, and faults, each fault one entry; a cell is a set at a rate under a fault.
 
 To add a fault, write an entry of `FAULTS` (see `Fault` in `campaign_drives.py`) and, where it wants another set of sensors or rate
-than all of them at 10 Hz, a line in `_elsewhere`.
+than all of them at 10 Hz, a line in `_ELSEWHERE`.
 """
 
 from __future__ import annotations
@@ -15,8 +15,9 @@ import numpy as np
 from campaign_drives import Drive, Fault, Messages, Readings
 
 from tcpipe.formats.logs.writing import MessageStream
+from tcpipe.geometry.rotation import inverse, rotate
 from tcpipe.simulation.messages import TOPICS
-from tcpipe.simulation.sensors import Gnss, Mounting, Power, Reading, Sensors
+from tcpipe.simulation.sensors import Doppler, Gnss, Mounting, Power, Reading, Sensors
 
 MINUTE_S = (90.0, 150.0)
 """The window of faults that last a minute."""
@@ -40,6 +41,9 @@ SETS: dict[str, frozenset[str]] = {
     "visual alone": frozenset({"gnss", "imu", "wheels"}),
 }
 """By name, the sensors left out."""
+DOPPLER = ", Doppler"
+"""At the end of a set's name: its receiver tells its own velocity as well."""
+SETS |= {f"{name}{DOPPLER}": left for name, left in SETS.items() if "gnss" not in left}
 
 
 @dataclass(frozen=True)
@@ -62,8 +66,8 @@ class Cell:
     def fitted(self) -> Sensors:
         """The robot's sensors before the fault."""
         left = dict.fromkeys(SETS[self.sensors] | self.without)
-        gnss = Gnss(rate_hz=self.gnss_hz)
-        return replace(Sensors(), **({"gnss": gnss} | left))
+        doppler = Doppler(rate_hz=self.gnss_hz) if self.sensors.endswith(DOPPLER) else None
+        return replace(Sensors(), **({"gnss": Gnss(rate_hz=self.gnss_hz), "doppler": doppler} | left))
 
 
 def _of(role: str, change: Callable[[Reading, Drive], Reading]) -> Callable[[Readings, Drive], Readings]:
@@ -269,6 +273,16 @@ def _odometry_covariance(value: np.ndarray) -> Callable[[Messages, Drive], Messa
     )
 
 
+def _of_the_body(reading: Reading, drive: Drive) -> Reading:
+    """Return a receiver's velocity as a driver would write it that turns it into the body's axes."""
+    velocity = rotate(inverse(drive.truth.at(reading.stamp_ns).quat_xyzw), reading.values["velocity_enu_mps"])
+    return _values(reading, velocity_enu_mps=velocity)
+
+
+def _down(reading: Reading, _: Drive) -> Reading:
+    return _values(reading, velocity_enu_mps=reading.values["velocity_enu_mps"][:, [1, 0, 2]] * [1.0, 1.0, -1.0])
+
+
 def _holes(reading: Reading, drive: Drive) -> Reading:
     keep = ~_inside(reading, drive, (100.0, 110.0))
     values = {name: column[keep] for name, column in reading.values.items()}
@@ -338,6 +352,19 @@ FAULTS: dict[str, Fault] = {
     )
 }  # fmt: skip
 
+_SAID = "gnss_velocity"
+VELOCITY_FAULTS: dict[str, Fault] = {
+    f"velocity {name}": Fault(f"velocity {name}", ("doppler",), window_s, said, readings=_of("doppler", change))
+    for name, window_s, said, change in (
+        ("frozen at 0", None, _SAID, _scaled("velocity_enu_mps", 0.0)),
+        ("0 for a minute", MINUTE_S, _SAID, _scaled("velocity_enu_mps", 0.0, MINUTE_S)),
+        ("north, east, down", None, _SAID, _down),
+        ("of the body", None, _SAID, _of_the_body),
+        ("0.2 s late", None, "", _late(0.2)),
+    )
+}
+"""Of a receiver's own velocity; in sets that have one."""
+
 _PAIRED = ("wrong fix", "wheels 1.3 too fast", "IMU pitched by 5 deg", "GNSS 0.1 s late", "gyro at 0", "float minute")
 _WITHOUT_VISUAL = (
     "wrong fix", "wrong fix by a ramp", "float minute", "noisy minute",
@@ -347,22 +374,26 @@ _WITHOUT_VISUAL = (
 )  # fmt: skip
 
 
-def _elsewhere() -> Iterator[tuple[str, float, str]]:
-    """Yield set, rate of GNSS and fault of the cells beside clean ones and faults on all sensors at 10 Hz."""
-    for name in _WITHOUT_VISUAL:
-        yield "no visual", 5.0, name
-    for name in ("wrong fix", "float minute", "noisy minute", "GNSS 0.2 s late", "arm wrong fore-aft"):
-        yield "all", 1.0, name
-    for name in ("wrong fix", "float minute", "wheels 1.3 too fast", "wheels turn at 0"):
-        yield "GNSS, wheels", 5.0, name
-    for name in ("planar visual", "visual turns at 0", "visual 1.3 too fast"):
-        yield "GNSS, visual", 10.0, name
-    for name in ("planar visual", "wrong fix"):
-        yield "no IMU", 10.0, name
-    for name in ("metres, claimed", "wrong fix", "float minute"):
-        yield "GNSS alone", 1.0, name
-    for name in ("wheels 1.3 too fast", "gyro at 0", "IMU pitched by 5 deg"):
-        yield "wheels, IMU", 10.0, name
+_ELSEWHERE: tuple[tuple[str, float, tuple[str, ...]], ...] = (
+    ("no visual", 5.0, _WITHOUT_VISUAL),
+    ("all", 1.0, ("wrong fix", "float minute", "noisy minute", "GNSS 0.2 s late", "arm wrong fore-aft")),
+    ("GNSS, wheels", 5.0, ("wrong fix", "float minute", "wheels 1.3 too fast", "wheels turn at 0")),
+    ("GNSS, visual", 10.0, ("planar visual", "visual turns at 0", "visual 1.3 too fast")),
+    ("no IMU", 10.0, ("planar visual", "wrong fix")),
+    ("GNSS alone", 1.0, ("metres, claimed", "wrong fix", "float minute")),
+    ("wheels, IMU", 10.0, ("wheels 1.3 too fast", "gyro at 0", "IMU pitched by 5 deg")),
+    *(
+        (f"{name}{DOPPLER}", 10.0, ("clean",))
+        for name in ("all", "no visual", "no wheels", "no IMU", "GNSS, IMU", "GNSS, wheels")
+    ),
+    (f"GNSS alone{DOPPLER}", 1.0, ("clean", "metres, claimed", "float minute")),
+    (f"no visual{DOPPLER}", 5.0, ("wrong fix", "float minute")),
+    *(
+        (f"{name}{DOPPLER}", hz, tuple(VELOCITY_FAULTS))
+        for name, hz in (("all", 10.0), ("no visual", 5.0), ("GNSS alone", 1.0))
+    ),
+)
+"""Set, rate of GNSS and faults of the cells beside clean ones and faults on all sensors at 10 Hz."""
 
 
 def cells() -> Iterator[Cell]:
@@ -370,14 +401,14 @@ def cells() -> Iterator[Cell]:
     for gnss_hz in (1.0, 5.0, 10.0, 20.0):
         for name in ("all", "no visual", "no wheels", "no IMU"):
             yield Cell(name, gnss_hz, FAULTS["clean"])
-    for name in list(SETS)[4:]:
+    for name in [name for name in SETS if not name.endswith(DOPPLER)][4:]:
         yield Cell(name, 10.0, FAULTS["clean"])
     yield Cell("GNSS alone", 1.0, FAULTS["clean"])
     for name, fault in FAULTS.items():
         if name != "clean":
             yield Cell("all", 10.0, fault)
-    for sensors, gnss_hz, name in _elsewhere():
-        yield Cell(sensors, gnss_hz, FAULTS[name])
+    for sensors, gnss_hz, names in _ELSEWHERE:
+        yield from (Cell(sensors, gnss_hz, (FAULTS | VELOCITY_FAULTS)[name]) for name in names)
     for first, second in combinations(_PAIRED, 2):
         if (first, second) != ("wrong fix", "float minute"):
             both = FAULTS[first] & FAULTS[second]

@@ -59,6 +59,7 @@ class Counts:
     track_rows: int | None = field(default=None, metadata=LEFT_OUT)
     rejections: int | None = field(default=None, metadata=LEFT_OUT)
     gnss_messages: int | None = field(default=None, metadata=LEFT_OUT)
+    gnss_velocity_messages: int | None = field(default=None, metadata=LEFT_OUT)
     imu_messages: int | None = field(default=None, metadata=LEFT_OUT)
     wheel_odometry_messages: int | None = field(default=None, metadata=LEFT_OUT)
     visual_odometry_messages: int | None = field(default=None, metadata=LEFT_OUT)

@@ -28,7 +28,7 @@ class Rejections:
     Attributes
     ----------
     stamp_ns : [ns], shape (M,), int64.
-    role : shape (M,), str; gnss, imu, wheel_odometry or visual_odometry.
+    role : shape (M,), str; gnss, gnss_velocity, imu, wheel_odometry or visual_odometry.
     reason : shape (M,), str; gate (chi-square), invalid (not finite) or covariance (unusable).
     normalized_innovation_squared : [1], shape (M,); NaN where it was not computed.
     threshold : [1], shape (M,), the gate; NaN where it was not computed.

@@ -169,13 +169,23 @@ def message_fields(role: str, values: Mapping[str, Floats], rows: int) -> dict[s
             made[field.message] = zero if name[-1] != "w" else np.ones(rows)
         elif role != "power":
             made[field.message] = zero
+    return made | _beside(role, values, made, rows)
+
+
+def _beside(
+    role: str, values: Mapping[str, Floats], made: Mapping[str, NDArray[Any]], rows: int
+) -> dict[str, NDArray[Any]]:
+    """Return the fields of a role's message that no mapping names."""
     if role == "gnss":
         status = made["status.status"]
-        made["status.status"] = np.where(np.isfinite(status), status, -1).astype(np.int8)
-        made["position_covariance_type"] = np.full(rows, 2 if "position_covariance" in made else 0, np.uint8)
-    if role == "imu" and "orientation_w" not in values:
-        made["orientation_covariance"] = np.full((rows, 9), -1.0)
-    return made
+        return {
+            "status.status": np.where(np.isfinite(status), status, -1).astype(np.int8),
+            "position_covariance_type": np.full(rows, 2 if "position_covariance" in made else 0, np.uint8),
+        }
+    if role == "gnss_velocity":
+        return {f"twist.twist.angular.{axis}": np.zeros(rows) for axis in "xyz"}
+    unoriented = role == "imu" and "orientation_w" not in values
+    return {"orientation_covariance": np.full((rows, 9), -1.0)} if unoriented else {}
 
 
 def topic_of(name: str, role: str, columns: Mapping[str, str]) -> tuple[str, str]:

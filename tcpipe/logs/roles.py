@@ -15,7 +15,7 @@ from typing import TypeVar
 
 from tcpipe.logs.coverage import LITTLE_SPAN, LITTLE_SPAN_OF_POWER, coverage, covering_little
 from tcpipe.logs.robots import find_robot
-from tcpipe.logs.several_robots import namespaces_of_robots
+from tcpipe.logs.several_robots import namespaces_of_robots, which_robot
 from tcpipe.logs.topic_texts import LISTED, listing, short_list
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
@@ -166,7 +166,7 @@ def assign_roles(
     poses, velocities = found.pop("pose", []), found.pop("gnss_velocity", [])
     robots = namespaces_of_robots({role: [topic.name for _, _, topic in ranked] for role, ranked in found.items()})
     if robots:
-        decided.problems += _which_robot(robots)
+        decided.problems += which_robot(robots)
         decided.undecided |= set(found)
     else:
         for role, candidates in found.items():
@@ -192,19 +192,6 @@ def _is_in(namespace: str | None, topic: Topic) -> bool:
     """Whether a topic belongs to the robot that was asked for; transforms of no namespace belong to all."""
     below = namespace is None or topic.name.startswith(f"/{namespace.strip('/')}/")
     return below or (topic.type_name in TRANSFORMS and topic.name.count("/") == 1)
-
-
-def _which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
-    """Return the one question that a log of several robots asks, and the recipe line that answers it."""
-    each = "; ".join(f"{name} ({', '.join(roles)})" for name, roles in robots.items())
-    first, *others = robots
-    other = "".join(f' or "{name}"' for name in others)
-    return [
-        f"the log holds {len(robots)} robots, and a run is of one: {each}",
-        "settle it in the recipe (tcpipe.toml), for example:",
-        "[read]",
-        f'namespace = "{first}"  #{other}',
-    ]
 
 
 def _let_stand_in(decided: _Decisions, settled: dict[str, str], pose_from: Collection[str]) -> None:
@@ -378,8 +365,9 @@ def _sort_gnss(topic: Topic) -> Sorted:
 
 
 def _sort_gps_fix(topic: Topic) -> Sorted:
-    role, _, why = _sort_gnss(topic)
-    return role and "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), why
+    if word := _says(_FUSED, topic.name):
+        return None, (), f"its name ({word}) says that it is another estimator's output"
+    return "gnss_velocity", (ROLE_TYPES["gnss_velocity"].index(topic.type_name),), ""
 
 
 def _sort_imu(topic: Topic) -> Sorted:
@@ -588,7 +576,7 @@ def _warnings(decided: _Decisions, topics: Iterable[Topic]) -> Iterable[str]:
         yield "no topic plays gnss: the track lies in a local frame and cannot be placed on a map"
     if "power" not in there:
         yield "no topic plays power: there will be a track but no energy"
-    for role, passed in decided.passed_over.items():
+    for role, passed in ((role, passed) for role, passed in decided.passed_over.items() if passed):
         shown = ", ".join(f"{name} ({why})" for name, why in list(passed.items())[:LISTED])
         yield f"{role}: left out: {shown}" + (f" and {len(passed) - LISTED} more" if len(passed) > LISTED else "")
     yield from _undecodable(topics)

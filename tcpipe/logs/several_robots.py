@@ -33,3 +33,16 @@ def namespaces_of_robots(candidates: Mapping[str, Sequence[str]]) -> dict[str, t
         if count > (others == roles) and len(roles & others) >= _ENOUGH and roles & others & _PLACES
     }
     return {name: tuple(role for role in candidates if role in roles_of[name]) for name in sorted(robots)}
+
+
+def which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
+    """Return the one question that a log of several robots asks, and the recipe line that answers it."""
+    each = "; ".join(f"{name} ({', '.join(roles)})" for name, roles in robots.items())
+    first, *others = robots
+    other = "".join(f' or "{name}"' for name in others)
+    return [
+        f"the log holds {len(robots)} robots, and a run is of one: {each}",
+        "settle it in the recipe (tcpipe.toml), for example:",
+        "[read]",
+        f'namespace = "{first}"  #{other}',
+    ]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import pyarrow as pa
@@ -14,9 +14,9 @@ from tcpipe.logs.imu_units import imu_in_si
 from tcpipe.logs.mapped import MAPPED_TYPES, mapped_message
 from tcpipe.logs.messages import Readings, frames, needed_fields, read_messages
 from tcpipe.logs.odometry_scale import scaled
-from tcpipe.logs.placements import is_base
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
+from tcpipe.logs.velocity_frame import over_ground
 from tcpipe.power.readings import PowerReadings
 from tcpipe.power.sources import power_lists
 from tcpipe.recipe import ReadConfig, Role
@@ -38,10 +38,7 @@ class TopicReadings:
     @property
     def key(self) -> str:
         """What tells it from others: a topic may tell places and velocities at once."""
-        return f"{self.topic} ({VELOCITY})" if self.role == VELOCITY else self.topic
-
-
-VELOCITY: Role = "gnss_velocity"
+        return f"{self.topic} ({self.role})" if self.role == "gnss_velocity" else self.topic
 
 
 def read_sources(
@@ -90,35 +87,14 @@ def read_sources(
             readings = read_messages(columns, role, _type_of(topics[topic], role, config))
             if role == "imu":
                 readings = imu_in_si(readings, config.imu_units)
-            elif role == VELOCITY and role not in config.topics:
-                readings = _over_ground(readings, frames(columns, types[topic]))
+            elif role == "gnss_velocity" and role not in config.topics:
+                readings = over_ground(readings, next(iter(frames(columns, types[topic])), ""))
             elif role in config.odometry_scale:
                 readings = scaled(readings, config.odometry_scale[role])
             sources.append(TopicReadings(topic, role, types[topic], columns, readings))
         elif topic in power.rails:
             sources.append(TopicReadings(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))
     return sources, power, warnings
-
-
-def _over_ground(readings: Readings, named: Mapping[str, int]) -> Readings:
-    """Return a receiver's velocities, none where its messages say that they are in the body's frame."""
-    frame = next(iter(named), "")
-    if not is_base(frame):
-        return readings
-    why = (
-        f"its frame is {frame!r}: of the body, or of the antenna over ground, nobody can tell, so it is not used; if it is east, "
-        f"north, up, name it in the recipe, under [read.topics]: {VELOCITY}"
-    )
-    none = {name: values[:0] for name, values in readings.columns.items()}
-    header_ns = None if readings.header_ns is None else readings.header_ns[:0]
-    return replace(
-        readings,
-        row=readings.row[:0],
-        log_time_ns=readings.log_time_ns[:0],
-        header_ns=header_ns,
-        columns=none,
-        warnings=(why,),
-    )
 
 
 def _type_of(topic: Topic, role: Role, config: ReadConfig) -> str:

@@ -451,7 +451,7 @@ REJECTIONS = TableSchema(
     "Measurements that the filter refused, and why.",
     (
         Column("stamp_ns", _I64, "ns", "time of the measurement"),
-        Column("role", pa.string(), "", "gnss, imu, wheel_odometry, visual_odometry"),
+        Column("role", pa.string(), "", "gnss, gnss_velocity, imu, wheel_odometry, visual_odometry"),
         Column("reason", pa.string(), "", "gate: chi-square; invalid: not finite; covariance: unusable"),
         Column(
             "normalized_innovation_squared",

@@ -11,7 +11,7 @@ sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
 
 import campaign
 from campaign_drives import FIRST_SEED, Fault, outcome_of, simulated
-from campaign_faults import FAULTS, Cell, cells
+from campaign_faults import DOPPLER, FAULTS, VELOCITY_FAULTS, Cell, cells
 from campaign_figures import LABELS, Figures, Result, figures_of
 from campaign_map import MapResult
 
@@ -94,3 +94,26 @@ def test_cells_are_many_and_named_once():
 def test_a_footprint_is_no_word_about_feet():
     assert MapResult(["nearest train footprint 0.00 m"], False, 18.0).failures
     assert not MapResult(["its heights seem to be feet"], False, 18.0).failures
+
+
+@pytest.mark.parametrize(("name", "gain"), [("clean", 3.0), ("float minute", 3.0)])
+def test_a_receivers_own_velocity_makes_fixes_alone_worth_more(name, gain):
+    """Once a second, the same drive with it and without: durations err by a third at most, and within what they claim."""
+    without, told = (
+        campaign.made(Cell(sensors, 1.0, FAULTS[name]), FIRST_SEED, length_m=LENGTH_M).outcome
+        for sensors in ("GNSS alone", f"GNSS alone{DOPPLER}")
+    )
+    error, claimed = np.array(told.error["T"]), np.array(told.claimed["T"])
+    assert np.sqrt(np.mean(error**2)) * gain < np.sqrt(np.mean(np.square(without.error["T"])))
+    assert np.mean(np.abs(error) <= 2 * claimed) > 0.9
+    assert len(error) > 0.8 * len(without.error["T"])
+
+
+@pytest.mark.parametrize("name", list(VELOCITY_FAULTS))
+def test_a_velocity_that_lies_moves_no_label(name, clean):
+    """It is left out, or refused where it lies, and named: the labels are what they are without it."""
+    result = campaign.made(Cell(f"all{DOPPLER}", 10.0, VELOCITY_FAULTS[name]), FIRST_SEED, length_m=LENGTH_M)
+    assert any("gnss_velocity" in line for line in result.outcome.said)
+    for label in ("T", "E"):
+        error, usual = (np.sqrt(np.mean(np.square(of.error[label]))) for of in (result.outcome, clean.outcome))
+        assert error < 1.1 * usual

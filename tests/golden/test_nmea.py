@@ -1,10 +1,10 @@
-"""GGA sentences against positions worked out by hand; checksums are those of the sentences' makers."""
+"""GGA, RMC and VTG sentences against positions worked out by hand; checksums are those of the sentences' makers."""
 
 from datetime import UTC, datetime
 
 import numpy as np
 
-from tcpipe.logs.nmea import NS_PER_DAY, read_gga, with_date
+from tcpipe.logs.nmea import NS_PER_DAY, read_gga, read_over_ground, with_date
 
 S = 1_000_000_000
 
@@ -82,3 +82,30 @@ def test_a_clock_half_a_day_off_keeps_its_side_and_unknown_times_are_zero() -> N
     offset = np.delete(found - log, 50)
     assert found[50] == 0
     assert np.ptp(offset) == 2 * (S // 10)
+
+
+def test_speed_in_knots_and_course_from_north() -> None:
+    # The manuals' RMC: 22.4 knots of 1852 m an hour, course 84.4 degrees; it has no mode yet.
+    manual = "$GPRMC,123519,A,4807.038,N,01131.000,E,022.4,084.4,230394,003.1,W*6A"
+    fixed = signed("GNRMC,101325.20,A,4704.0,N,01526.0,E,1.944,270.00,130324,,,R,V")
+    void = signed("GNRMC,101325.40,V,,,,,,,130324,,,N")
+    guessed = signed("GNRMC,101325.60,A,4704.0,N,01526.0,E,1.944,270.00,130324,,,E")
+    found = read_over_ground([manual, MANUAL, fixed, void, guessed, fixed.replace("1.944", "2.944")])
+    assert found.row.tolist() == [0, 2, 3, 4, 5]
+    assert abs(found.speed_mps[0] - 11.523555555555555) < 1e-12  # 22.4 * 1852 / 3600
+    assert abs(found.course_rad[0] - 1.4730578886832142) < 1e-12  # 84.4 * pi / 180
+    assert found.time_of_day_ns[:2].tolist() == [45_319 * S, 36_805_200_000_000]
+    assert abs(found.speed_mps[1] - 1.0000800) < 1e-9
+    assert found.status.tolist() == [0, 2, -1, -1, -1]
+    assert found.broken.tolist() == [False, False, False, False, True]  # the last: its checksum tells
+
+
+def test_vtg_speaks_where_there_is_no_rmc_and_has_no_time() -> None:
+    knots = signed("GPVTG,054.7,T,034.4,M,005.5,N,010.2,K")  # the manuals' sentence
+    kilometres = signed("GNVTG,90.00,T,,M,,N,3.600,K,D")
+    found = read_over_ground([knots, kilometres, signed("GNVTG,,T,,M,0.012,N,0.022,K,A")])
+    assert np.allclose(found.speed_mps, [5.5 * 1852 / 3600, 1.0, 0.012 * 1852 / 3600])
+    assert np.allclose(np.degrees(found.course_rad[:2]), [54.7, 90.0])
+    assert np.isnan(found.course_rad[2])
+    assert found.time_of_day_ns.tolist() == [-1, -1, -1]
+    assert found.status.tolist() == [0, 1, 0]

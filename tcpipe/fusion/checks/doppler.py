@@ -2,7 +2,8 @@
 
 Its integral over windows is held against the displacement of the fixes. Windows are as long as it takes for the way in them to be far
 longer than the fixes are noisy. Zero while the fixes move is a frozen one; a way as long as theirs in other directions is that of another
-frame; one that is late or early against the odometry, or the fixes, is off by what the robot's velocity changes meanwhile.
+frame; one that is late or early against the odometry is off by what the robot's velocity changes meanwhile, as is one that
+is not of the fixes' time; which of these two is off nobody can tell.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _MAX_GAP_NS = 1_000_000_000
 
 @dataclass(frozen=True, slots=True)
 class Doubt:
-    """Why a receiver's velocity is not fused; ``late_s`` where its stamps alone are off [s]."""
+    """Why a receiver's velocity is not fused; ``late_s`` where its stamps are off against an odometry [s]."""
 
     why: str
     late_s: float | None = None
@@ -93,22 +94,24 @@ def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128]
 
 
 def _lateness(m: Measurements) -> Doubt | None:
-    """Return by how much its stamps are off, where the first odometry, or without one the fixes, surely show it."""
+    """Return by how much its stamps are off: by the first odometry, or, where that tells no lag, by how the fixes go."""
     at_ns = liveliest_ns(m)
     if at_ns is None or m.doppler is None or m.gnss is None:
         return None
-    speed = np.linalg.norm(on_grid(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns), axis=1)[:, None]
-    odometry = next(iter(m.odometries().values()), None)
-    seen = np.abs(fix_velocity(m.gnss, at_ns))[:, None] if odometry is None else _antenna(m, at_ns)
-    smooth_s = FIXES_S if odometry is None else _SMOOTH_S
-    lag = find_lag(*where_it_changes(averaged(speed, smooth_s), averaged(seen, smooth_s)))
-    if lag is None or not _is_sure(lag):
-        return None
-    against = "the fixes" if odometry is None else next(iter(m.odometries()))
-    how = "late" if lag.offset_s > 0 else "early"
-    return Doubt(
-        f"its stamps are {abs(lag.offset_s):.2f} s {how} against {against} (± {2 * lag.std_s:.2f} s)", lag.offset_s
-    )
+    velocity = on_grid(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2], at_ns)
+    for role in list(m.odometries())[:1]:
+        speed = averaged(np.linalg.norm(velocity, axis=1)[:, None], _SMOOTH_S)
+        lag = find_lag(*where_it_changes(speed, averaged(_antenna(m, at_ns), _SMOOTH_S)))
+        if lag is not None and _is_known(lag):
+            how = "late" if lag.offset_s > 0 else "early"
+            why = f"its stamps are {abs(lag.offset_s):.2f} s {how} against {role} (± {2 * lag.std_s:.2f} s)"
+            return Doubt(why, lag.offset_s) if _is_off(lag) else None
+    seen = fix_velocity(m.gnss, at_ns)
+    for axis, of_fixes in zip(averaged(velocity, FIXES_S).T, (seen.real, seen.imag), strict=True):
+        lag = find_lag(axis, averaged(of_fixes[:, None], _SMOOTH_S))
+        if lag is not None and _is_known(lag) and _is_off(lag):
+            return Doubt(f"its stamps and the fixes' are {abs(lag.offset_s):.2f} s apart (± {2 * lag.std_s:.2f} s)")
+    return None
 
 
 _SMOOTH_S = 0.3
@@ -121,6 +124,9 @@ def _antenna(m: Measurements, at_ns: NDArray[np.int64]) -> Floats:
     return np.asarray(np.hypot(forward - yaw_rate * left, yaw_rate * ahead)[:, None])
 
 
-def _is_sure(lag: Lag) -> bool:
-    known = lag.std_s <= _MAX_STD_S and lag.explained >= _MIN_EXPLAINED
-    return known and abs(lag.offset_s) > max(_LATE_S, _SURE * lag.std_s)
+def _is_known(lag: Lag) -> bool:
+    return lag.std_s <= _MAX_STD_S and lag.explained >= _MIN_EXPLAINED
+
+
+def _is_off(lag: Lag) -> bool:
+    return abs(lag.offset_s) > max(_LATE_S, _SURE * lag.std_s)

@@ -16,6 +16,7 @@ KEPT = Path(__file__).parents[2] / "data" / "store-1.0.tar.xz"
 SINCE = dict.fromkeys(("weight_over_efficiency_newton", "rolling_resistance", "gyro_bias_radps", "turn_scale")) | {
     "blamed": True,
     "sha256_of": "log",
+    "gnss_velocity_std_mps": 0.1,
 }
 """Keys that are always there since, and what they hold where they were left out."""
 

@@ -46,6 +46,7 @@ def expect(kind, x, w, lever):
         kernel.GNSS_POSITION: x[18:21] + R @ lever + (x[23:26] if x.size > 23 else 0.0),
         kernel.WHEEL_VELOCITY: body * [1 + x[21], 1, 1],
         kernel.VISUAL_VELOCITY: body * (1 + x[22]),
+        kernel.GNSS_VELOCITY: x[15:18] + R @ np.cross(w - x[9:12], lever),
         kernel.STANDING: x[15:18],
         kernel.STANDING_RATE: x[9:12],
         kernel.SIDEWAYS: np.array([body[1], body[2], 0]),

@@ -5,7 +5,7 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tcpipe.fusion.preparation import body_velocities, find_datum, inertial, positions
+from tcpipe.fusion.preparation import body_velocities, find_datum, ground_velocities, inertial, positions
 
 NAN = np.nan
 ARM = (0.1, 0.2, 0.3)
@@ -248,3 +248,16 @@ def test_a_force_in_g_or_without_gravity_is_not_used(norm):
     )
     assert not found.accelerometer_usable
     assert "only the gyroscope" in prepared.remarks[0]
+
+
+def test_a_receivers_velocity_has_a_deviation_always_and_a_vast_one_where_it_tells_no_climb():
+    velocity = np.array([[1.0, 2.0, NAN], [1.0, 2.0, 0.1], [NAN, 0.0, 0.0], [99.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    variance = np.array([[0.04, 0.04, NAN], [NAN, NAN, NAN], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0], [1e-9, 0.09, 0.16]])
+    columns = {f"{axis}_velocity_mps": velocity[:, i] for i, axis in enumerate(("east", "north", "up"))}
+    columns |= {f"{axis}_var_m2ps2": variance[:, i] for i, axis in enumerate(("east", "north", "up"))}
+    found, prepared = ground_velocities(stamps(5), columns, default_std_mps=0.1)
+    assert found.stamp_ns.tolist() == stamps(5)[[0, 1, 4]].tolist()
+    assert prepared.invalid_ns.tolist() == stamps(5)[[2, 3]].tolist()
+    assert found.velocity_enu_mps.tolist() == [[1.0, 2.0, 0.0], [1.0, 2.0, 0.1], [1.0, 1.0, 0.0]]
+    wanted = [[0.04, 0.04, 1e6], [0.01, 0.01, 0.04], [0.0004, 0.09, 0.16]]
+    assert found.variance_m2ps2 == pytest.approx(np.array(wanted))

@@ -2,13 +2,14 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from unit.fusion import dense_reference
 from unit.fusion.dense_reference import LEVER, RATE, P, X
 
 from tcpipe.fusion import state_kernel, update_kernel
 
 
-@pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 6, 7])
+@pytest.mark.parametrize("kind", [1, 2, 3, 4, 5, 6, 7, 8])
 def test_update_is_the_unscented_transform(kind):
     work, gain = state_kernel.workspace(17)
     z, r = np.array([0.2, -0.1, 0.3]), np.array([0.02, 0.03, 0.04])
@@ -27,3 +28,18 @@ def test_update_is_the_unscented_transform(kind):
         assert nis == pytest.approx(wanted_nis, rel=1e-12)
     else:
         assert nis == pytest.approx(wanted[2], rel=1e-10)
+
+
+def test_the_receivers_velocity_is_the_slope_of_the_antennas_places():
+    """Of a body that turns and moves on evenly the antenna's place is known; its central difference is what is to be measured."""
+    R, turn = X[:9].reshape(3, 3), RATE - X[9:12]
+    step_s = 1e-5
+
+    def place(at_s):
+        return X[18:21] + X[15:18] * at_s + R @ Rotation.from_rotvec(turn * at_s).apply(LEVER)
+
+    slope = (place(step_s) - place(-step_s)) / (2 * step_s)
+    work, gain = state_kernel.workspace(17)
+    tiny, r = 1e-18 * np.eye(17), np.ones(3)
+    update_kernel.innovation_of(state_kernel.GNSS_VELOCITY, X.copy(), tiny, slope, r, RATE, LEVER, 1.0, work, gain)
+    assert np.abs(gain[0]).max() < 1e-8

@@ -283,3 +283,67 @@ def test_frames_lose_their_slash_and_the_most_frequent_leads() -> None:
     columns["child_frame_id"] = np.array(["a"] * 4 + ["/base_link", "base_link"] * 4)
     assert frames(columns, roles.ODOMETRY) == {"base_link": 8, "a": 4}
     assert frames(columns, roles.TWIST_STAMPED) == {"sensor": N}
+
+
+def ground_twist(velocity, *diagonal) -> dict[str, np.ndarray]:
+    return with_times(**vectors("twist.twist.linear", velocity), **{"twist.covariance": covariance(6, *diagonal)})
+
+
+def test_a_receivers_twist_is_east_north_up() -> None:
+    velocity = np.column_stack((np.linspace(0.1, 0.5, N), np.linspace(-1.0, 1.0, N), np.full(N, 0.02)))
+    columns = ground_twist(velocity, 0.01, 0.02, 0.03, -1.0)
+    columns["twist.covariance"][0, 0] = -1.0
+    columns["twist.covariance"][1, 14] = 1e6
+    columns["twist.covariance"][2] = 0.0
+    columns["twist.twist.linear.y"][3] = np.nan
+    found = read_messages(columns, "gnss_velocity", roles.TWIST_WITH_COVARIANCE_STAMPED)
+    assert found.dropped == {"not_measured": 1, "not_finite": 1}
+    assert found.columns["east_velocity_mps"].tolist() == velocity[[1, 2, *range(4, N)], 0].tolist()
+    assert np.isnan(found.columns["up_velocity_mps"]).tolist() == [True] + [False] * (N - 3)
+    assert np.isnan(found.columns["east_var_m2ps2"]).tolist() == [False, True] + [False] * (N - 4)
+    assert (found.columns["fix_status"] == -1).all()
+
+
+def test_a_twist_that_never_goes_aside_is_of_the_body() -> None:
+    count = 40
+    velocity = np.column_stack((np.linspace(0.1, 1.0, count), np.zeros(count), np.zeros(count)))
+    columns = with_times(count, **vectors("twist.linear", velocity))
+    found = read_messages(columns, "gnss_velocity", roles.TWIST_STAMPED)
+    assert found.dropped == {"of_the_body": count}
+    assert "of the body" in found.warnings[0]
+    velocity[:, 1] = 0.1
+    found = read_messages(with_times(count, **vectors("twist.linear", velocity)), "gnss_velocity", roles.TWIST_STAMPED)
+    assert not found.dropped
+    assert np.isnan(found.columns["up_velocity_mps"]).all()  # nmea_navsat_driver leaves it zero
+
+
+def test_gps_fix_tells_speed_and_track_with_their_errors() -> None:
+    columns = with_times(
+        speed=np.full(N, 2.0), track=np.full(N, 90.0), climb=np.full(N, 0.1), err_speed=np.full(N, 0.2),
+        err_track=np.full(N, np.degrees(0.05)), err_climb=np.zeros(N), **{"status.status": np.full(N, 18)},
+    )  # fmt: skip
+    columns["speed"][0], columns["track"][0] = 0.2, np.nan
+    columns["status.status"][1] = -1
+    found = read_messages(columns, "gnss_velocity", "gps_common/msg/GPSFix")
+    assert found.dropped == {"no_fix": 1}
+    assert found.columns["east_velocity_mps"][[0, 1]].tolist() == [0.0, 2.0]
+    assert found.columns["north_velocity_mps"][1] == pytest.approx(0.0, abs=1e-12)
+    assert found.columns["up_velocity_mps"][1] == 0.1
+    assert found.columns["east_var_m2ps2"][[0, 1]] == pytest.approx(
+        [0.2**2 / 2 + 0.1**2, 0.1**2]
+    )  # 95 per cent: two deviations
+    assert np.isnan(found.columns["up_var_m2ps2"]).all()
+    assert found.columns["fix_status"].tolist() == [2] * (N - 1)
+
+
+def test_vtg_takes_the_time_of_the_fix_that_came_with_it() -> None:
+    """The receiver sends VTG just before GGA: the nearest in the log is that of the same epoch, not the one before."""
+    second = ("$GPVTG,90.0,T,,M,2.0,N,3.7,K,A", "$GPGGA,101325,4807.038,N,01131.000,E,4,08,0.9,545.4,M,46.9,M,,")
+    later = ("$GPVTG,90.0,T,,M,2.0,N,3.7,K,A", "$GPGGA,101326,4807.038,N,01131.000,E,4,08,0.9,545.4,M,46.9,M,,")
+    day = 1_699_920_000 * S
+    at = day + (36_805 * S) + np.array([0, 5_000_000, S, S + 5_000_000])
+    columns = {"log_time_ns": at, "sentence": np.array([*second, *later])}
+    found = read_messages(columns, "gnss_velocity", roles.NMEA_SENTENCE)
+    assert found.row.tolist() == [0, 2]
+    assert found.own_time_ns.tolist() == [day + 36_805 * S, day + 36_806 * S]
+    assert found.dropped == {"no_velocity": 2}

@@ -59,13 +59,13 @@ def test_a_ros1_husky_with_everything() -> None:
         "wheel_odometry": ("/husky_velocity_controller/odom",),
         "visual_odometry": ("/zed2/zed_node/odom",),
         "power": ("/status",),
+        "gnss_velocity": ("/navsat/nmea_sentence",),
         "command": ("/husky_velocity_controller/cmd_vel",),
     }
     assert found.robot == "husky"
     assert found.transforms == ("/tf_static", "/tf")
     assert [line.split(" (")[0] for line in found.warnings] == [
         "wheel_odometry: left out: /odometry/filtered",
-        "gnss: left out: /navsat/nmea_sentence",
         "imu: left out: /imu/data_raw",
         "command: left out: /joy_teleop/cmd_vel",
     ]
@@ -297,8 +297,8 @@ def test_empty_and_unreadable_topics_play_nothing() -> None:
         ("/zed/odometry/filtered", ODOMETRY, None),
         ("/ground_truth/state", ODOMETRY, None),
         ("/lio_sam/mapping/odometry", ODOMETRY, None),
-        ("/gps/fix_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", None),
-        ("/ublox/fix_velocity", STAMPED, None),
+        ("/gps/fix_velocity", "geometry_msgs/msg/TwistWithCovarianceStamped", "gnss_velocity"),
+        ("/ublox/fix_velocity", STAMPED, "gnss_velocity"),
         ("/cmd_vel", STAMPED, "command"),
         ("/turtle/command/twist", TWIST, "command"),
         ("/measured_twist", TWIST, None),
@@ -401,3 +401,55 @@ def test_a_mapped_role_is_played_by_any_type_that_the_recipe_names() -> None:
     mine = topic("/rtk", "my_msgs/msg/Pvt")
     assert assign_roles([mine], {"gnss": ["/rtk"]}).problems
     assert played(assign_roles([mine], {"gnss": ["/rtk"]}, mapped=["gnss"])) == {"gnss": ("/rtk",)}
+
+
+TWIST_COVARIANCE, NMEA = "geometry_msgs/msg/TwistWithCovarianceStamped", "nmea_msgs/msg/Sentence"
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "fix"),
+    [
+        ("/ublox/fix_velocity", TWIST_COVARIANCE, "/ublox/fix"),
+        ("/gps/vel", STAMPED, "/gps/fix"),
+        ("/navsat/vel", STAMPED, "/navsat/fix"),
+        ("/septentrio_gnss/twist_gnss", TWIST_COVARIANCE, "/septentrio_gnss/navsatfix"),
+        ("/novatel/gps", "gps_common/msg/GPSFix", "/novatel/fix"),
+        ("/nmea_sentence", NMEA, "/gps/fix"),
+    ],
+)
+def test_a_receivers_own_velocity_goes_with_its_fixes(name: str, kind: str, fix: str) -> None:
+    found = assign((fix, FIX), (name, kind), ("/odom", ODOMETRY))
+    assert played(found) == {"gnss": (fix,), "wheel_odometry": ("/odom",), "gnss_velocity": (name,)}
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("/odometry/gps", ODOMETRY),
+        ("/velocity", STAMPED),
+        ("/septentrio_gnss/twist_ins", TWIST_COVARIANCE),
+        ("/gps/cmd_vel", STAMPED),
+        ("/gps/filtered_velocity", TWIST_COVARIANCE),
+        ("/wheel/gps_synced", TWIST_COVARIANCE),
+    ],
+)
+def test_other_velocities_are_never_taken_for_one(name: str, kind: str) -> None:
+    assert "gnss_velocity" not in played(assign(("/gps/fix", FIX), (name, kind)))
+
+
+def test_one_topic_of_sentences_tells_places_and_velocities() -> None:
+    found = assign(("/gps/nmea", NMEA), ("/odom", ODOMETRY))
+    assert played(found) == {"gnss": ("/gps/nmea",), "wheel_odometry": ("/odom",), "gnss_velocity": ("/gps/nmea",)}
+    named = assign(("/gps/nmea", NMEA), chosen={"gnss": ["/gps/nmea"], "gnss_velocity": []})
+    assert played(named) == {"gnss": ("/gps/nmea",)}
+
+
+def test_of_two_receivers_that_of_the_fixes_is_taken_and_without_fixes_none() -> None:
+    topics = (("/front/fix_velocity", TWIST_COVARIANCE), ("/rear/fix_velocity", TWIST_COVARIANCE), ("/odom", ODOMETRY))
+    assert played(assign(("/rear/fix", FIX), *topics))["gnss_velocity"] == ("/rear/fix_velocity",)
+    nobody = assign(("/fix", FIX), *topics)
+    assert "gnss_velocity" not in played(nobody)
+    assert any("gnss_velocity: left out" in line and "several could" in line for line in nobody.warnings)
+    alone = assign(*topics)
+    assert "gnss_velocity" not in played(alone)
+    assert "no topic plays gnss" in alone.left_out["/rear/fix_velocity"]

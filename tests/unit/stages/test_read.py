@@ -280,6 +280,42 @@ def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
     assert not any("not used" in text for text in found.findings.warnings)
 
 
+def test_one_topic_of_sentences_plays_two_roles_each_on_its_own_time() -> None:
+    stamps = START + np.arange(20) * S
+    text = [datetime.fromtimestamp(stamp // S, UTC).strftime("%H%M%S") for stamp in stamps.tolist()]
+    places = [f"$GPGGA,{time},4700.{i:04d},N,01500.0000,E,4,20,0.6,355.0,M,45.0,M,," for i, time in enumerate(text)]
+    speeds = [f"$GPRMC,{time}.50,A,,,,,1.944,090.0,,,,R" for time in text]
+    sentences = [s for pair in zip(places, speeds, strict=True) for s in pair]
+    table = message_table(40, 2.0, delay_ns=60_000_000, frame="gps", sentence=sentences)
+    found = read({"/nmea_sentence": ("nmea_msgs/msg/Sentence", table), "/odom": odometry()})
+    velocity = found.tables["gnss_velocity"]
+    assert velocity["stamp_ns"].to_pylist() == (stamps + S // 2).tolist()
+    assert found.tables["gnss"]["stamp_ns"].to_pylist() == stamps.tolist()
+    assert velocity["east_velocity_mps"].to_pylist() == pytest.approx([1.00008] * 20)
+    assert velocity["north_velocity_mps"].to_pylist() == pytest.approx([0.0] * 20, abs=1e-9)
+    assert velocity["up_velocity_mps"].null_count == velocity["east_var_m2ps2"].null_count == 20
+    assert set(velocity["fix_status"].to_pylist()) == {2}
+    assert found.sensors["gnss_velocity"].placed_by == "not needed"
+    assert not any("gnss_velocity" in line for line in found.findings.warnings)
+
+
+@pytest.mark.parametrize(("frame", "rows"), [("gps", 50), ("base_link", 0), ("robot/base_footprint", 0)])
+def test_a_receivers_twist_in_the_bodys_frame_stays_out_unless_the_recipe_names_it(frame: str, rows: int) -> None:
+    columns = {
+        **xyz("twist.twist.linear", 50, x=0.4, y=-0.3),
+        **xyz("twist.twist.angular", 50),
+        "twist.covariance": cov(50, 6, 0.01),
+    }
+    twist = message_table(50, 5.0, frame=frame, **columns)
+    topics = {"/gps/fix": fix(), "/gps/vel": ("geometry_msgs/msg/TwistWithCovarianceStamped", twist)}
+    found = read(topics)
+    assert (found.tables["gnss_velocity"].num_rows if rows else len(set(found.tables) - {"gnss"})) == rows
+    assert any("nobody can tell" in line for line in found.findings.warnings) == (not rows)
+    named = ReadConfig(topics={"gnss_velocity": ["/gps/vel"]})
+    told = read_run(MemoryLog(topics), named, robot=None, known=shipped_profiles())
+    assert told.tables["gnss_velocity"].num_rows == 50
+
+
 def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
     found = read_run(
         MemoryLog(husky(), undecodable=["/fix", "/left/battery"]), ReadConfig(), robot=None, known=shipped_profiles()

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rough_drive import drive, measured, true_track
+from rough_drive import ANTENNA_M, drive, measured, true_track
 from scipy.stats import chi2
 
 from tcpipe.fusion.checks import audit
 from tcpipe.fusion.checks.audit import Tally, alone_in_most, audited, undecided_in_most
+from tcpipe.fusion.measurements import GroundVelocities
 from tcpipe.fusion.trajectory import Trajectory
 
 SECONDS = 120.0
@@ -52,6 +53,21 @@ def test_the_truth_disagrees_with_nobody(track, sensors):
         ("visual_odometry", "displacement"),
         ("visual_odometry", "turn"),
     }
+
+
+def test_a_receivers_velocity_is_held_against_the_antennas_way(track, sensors, truth):
+    """The true one disagrees nowhere; one that is zero for a while does there, and is alone against the odometries and the fixes."""
+    at = np.arange(7, truth.stamp_ns.size, 20)
+    velocity = np.gradient(truth.position + truth.rotation @ np.array(ANTENNA_M), 1 / 200, axis=0)[at]
+    told = GroundVelocities(truth.stamp_ns[at], velocity, np.full(velocity.shape, 0.05**2))
+    same, found = audited(track, replace(sensors, doppler=told))
+    assert same is track
+    assert ("gnss_velocity", "displacement") in {(t.sensor, t.what) for t in found.tallies}
+    at_s = seconds(track, told.stamp_ns)
+    zero = np.where(((at_s > 40.0) & (at_s < 60.0))[:, None], 0.0, velocity)
+    same, found = audited(track, replace(sensors, doppler=replace(told, velocity_enu_mps=zero)))
+    assert {(each.sensor, each.alone) for each in found.disagreements} == {("gnss_velocity", True)}
+    assert same is track
 
 
 def test_fixes_that_lie_elsewhere_for_a_time_raise_the_position_there_and_only_there(track, sensors):
