@@ -24,6 +24,7 @@ _WHEEL_TURN_SCALE_STD, _VISUAL_TURN_SCALE_STD = 0.2, 0.03
 _TURN_SCALE_TIME_S = 60.0
 SLOPE_RAD = 0.1  # of ground, where nothing shows it
 ROLL_AS_TURN_RAD = 0.06  # of a body whose turns the course alone tells, beyond what the filter knows
+DOPPLER_LASTS_S = 3.0  # what a correlation that fades in 1.5 s weighs
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
 GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
 _ACCELERATION_WINDOW_S = 0.6

@@ -10,7 +10,7 @@ Constraints are events of our own making:
   error of this constraint (side slip, a lever arm to the turning centre) lasts, so it must not be counted as white at 50 Hz with a
   small deviation: that locks GNSS out. Its information is that of 0.15 m/s ten times a second, whatever the wheels' rate; so is that of
   the wheels themselves, as far as they claim a larger variance than they scatter by: such an error, slip, lasts as well.
-- a receiver's own velocity errs alike for a second (its filter, multipath): it counts once a second, whatever its rate.
+- a receiver's own velocity errs alike for a while (its filter, multipath): it counts once in three seconds, whatever its rate.
 - standing (`tcpipe.fusion.standing`): zero velocity, and the gyroscope shows its bias, five times a second.
 - level, where no accelerometer tells up from down: roll and pitch are small. A slope lasts, so 20° are counted once in four seconds: as 40°
   once a second.
@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements
-from tcpipe.fusion.process import UNSEEN_TURN_RADPS, glides, shake_density, turn_sources
+from tcpipe.fusion.process import DOPPLER_LASTS_S, UNSEEN_TURN_RADPS, glides, shake_density, turn_sources
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 
 _MAX_STEP_NS = 50_000_000
@@ -36,7 +36,6 @@ _UNSEEN_TURN_S = 1.0
 _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _STANDING_NS = 200_000_000
 _STANDING_STD_MPS = 0.01
-_DOPPLER_LASTS_S = 1.0
 _LEVEL_NS = 1_000_000_000
 _LEVEL_STD_RAD = 0.7
 _MIN_INPUT_GAP_NS = 100_000_000
@@ -144,7 +143,7 @@ def _measured(measurements: Measurements) -> list[_Part]:
         parts.append((visual.stamp_ns, kernel.VISUAL_VELOCITY, visual.velocity_mps, variance))
     doppler = measurements.doppler
     if gnss is not None and doppler is not None and doppler.stamp_ns.size:
-        variance = doppler.variance_m2ps2 * max(1.0, _DOPPLER_LASTS_S * 1e9 / median_period_ns(doppler.stamp_ns))
+        variance = doppler.variance_m2ps2 * max(1.0, DOPPLER_LASTS_S * 1e9 / median_period_ns(doppler.stamp_ns))
         if measurements.imu is None and (visual is None or visual.turn_rate_radps is None):
             variance = variance + _unseen_turn_variance(doppler.stamp_ns, gnss.lever_arm_m)
         parts.append((doppler.stamp_ns, kernel.GNSS_VELOCITY, doppler.velocity_enu_mps, variance))

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, BodyVelocities, Measurements, Positions
-from tcpipe.fusion.process import VISUAL_SCALE_STD, WHEEL_SCALE_STD
+from tcpipe.fusion.process import DOPPLER_LASTS_S, VISUAL_SCALE_STD, WHEEL_SCALE_STD
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
@@ -240,8 +240,8 @@ def _comparisons(found: Trajectory, m: Measurements, windows: NDArray[np.int64])
         said = means(m.doppler.stamp_ns, m.doppler.velocity_enu_mps[:, :2]) * step_s
         antenna = (found.position_enu_m + rotation @ np.asarray(m.gnss.lever_arm_m))[:, :2]
         moved = _sums(said - np.diff(antenna, axis=0), windows)
-        # It errs alike for a second: so long each of its errors lasts.
-        std = np.hypot(_LASTING_MPS * _WINDOW_S, np.sqrt(np.median(m.doppler.variance_m2ps2[:, :2]) * _WINDOW_S))
+        variance = float(np.median(m.doppler.variance_m2ps2[:, :2]))
+        std = np.hypot(_LASTING_MPS * _WINDOW_S, np.sqrt(variance * DOPPLER_LASTS_S * _WINDOW_S))
         difference = _ahead_and_aside(moved, rotation[windows.sum(1) // 2])
         yield Comparison(DOPPLER, "displacement", difference, np.full(way_std.size, std), way_std)
     if m.imu is not None:

@@ -51,7 +51,7 @@ def test_every_wrong_key_is_one_problem() -> None:
 
 WRONG = {
     "robot = 3": "robot is 3; wanted text in quotes",
-    'read.topics.gnsss = ["/a"]': "unknown key read.topics.gnsss; known here: gnss, imu, wheel_odometry, visual_odometry",
+    'read.topics.gnsss = ["/a"]': "unknown key read.topics.gnsss; known here: gnss, gnss_velocity, imu, wheel_odometry, visual_odometry",
     'read.topics.imu = "/a"': 'read.topics.imu is "/a"; wanted a list',
     "read.topics.imu = [1]": "read.topics.imu.0 is 1; wanted text in quotes",
     "read.placement.imu.xyz_m = [1, 2]": "read.placement.imu.xyz_m is [1, 2]; wanted 3 values, got 2",
