@@ -25,7 +25,7 @@ WHOLLY = (
 )
 """Modules of which every number is listed."""
 UNLISTED = {"_MAX_GAP_NS", "_GRAVITY_BAND_MPS2"}  # the recipe's default beside the recipe; a band, told in words
-UNLISTED |= {"WHEEL_SCALE_STD", "VISUAL_SCALE_STD", "FIXES_S"}  # listed where they are made
+UNLISTED |= {"WHEEL_SCALE_STD", "VISUAL_SCALE_STD", "FIXES_S", "DOPPLER_LASTS_S"}  # listed where they are made
 
 
 @pytest.mark.parametrize(("module", "name", "value"), ROWS, ids=lambda of: of)
