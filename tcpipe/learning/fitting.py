@@ -36,6 +36,9 @@ _SLOWER = 0.1
 
 _TOGETHER = 256
 
+_STEPS_BETWEEN = 32
+"""Steps that are lost at most by a stop, unless an epoch has more: a state is 180 MB."""
+
 _LAST = 0.8
 """Share of the most epochs after which the rate is smaller in any case."""
 
@@ -127,7 +130,7 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
     key
         Of dataset and options, kept in the checkpoint.
     checkpoint
-        Written before the first and after every epoch, and gone on from where it is.
+        Written before the first epoch and after every one, or every so many short ones, and gone on from where it is.
 
     """
     scale = label_scale(task)
@@ -152,7 +155,8 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
         progress.history.append((progress.epoch, loss, held))
         if held < progress.best_loss:
             progress.best_loss, progress.best_epoch, best = held, progress.epoch, network.arrays()
-        write_checkpoint(checkpoint, progress, _state(trainer, best))
+        if progress.epoch % max(_STEPS_BETWEEN * config.batch // len(task.fit), 1) == 0:
+            write_checkpoint(checkpoint, progress, _state(trainer, best))
         _say(name, progress, config, spent)
     network.set_arrays(best, str(checkpoint))
     return Fitted(best, scale, task.held, predicted(network, task, task.held, scale), progress, spent, device)

@@ -114,6 +114,7 @@ def _stopped(monkeypatch, at, dataset, place, config, **options):
         if progress.epoch == at:
             raise KeyboardInterrupt
 
+    monkeypatch.setattr(fitting, "_STEPS_BETWEEN", 1)
     monkeypatch.setattr(fitting, "write_checkpoint", write_and_stop)
     with pytest.raises(KeyboardInterrupt):
         train(dataset, place, config=config, **options)
@@ -137,6 +138,15 @@ def test_a_training_stopped_after_any_checkpoint_goes_on_as_if_nothing_had_happe
     checkpoint.write_bytes(state)  # ended before the state was removed
     assert train(dataset, place, config=CONFIG).status == "unchanged"
     assert not checkpoint.exists()
+
+
+def test_short_epochs_share_a_checkpoint(dataset, tmp_path, monkeypatch):
+    """As many as have 32 steps of 64 samples together, of a training set of a step or two."""
+    epochs = []
+    monkeypatch.setattr(fitting, "write_checkpoint", lambda _path, progress, _parts: epochs.append(progress.epoch))
+    monkeypatch.setattr(fitting, "_epoch", lambda *_, **__: 1.0)
+    result = train(dataset, tmp_path / "model", config=replace(CONFIG, epochs=45, patience=99, batch=64))
+    assert epochs == list(range(0, 46, 32 * 64 // result.samples["fitted"]))
 
 
 def test_a_variant_goes_on_too(dataset, tmp_path, monkeypatch):
