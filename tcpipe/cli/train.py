@@ -5,17 +5,21 @@ from __future__ import annotations
 from typing import Any
 
 import click
+from click.core import ParameterSource
 
 from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRange, json_option, quiet_option
+
+_OF_THE_NETWORK = {"epochs", "patience", "batch", "learning_rate", "fold", "mirror", "width", "seed"}
+"""Options that a table and physics do not heed: who gives one wants the network."""
 
 
 @click.command(short_help="Train a model on a dataset")
 @click.argument("dataset", type=INPUT_DIRECTORY, metavar="DATASET")
 @click.argument("out", default="model", type=OUTPUT_DIRECTORY, metavar="[OUT]")
 @click.option(
-    "--model", default="resnet18", show_default=True, type=click.Choice(["resnet18", "table", "physics"]),
+    "--model", type=click.Choice(["resnet18", "table", "physics"]),
     help="The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, --weights, "
-    "--label and --beside alone.",
+    "--label and --beside alone (default: a table of fewer than 5000 samples, else, and with the network's own options, the network).",
 )  # fmt: skip
 @click.option(
     "--loss", default="nrmse", show_default=True, type=click.Choice(["nrmse", "paper_eq4"]),
@@ -58,7 +62,10 @@ from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRan
 @click.option("--fresh", is_flag=True, help="Do not go on from where an earlier training was stopped.")
 @json_option
 @quiet_option
-def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **options: Any) -> None:
+@click.pass_context
+def train(
+    context: click.Context, /, dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **options: Any
+) -> None:
     """Train ResNet-18, stopped early by a fold of train, or a table on DATASET's patches and labels, and write the model folder OUT.
 
     Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for a table. A network runs on a GPU when there is one; its training
@@ -66,8 +73,12 @@ def train(dataset: str, out: str, *, fresh: bool, as_json: bool, quiet: bool, **
     """
     from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.fitting import FitConfig
+    from tcpipe.learning.training import model_for
     from tcpipe.learning.training import train as run
 
+    given = {name for name in options if context.get_parameter_source(name) is not ParameterSource.DEFAULT}
     with progress("train", 1, quiet=quiet):
+        if options["model"] is None:
+            options["model"] = "resnet18" if given & _OF_THE_NETWORK else model_for(dataset)
         result = run(dataset, out, config=FitConfig(**options), fresh=fresh)
     say_result(result, as_json=as_json)

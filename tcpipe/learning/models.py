@@ -238,6 +238,8 @@ def load_model(path: str | Path) -> Model:
         raise ModelError(*(f"{problem}; train the model again" for problem in problems))
     table = read_table(place / RESIDUALS)
     residuals = {name: table.column(name).to_numpy() for name in table.column_names}
+    if "terrain_class" in residuals:  # of a map without classes: null
+        residuals["terrain_class"] = np.nan_to_num(residuals["terrain_class"].astype(np.float64)).astype(np.uint8)
     return Model(str(path), card, place, card_checksum(card), residuals)
 
 

@@ -17,6 +17,7 @@ from tcpipe.dataset.beside import beside_of, inputs_of
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.checkpoint import read_checkpoint
@@ -30,6 +31,9 @@ from tcpipe.terrain.relief import relief_m
 logger = logging.getLogger("tcpipe")
 
 _READ_TOGETHER = 1024
+
+FEW_SAMPLES = 5_000
+"""Training samples below which a network has nothing to show that a table has not (docs/how-to/reproduce.md)."""
 
 _CALLED = {"turn_radpm": "turn (turn_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
 
@@ -85,6 +89,22 @@ class TrainResult:
             f"{self.path}: trained on {fitted} samples, stopped by {held}; best of {self.epochs} epochs is {self.best_epoch}\n"
             f"held-out loss {self.held_out_loss:.4f}; {speed:.0f} samples/s on {self.device}, {share:.1f} % of the time feeding"
         )
+
+
+def model_for(dataset: str | Path) -> ModelKind:
+    """Return the kind of model that a dataset of this size is best served by, and say so."""
+    count = read_card(Path(dataset)).splits.get("train", 0)
+    kind: ModelKind = "table" if count < FEW_SAMPLES else "resnet18"
+    than, other = ("fewer than", "resnet18") if kind == "table" else ("not fewer than", "table")
+    logger.info(
+        "%d training samples are %s %d: a %s is trained; --model %s is the other choice",
+        count,
+        than,
+        FEW_SAMPLES,
+        kind,
+        other,
+    )
+    return kind
 
 
 def train(

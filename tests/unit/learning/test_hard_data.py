@@ -1,0 +1,124 @@
+"""Datasets that a model is not easily made of: few layers, few samples of a class, labels that say nothing or are not there."""
+
+import json
+
+import numpy as np
+import pytest
+from installed_command import plain_lines, tcpipe
+from made_models import made_model
+from synthetic_store import add_run, add_world, box, lanes, lonlat, region_file, segments
+
+from tcpipe.dataset import Split, open_dataset
+from tcpipe.errors import DatasetError
+from tcpipe.learning.evaluation_facts import EvaluateConfig
+from tcpipe.learning.evaluation_files import run_evaluation
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.models import load_model
+from tcpipe.learning.training import train
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store
+
+pytest.importorskip("lightgbm")
+
+CONFIG = EvaluateConfig(draws=1, baselines=False)
+real_column, real_labels = Split.column, Split.labels.fget
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory):
+    """A store whose map has heights alone, and its dataset."""
+    here = tmp_path_factory.mktemp("bare")
+    store = Store(here / "store")
+    store.root.mkdir()
+    add_world(store, here / "rasters", layers=())
+    for run_id, first in (("north", 1.0), ("south", -15.5)):
+        start, end = lanes(first + 2.0 * np.arange(8), -14.0, 14.0)
+        add_run(store, run_id, segments(run_id, start, end, start_ns=int(1e18 + first * 1e12)))
+    region = region_file(here / "region.geojson", box(-18, -18, 6, 18))
+    build_dataset(here / "dataset", store=store.root, split=region, recipe=Recipe())
+    return here
+
+
+@pytest.mark.parametrize("kind", ["table", "physics"])
+def test_heights_alone_are_enough(bare, tmp_path, kind):
+    train(bare / "dataset", tmp_path / "model", config=FitConfig(model=kind))
+    model = load_model(tmp_path / "model")
+    assert model.channels == ("height",)
+    found = run_evaluation(tmp_path / "model", bare / "dataset", tmp_path / "evaluation", config=CONFIG)
+    assert np.isfinite(found.values.splits["unseen"].errors["E"]["all"].rmse)
+    assert "unseen, energy E: " in str(found)
+    if kind == "physics":
+        path = {"type": "LineString", "coordinates": lonlat([(-10.0, 0.0), (5.0, 0.0)]).tolist()}
+        (tmp_path / "path.geojson").write_text(json.dumps(path))
+        done = tcpipe("predict-path", "model", "--path", "path.geojson", "--store", bare / "store", cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        away = {"type": "LineString", "coordinates": (lonlat([(0.0, 0.0), (9.0, 0.0)]) + 1.0).tolist()}
+        (tmp_path / "away.geojson").write_text(json.dumps(away))
+        lines = plain_lines(
+            tcpipe("predict-path", "model", "--path", "away.geojson", "--store", bare / "store", cwd=tmp_path), 1
+        )
+        assert "is not on map site" in lines
+
+
+@pytest.mark.parametrize("kind", ["table", "physics"])
+def test_three_samples_of_a_class_are_enough_to_be_told_something(dataset, tmp_path, kind, monkeypatch):
+    three = real_column(open_dataset(dataset)["train"], "sample_id")[:3]
+
+    def column(split, name):
+        found = real_column(split, name)
+        return np.where(np.isin(real_column(split, "sample_id"), three), 1, found) if name == "terrain_class" else found
+
+    monkeypatch.setattr(Split, "column", column)
+    train(dataset, tmp_path / "model", config=FitConfig(model=kind))
+    assert load_model(tmp_path / "model").class_counts[1] == 3
+    values = run_evaluation(tmp_path / "model", dataset, tmp_path / "evaluation", config=CONFIG).values
+    assert np.isfinite([row.errors.rmse for row in values.baselines]).all()
+
+
+@pytest.mark.parametrize("kind", ["table", "physics"])
+def test_labels_that_are_all_equal_are_predicted_and_compared_with_nothing(dataset, tmp_path, kind, monkeypatch):
+    monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), [150.0, 0.8], np.float32)))
+    train(dataset, tmp_path / "model", config=FitConfig(model=kind))
+    values = run_evaluation(tmp_path / "model", dataset, tmp_path / "evaluation", config=CONFIG).values
+    assert values.splits["test"].errors["w"]["all"].rmse < 1.0
+    assert np.isfinite([row.errors.rmse for row in values.baselines]).all()
+
+
+@pytest.mark.parametrize("kind", ["table", "physics"])
+def test_samples_without_a_label_are_left_out_and_counted(dataset, tmp_path, kind, monkeypatch, caplog):
+    def labels(split):
+        some = real_column(split, "start_ns") // 1_200_000_000 % 40 == 0
+        return np.where(some[:, None], np.nan, real_labels(split)) if split.name == "train" else real_labels(split)
+
+    monkeypatch.setattr(Split, "labels", property(labels))
+    caplog.set_level("INFO", "tcpipe")
+    train(dataset, tmp_path / "model", config=FitConfig(model=kind))
+    assert "samples of train have no label and are left out" in caplog.text
+    assert np.isfinite(load_model(tmp_path / "model").residuals["power_predicted_watt"]).all()
+    monkeypatch.setattr(Split, "labels", property(lambda split: np.full((len(split), 2), np.nan, np.float32)))
+    with pytest.raises(DatasetError, match="no labelled samples in split train"):
+        train(dataset, tmp_path / "none", config=FitConfig(model=kind))
+
+
+def test_a_small_dataset_gets_a_table_and_is_told_so(dataset, tmp_path):
+    done = tcpipe("train", dataset, "model", cwd=tmp_path)
+    assert load_model(tmp_path / "model").card.training.config.model == "table"
+    assert (
+        "training samples are fewer than 5000: a table is trained; --model resnet18 is the other choice" in done.stderr
+    )
+
+
+def test_who_gives_the_network_s_options_gets_the_network(dataset, tmp_path):
+    pytest.importorskip("torch")
+    tcpipe("train", dataset, "model", "--epochs", "1", "--width", "16", "--quiet", cwd=tmp_path)
+    assert load_model(tmp_path / "model").card.training.config.model == "resnet18"
+
+
+def test_a_model_of_an_older_schema_is_told_what_to_do(tmp_path):
+    pytest.importorskip("torch")
+    place = made_model(tmp_path / "model")
+    card = json.loads((place / "model.json").read_text())
+    (place / "model.json").write_text(json.dumps({**card, "schema_version": 1}))
+    line = plain_lines(tcpipe("evaluate", "model", tmp_path, cwd=tmp_path), 1)
+    assert "written by model schema 1, wanted 2; train the model again" in line
