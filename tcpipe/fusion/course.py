@@ -15,6 +15,8 @@ _MOVING_M = 0.3
 _MOVING_MPS = 0.2
 _OFTEN = 0.3
 _STEP_S = 1e-6
+_WILD = 5.0
+_TURNS_MPS2 = 2.0
 
 
 def course_rate(
@@ -23,16 +25,18 @@ def course_rate(
     """Return how fast the course over ground turns: stamps [s] from ``zero_ns`` on, twice a second at most, and rates [rad/s].
 
     The course is that of the way over a second, or over as many as it takes to be longer than the fixes are noisy; in between it turns
-    evenly. Where the odometry goes backwards, the body looks the other way.
+    evenly. Where the odometry goes backwards, the body looks the other way. Single wild fixes are bridged.
     """
     stamp_s = seconds(gnss.stamp_ns, zero_ns)
     grid_s = np.arange(stamp_s[0], stamp_s[-1], _GRID_S)
-    least_m = max(_MOVING_M, _CLEARLY * float(np.sqrt(np.median(gnss.variance_m2[:, :2]))))
+    std_m = float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
+    least_m = max(_MOVING_M, _CLEARLY * std_m)
+    places = _bridged(stamp_s, gnss.position_enu_m[:, :2] @ np.array([1.0, 1j]), std_m)[:, None]
     for window_s in _WINDOWS_S:
         rows = round(window_s / _GRID_S)
         if grid_s.size <= rows:
             return stamp_s[:1], np.zeros(1)
-        means = interval_means(stamp_s, gnss.position_enu_m[:, :2], grid_s - _GRID_S, grid_s + _GRID_S)
+        means = interval_means(stamp_s, np.column_stack((places.real, places.imag)), grid_s - _GRID_S, grid_s + _GRID_S)
         way = (means[rows:] - means[:-rows]) @ np.array([1.0, 1j])
         at_s = 0.5 * (grid_s[rows:] + grid_s[:-rows])
         moving = np.abs(way) > least_m
@@ -51,6 +55,21 @@ def course_rate(
     stamp_s = np.repeat(at_s, 2) + np.tile([-_STEP_S, _STEP_S], at_s.size)
     rate = np.repeat(np.diff(course) / np.diff(at_s), 2)
     return stamp_s, np.concatenate(([0.0], rate, [0.0]))
+
+
+def _bridged(stamp_s: NDArray[np.float64], places: NDArray[np.complex128], std_m: float) -> NDArray[np.complex128]:
+    """Return places [m], shape (N,), those on the line between their neighbours that lie further off it than noise and a turn explain."""
+    if places.size < 3:
+        return places
+    step_s = stamp_s[2:] - stamp_s[:-2]
+    share = (stamp_s[1:-1] - stamp_s[:-2]) / np.maximum(step_s, _STEP_S)
+    between = places[:-2] + share * (places[2:] - places[:-2])
+    off_m = np.concatenate(([0.0], np.abs(places[1:-1] - between), [0.0]))
+    wild = off_m[1:-1] > _WILD * std_m + _TURNS_MPS2 * step_s**2 / 8
+    wild &= off_m[1:-1] >= np.maximum(off_m[:-2], off_m[2:])  # its neighbours lie half as far off their lines
+    found = places.copy()
+    found[1:-1][wild] = between[wild]
+    return found
 
 
 def course_of(velocity_mps: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -22,7 +22,6 @@ from tcpipe.fusion.state_kernel import (
     PREDICT,
     REFUSED,
     REOPENED,
-    SCALED,
     VISUAL_VELOCITY,
     WHEEL_VELOCITY,
     Matrix,
@@ -193,7 +192,8 @@ def filter_block(
         k = kind[e]
         hears = False
         if k != PREDICT:
-            bias = 1.0 if mode[e] >= GYRO_TURN else -densities[mode[e], SCALED]
+            # A scale of the turn rate is told by turns alone: beside a lever arm the rate's own noise would pass for one.
+            bias = 1.0 if mode[e] >= GYRO_TURN else 0.0
             if k == GNSS_POSITION and opened[0] > 0.0 and _is_gone(x, P):
                 kept = 0.0
                 opened[:] = 0.0

@@ -15,7 +15,15 @@ from tcpipe.fusion.error_state_kernel import OFF_M, SURELY, filter_block, most_d
 from tcpipe.fusion.fix_errors import FixErrors
 from tcpipe.fusion.gates import chi_square_gate
 from tcpipe.fusion.measurements import DOPPLER, GNSS, VISUAL, WHEELS, InitialState, Measurements
-from tcpipe.fusion.process import glides, process_noise, scale_stds, turn_scale_std, turns_by_course
+from tcpipe.fusion.process import (
+    SLOPE_RAD,
+    glides,
+    process_noise,
+    scale_stds,
+    slope_std_rad,
+    turn_scale_std,
+    turns_by_course,
+)
 from tcpipe.fusion.signals import median_period_ns
 from tcpipe.fusion.smoother_kernel import smooth_block
 from tcpipe.fusion.timeline import EventTimeline
@@ -118,6 +126,7 @@ class FilterPass:
         self.unplaced = measurements.gnss is None
         self.along_course = glides(measurements)
         self.turns_by_course = turns_by_course(measurements)
+        self.slope_std_rad = slope_std_rad(measurements) or SLOPE_RAD
         if self.along_course:
             self._levers[:] = 0.0
         if measurements.imu is None and not measurements.odometries():

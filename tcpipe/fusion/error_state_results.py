@@ -9,7 +9,7 @@ from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_of
 from tcpipe.fusion.error_state_pass import DOF, ROLES, FilterPass, lags_of
 from tcpipe.fusion.measurements import GNSS
-from tcpipe.fusion.process import GROUND, ROLL_AS_TURN_RAD, SLOPE_RAD, UNSEEN_TURN_RADPS
+from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
@@ -32,8 +32,8 @@ def trajectory_of(
     if run.unplaced:
         outputs[:, 23:26] += (scale_std * (outputs[:, 18:21] - outputs[0, 18:21])) ** 2
     if run.turns_by_course:
-        # The course takes a sway of the antenna for a turn: nothing tells one from the other, and fixes are counted for both.
-        outputs[:, 23:25] += (ROLL_AS_TURN_RAD * run.antenna_m[2] * rotation[:, :2, 1]) ** 2
+        # The course takes a sway of the antenna for a turn: nothing tells one from the other, and roll is taken to be none.
+        outputs[:, 23:25] += (run.slope_std_rad * run.antenna_m[2] * rotation[:, :2, 1]) ** 2
     if run.unseen_yaw_std:
         _doubt_yaw(outputs, rotation, run.unseen_yaw_std, run.antenna_m)
     bias = outputs[:, 9:12] * (timeline.output_rate_radps if run.turn_scale_std else timeline.output_has_gyro[:, None])

@@ -69,8 +69,9 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
     second = _second_differences(left)
     scatter[:, 0] = scatter[:, 1] = _rolling_median(gnss, second) / (6 * _SQUARES_OF_TWO)
     scatter[:, 2] = _rolling_median(gnss, _second_differences(gnss.position_enu_m[:, 2])) / (6 * _SQUARES_OF_ONE)
+    least = np.minimum(np.maximum(0.01 * claimed, _LEAST_M**2), claimed)  # a robot that stands does not show it
     little = scatter < _LITTLE * claimed
-    white[little] = np.maximum(scatter, 0.01 * claimed)[little]
+    white[little] = np.maximum(scatter, least)[little]
     lasting[little] = (claimed - white)[little]
     if drawn is not None and gnss.unclaimed is not None:
         unclaimed = gnss.unclaimed & np.isfinite(scatter).all(1)
@@ -81,7 +82,7 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
         white[much] = scatter[much]
         wander_m2 = float(np.nanmedian(np.abs(left) ** 2)) / _SQUARES_OF_TWO if np.isfinite(left).any() else 0.0
         if wander_m2 > max(_UNCLAIMED**2 * float(np.median(claimed[:, 0])), _DRAWN_HOLDS_M**2):
-            white = np.maximum(scatter, 0.01 * claimed)
+            white = np.maximum(scatter, least)
             lasting[:] = np.maximum(lasting, _SHARE_SEEN**2 * wander_m2)
     lasts_s = np.where(lasting[:, 0] > _FLOAT_M**2, _METRES_LAST_S, _LASTS_S)
     return FixErrors(white, lasting, lasts_s)

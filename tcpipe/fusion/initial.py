@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion.course import course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.process import turn_sources
-from tcpipe.fusion.signals import integral, interval_means, seconds
+from tcpipe.fusion.signals import integral, interval_means, median_of_five, seconds
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
 _MIN_COURSE_M = 5.0
@@ -191,7 +191,7 @@ class _Fit:
 def _course_fit(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
     """Find the first window of fixes that the drawn path fits; the best of all where none fits well."""
     stamp_s = seconds(gnss.stamp_ns, start_ns)
-    east_north = _smoothed(gnss.position_enu_m[:, 0]) + 1j * _smoothed(gnss.position_enu_m[:, 1])
+    east_north = median_of_five(gnss.position_enu_m[:, 0]) + 1j * median_of_five(gnss.position_enu_m[:, 1])
     noise = float(np.median(np.sqrt(gnss.variance_m2[:, :2].mean(1))))
     wanted = max(_MIN_COURSE_M, _MIN_COURSE_STD * noise)
     drawn = path.antenna(stamp_s)
@@ -217,14 +217,6 @@ def _course_fit(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
             return fit
         best = fit if best is None or fit.residual_m < best.residual_m else best
     return best
-
-
-def _smoothed(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Take the running median of five: single outliers vanish."""
-    if values.size < 5:
-        return values
-    padded = np.concatenate((values[:1], values[:1], values, values[-1:], values[-1:]))
-    return np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
 
 
 def _fit(

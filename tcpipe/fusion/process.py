@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.measurements import BodyVelocities, GroundVelocities, InertialMeasurements, Measurements, Positions
-from tcpipe.fusion.signals import in_gap, median_period_ns, seconds, slopes, white_noise
+from tcpipe.fusion.signals import in_gap, median_of_five, median_period_ns, seconds, slopes, white_noise
 
 WHEEL_SCALE_STD = 0.12  # a skid-steered robot on grass slips by so much
 VISUAL_SCALE_STD = 0.05
@@ -23,7 +23,6 @@ _WHEEL_SCALE_TIME_S = 60.0
 _WHEEL_TURN_SCALE_STD, _VISUAL_TURN_SCALE_STD = 0.2, 0.03
 _TURN_SCALE_TIME_S = 60.0
 SLOPE_RAD = 0.1  # of ground, where nothing shows it
-ROLL_AS_TURN_RAD = 0.06  # of a body whose turns the course alone tells, beyond what the filter knows
 DOPPLER_LASTS_S = 3.0  # what a correlation that fades in 1.5 s weighs
 UNSEEN_TURN_RADPS = 0.07  # roll and pitch of a robot on uneven ground
 GROUND = 2e-3  # rad²/m: how fast the ground's slope changes under a robot: 2.6° over a metre
@@ -39,6 +38,8 @@ _UNSEEN_SLIDE = 4e-4  # m²/s³
 _FIXES, _FIX_WINDOW_S, _UNSEEN_LASTS_S, _UNSEEN_STEADY = 5, 1.0, 0.2, 1e-3  # the last in m²/s³
 _SHOWS_COURSE_MPS = 0.2
 _UNSEEN_MPS = 0.5  # of a velocity told by fixes: more, and they do not show how it changes
+_LEVEL_STD_RAD, _HELD_STD_RAD = 0.7, 0.05
+_CHORD_S, _CHORD_M, _STEEPEST, _SLOPE_LASTS_M = 4.0, 1.0, 0.6, 10.0
 _UNKNOWN = 0.3  # m²/s³: a robot of which only positions are known
 
 
@@ -70,6 +71,35 @@ def _fix_velocity_std_mps(gnss: Positions) -> float:
 
 def _window_s(gnss: Positions) -> float:
     return max(_FIX_WINDOW_S, _FIXES * 1e-9 * median_period_ns(gnss.stamp_ns))
+
+
+def slope_std_rad(measurements: Measurements) -> float | None:
+    """Return how steep the ground is by how fixes climb it [rad], root mean square; None where they are too few or too noisy.
+
+    It is as steep across as along. One deviation is added of what so few slopes tell: each lasts for some metres.
+    """
+    gnss = measurements.gnss
+    if gnss is None or gnss.stamp_ns.size < _FIXES:
+        return None
+    rows = max(1, round(_CHORD_S * 1e9 / median_period_ns(gnss.stamp_ns)))
+    east, north, up = (median_of_five(axis) for axis in gnss.position_enu_m.T)
+    way_m = np.hypot(east[rows:] - east[:-rows], north[rows:] - north[:-rows])
+    climbs = way_m > _CHORD_M
+    if climbs.sum() < _FIXES:
+        return None
+    slope = ((up[rows:] - up[:-rows]) / np.maximum(way_m, _CHORD_M))[climbs].clip(-_STEEPEST, _STEEPEST)
+    noise = float(2.0 * np.median(gnss.variance_m2[:, 2]) / np.median(way_m[climbs]) ** 2)
+    told = float(np.mean(slope**2)) - noise
+    slopes_seen = max(1.0, float(np.sum(way_m[climbs])) / rows / _SLOPE_LASTS_M)
+    return float(np.sqrt(told)) * (1.0 + float(np.sqrt(0.5 / slopes_seen))) if told > noise else None
+
+
+def level_stds_rad(measurements: Measurements) -> tuple[float, float]:
+    """Return the deviations with which pitch and roll are said, once a second, to be small where no accelerometer tells them.
+
+    Where the course alone tells the turns, what the antenna sways by would pass for roll: it is held.
+    """
+    return _LEVEL_STD_RAD, _HELD_STD_RAD if turns_by_course(measurements) else _LEVEL_STD_RAD
 
 
 def turn_scale_std(measurements: Measurements) -> float:

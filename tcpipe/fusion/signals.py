@@ -90,6 +90,14 @@ def median_period_ns(stamp_ns: NDArray[np.int64]) -> int:
     return max(1, int(np.median(np.diff(stamp_ns)))) if stamp_ns.size > 1 else 1
 
 
+def median_of_five(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the running median of five of a signal (N,), its ends repeated: single outliers vanish."""
+    if values.size < 5:
+        return values
+    padded = np.pad(values, 2, mode="edge")
+    return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
+
+
 def slopes(stamp_ns: NDArray[np.int64], values: NDArray[np.float64], window_s: float) -> NDArray[np.float64]:
     """Return the slope [u/s] at each sample of the line through the samples within half a window, shape (N,); 0 where there is one only."""
     t = seconds(stamp_ns, int(stamp_ns[0]))

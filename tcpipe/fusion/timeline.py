@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements
-from tcpipe.fusion.process import DOPPLER_LASTS_S, UNSEEN_TURN_RADPS, glides, shake_density, turn_sources
+from tcpipe.fusion.process import DOPPLER_LASTS_S, UNSEEN_TURN_RADPS, glides, level_stds_rad, shake_density, turn_sources
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 
 _MAX_STEP_NS = 50_000_000
@@ -37,7 +37,6 @@ _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _STANDING_NS = 200_000_000
 _STANDING_STD_MPS = 0.01
 _LEVEL_NS = 1_000_000_000
-_LEVEL_STD_RAD = 0.7
 _MIN_INPUT_GAP_NS = 100_000_000
 _PIECE = 1 << 15
 
@@ -188,7 +187,7 @@ def _constraints(measurements: Measurements, standing_ns: NDArray[np.int64], sta
     imu = measurements.imu
     if imu is None or not imu.accelerometer_usable:
         grid = np.arange(start, end, _LEVEL_NS, dtype=np.int64)
-        parts.append(_constant(grid, kernel.LEVEL, (_LEVEL_STD_RAD, _LEVEL_STD_RAD, 1.0)))
+        parts.append(_constant(grid, kernel.LEVEL, (*level_stds_rad(measurements), 1.0)))
     if imu is not None and standing_ns.size:
         grid = np.concatenate([np.arange(a, b, _STANDING_NS, dtype=np.int64) for a, b in standing_ns])
         grid = grid[(grid >= start) & (grid <= end)]

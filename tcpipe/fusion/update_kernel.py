@@ -37,7 +37,7 @@ def observation(U: Matrix, Z: Matrix, H: Matrix) -> None:
 
 @kernel
 def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: Vector) -> None:
-    """Measurement h(x) of an event; w: angular velocity now, of which ``bias`` times b_g is taken off; -1 where b_g are scale errors."""
+    """Measurement h(x) of an event; w: angular velocity now, of which ``bias`` times b_g is taken off."""
     out[0] = 0.0
     out[1] = 0.0
     out[2] = 0.0
@@ -56,9 +56,9 @@ def _expected(kind: int, x: Vector, w: Vector, lever: Vector, bias: float, out: 
         out[0] = x[6]
         out[1] = x[7]
     else:
-        w0 = w[0] - x[9] * (bias if bias >= 0.0 else w[0])
-        w1 = w[1] - x[10] * (bias if bias >= 0.0 else w[1])
-        w2 = w[2] - x[11] * (bias if bias >= 0.0 else w[2])
+        w0 = w[0] - x[9] * bias
+        w1 = w[1] - x[10] * bias
+        w2 = w[2] - x[11] * bias
         v0 = x[0] * x[15] + x[3] * x[16] + x[6] * x[17] + w1 * lever[2] - w2 * lever[1]
         v1 = x[1] * x[15] + x[4] * x[16] + x[7] * x[17] + w2 * lever[0] - w0 * lever[2]
         v2 = x[2] * x[15] + x[5] * x[16] + x[8] * x[17] + w0 * lever[1] - w1 * lever[0]

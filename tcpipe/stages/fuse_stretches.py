@@ -80,8 +80,10 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
 def _doubted(found: Trajectory, stretch: Stretch, inputs: FusionInputs) -> Trajectory:
     """Return the trajectory with what is not known of a mended or unstated mounting."""
     gnss = stretch.measurements.gnss
-    covariance = None if gnss is None else antenna_doubt(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
-    return found if covariance is None else with_antenna_doubt(found, covariance)
+    if gnss is None:
+        return found
+    covariance = antenna_doubt(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
+    return found if covariance is None else with_antenna_doubt(found, covariance, gnss)
 
 
 def _initial(stretch: Stretch, last: Trajectory | None) -> InitialState:

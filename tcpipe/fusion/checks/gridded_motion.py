@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.lags import GRID_S, Floats, averaged, gridded
 from tcpipe.fusion.measurements import BodyVelocities, Positions
-from tcpipe.fusion.signals import median_period_ns
+from tcpipe.fusion.signals import median_of_five, median_period_ns
 
 FIXES_S = 0.5
 """A velocity is made of fixes averaged over, and taken apart by, this long [s]."""
@@ -81,8 +81,4 @@ def _strays(values: Floats) -> NDArray[np.bool_]:
 
 def _off_neighbours(values: Floats) -> Floats:
     """Return each sample's distance from the median of the five around it; 0 for fewer than five samples."""
-    if values.size < 5:
-        return np.zeros(values.size)
-    padded = np.concatenate((values[:1], values[:1], values, values[-1:], values[-1:]))
-    medians: Floats = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
-    return np.abs(values - medians)
+    return np.abs(values - median_of_five(values))

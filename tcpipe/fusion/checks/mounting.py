@@ -27,7 +27,7 @@ from tcpipe.fusion.measurements import (
     Measurements,
     Positions,
 )
-from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
+from tcpipe.fusion.signals import in_gap, interval_means, median_of_five, median_period_ns, seconds
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, product, quat_from_rpy, rotate
 
@@ -50,6 +50,7 @@ _TURNS_RADPS = 0.1
 _TURNING_POINT_STD_M = {WHEELS: 0.03, VISUAL: 0.01}
 _MOVES_MPS = 0.3
 _BLOCK_S = 10.0
+_HELD_S = 30.0
 _CLIMB_S = 4.0
 _LEAST_TILT_STD_RAD = 0.004
 _STATED_TILT_STD_RAD = 0.0175
@@ -267,10 +268,7 @@ def _climb_mps(gnss: Positions, stamp_ns: NDArray[np.int64]) -> tuple[Floats, ND
     The track would not do: an IMU that is surely pitched may have led it off the fixes.
     """
     zero, reach_ns = int(stamp_ns[0]), int(_CLIMB_S * 0.5e9)
-    height = gnss.position_enu_m[:, 2]
-    if height.size > 4:
-        padded = np.pad(height, 2, mode="edge")
-        height = np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1)
+    height = median_of_five(gnss.position_enu_m[:, 2])
     before, after = stamp_ns[:-1] - reach_ns, stamp_ns[1:] + reach_ns
     fix_s = seconds(gnss.stamp_ns, zero)
     low, high = (np.interp(seconds(at_ns, zero), fix_s, height) for at_ns in (before, after))
@@ -325,18 +323,33 @@ def rearmed(gnss: Positions, error_m: Floats) -> Positions:
     return replace(gnss, lever_arm_m=(x, y, z))
 
 
-def with_antenna_doubt(found: Trajectory, covariance_m2: Floats) -> Trajectory:
-    """Return the trajectory with what is not known of the arm: it turns with the robot, so that ways and speeds err where it turns."""
+def with_antenna_doubt(found: Trajectory, covariance_m2: Floats, gnss: Positions) -> Trajectory:
+    """Return the trajectory with what is not known of the arm: it turns with the robot, so that ways and speeds err where it turns.
+
+    They err as far as the fixes tell them: a metre that odometry tells, between fixes of a metre, knows nothing of the arm.
+    """
     rotation, rate = matrix_from_quat(found.quat_xyzw), found.angular_velocity_radps
     doubt_m2 = np.einsum("kij,jl,kil->ki", rotation, covariance_m2, rotation)
     ahead = np.column_stack((np.zeros(rate.shape[0]), -rate[:, 2], rate[:, 1]))  # of w x l
     speed_m2ps2 = np.einsum("ki,ij,kj->k", ahead, covariance_m2, ahead)
+    share = _share_of_fixes(found, gnss)
+    swung_m = share * _swung_std_m(found, rotation, covariance_m2)
     return replace(
         found,
         position_std_m=np.sqrt(found.position_std_m**2 + doubt_m2),
-        forward_velocity_std_mps=np.sqrt(found.forward_velocity_std_mps**2 + speed_m2ps2),
-        displacement_std_m=np.hypot(found.displacement_std_m, _swung_std_m(found, rotation, covariance_m2)),
+        forward_velocity_std_mps=np.sqrt(found.forward_velocity_std_mps**2 + share[:, 0] ** 2 * speed_m2ps2),
+        displacement_std_m=np.hypot(found.displacement_std_m, swung_m),
     )
+
+
+def _share_of_fixes(found: Trajectory, gnss: Positions) -> Floats:
+    """Return how much of what is known of each displacement the fixes may tell, shape (N, 4), at most 1.
+
+    Those within half a minute, for so long odometry holds, tell it to no less than 2 var / number [m²].
+    """
+    count = max(1.0, _HELD_S * 1e9 / median_period_ns(gnss.stamp_ns))
+    alone_m2 = 2.0 * float(np.median(gnss.variance_m2[:, :2])) / count
+    return np.asarray(np.minimum(1.0, np.nan_to_num(found.displacement_std_m, nan=np.inf) ** 2 / alone_m2))
 
 
 def _swung_std_m(found: Trajectory, rotation: Floats, covariance_m2: Floats) -> Floats:

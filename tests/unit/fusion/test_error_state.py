@@ -10,11 +10,13 @@ from unit.fusion import drive
 
 from tcpipe.errors import FusionError
 from tcpipe.fusion.error_state import run_error_state
+from tcpipe.fusion.error_state_pass import FilterPass, lags_of
 from tcpipe.fusion.fix_errors import find_fix_errors
 from tcpipe.fusion.initial import find_initial_state
 from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS
-from tcpipe.fusion.process import ROLL_AS_TURN_RAD, WHEEL_SCALE_STD
+from tcpipe.fusion.process import WHEEL_SCALE_STD, slope_std_rad
 from tcpipe.fusion.standing import standing_intervals
+from tcpipe.fusion.timeline import build_timeline
 from tcpipe.geometry.rotation import matrix_from_quat
 
 PERIOD_NS = 50_000_000
@@ -272,10 +274,28 @@ def test_a_speed_without_a_yaw_rate_goes_where_the_fixes_go():
     # The course takes a roll for a turn: across the way nobody knows where below its antenna the robot is.
     rotation = matrix_from_quat(found.quat_xyzw)
     across = np.sqrt(np.sum((rotation[:, :2, 1] * found.position_std_m[:, :2]) ** 2, axis=1))
-    assert (
-        across
-        > ROLL_AS_TURN_RAD * abs(measurements.gnss.lever_arm_m[2]) * (1.0 - rotation[:, 2, 1] ** 2) / np.sqrt(2.0)
-    ).all()
+    slope = slope_std_rad(measurements)
+    assert slope is not None
+    sway_m = slope * abs(measurements.gnss.lever_arm_m[2])
+    assert (across > sway_m * (1.0 - rotation[:, 2, 1] ** 2) / np.sqrt(2.0)).all()
+
+
+def test_the_noise_of_a_turn_rate_is_no_scale_of_it():
+    """A camera off base_link feels each turn as a velocity: there the noise of its rate would pull the rate's scale towards nothing."""
+    measurements = drive.measure(truth(), 1, imu=False, wheels=False)
+    at_s = (measurements.visual.stamp_ns - drive.ZERO_NS) * 1e-9
+    rate = truth().at(truth().rate, at_s)
+    rate = rate + np.random.default_rng(3).normal(size=rate.shape) * 0.02
+    turning = replace(
+        measurements.visual, turn_rate_radps=rate, yaw_rate_radps=rate[:, 2], yaw_rate_var=np.full(at_s.size, 0.02**2)
+    )
+    output_ns = np.arange(int(measurements.gnss.stamp_ns[-1]) - 10**9, int(measurements.gnss.stamp_ns[-1]), 10**8)
+    seen = replace(measurements, visual=turning)
+    run = FilterPass(build_timeline(seen, standing_intervals(seen), output_ns), seen, 0.999, lags=lags_of(output_ns))
+    run.filtered(find_initial_state(seen, standing_intervals(seen), int(seen.gnss.stamp_ns[0])))
+    scale, std = run.last.x[9:12], np.sqrt(np.diag(run.last.P)[3:6])
+    assert std[0] < 0.08
+    assert (np.abs(scale) < 2.0 * std).all()
 
 
 def test_noisy_fixes_alone_say_that_they_hardly_tell_a_speed():

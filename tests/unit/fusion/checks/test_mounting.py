@@ -164,19 +164,19 @@ def test_without_fixes_or_force_nothing_tells_a_tilt(track, sensors):
     assert solve_tilt([]) is None
 
 
-def test_what_is_not_known_of_an_arm_turns_with_the_robot(track):
+def test_what_is_not_known_of_an_arm_turns_with_the_robot(track, sensors):
     """An arm known to 0.3 m ahead: of a robot that looks north, north is unknown."""
     north = replace(
         track,
         quat_xyzw=np.tile(Rotation.from_euler("z", 90, degrees=True).as_quat(), (track.stamp_ns.size, 1)),
         velocity_enu_mps=np.tile([0.0, 0.9, 0.0], (track.stamp_ns.size, 1)),
     )
-    doubted = with_antenna_doubt(north, np.diag([0.09, 0.0, 0.0]))
+    doubted = with_antenna_doubt(north, np.diag([0.09, 0.0, 0.0]), sensors.gnss)
     assert doubted.position_std_m[:, 0] == pytest.approx(0.01)
     assert doubted.position_std_m[:, 1] == pytest.approx(np.hypot(0.01, 0.3))
 
 
-def test_an_arms_error_that_goes_round_with_the_robot_is_an_error_of_ways_and_speeds_along_them(track):
+def test_an_arms_error_that_goes_round_with_the_robot_is_an_error_of_ways_and_speeds_along_them(track, sensors):
     """An antenna known to 0.1 m sideways on a circle: the chord is off by both ends' difference, 2 sin(half the turn), along itself."""
     turn_radps, speed_mps = 0.5, 1.0
     at_s = (track.stamp_ns - track.stamp_ns[0]) * 1e-9
@@ -187,15 +187,20 @@ def test_an_arms_error_that_goes_round_with_the_robot_is_an_error_of_ways_and_sp
         quat_xyzw=Rotation.from_rotvec(yaw[:, None] * [0.0, 0.0, 1.0]).as_quat(),
         velocity_enu_mps=speed_mps * np.column_stack((np.cos(yaw), np.sin(yaw), zero)),
         angular_velocity_radps=np.column_stack((zero, zero, zero + turn_radps)),
-        displacement_std_m=np.zeros_like(track.displacement_std_m),
+        displacement_std_m=np.full_like(track.displacement_std_m, 1e-4),
         forward_velocity_std_mps=zero,
     )
-    doubted = with_antenna_doubt(round_, np.diag([0.0, 0.01, 0.0]))
+    fixes = replace(sensors.gnss, variance_m2=np.full_like(sensors.gnss.variance_m2, 1e-8))
+    doubted = with_antenna_doubt(round_, np.diag([0.0, 0.01, 0.0]), fixes)
     assert doubted.forward_velocity_std_mps == pytest.approx(np.full(at_s.size, 0.1 * turn_radps))
     expected = 0.1 * 2.0 * np.sin(turn_radps * np.array([0.5, 1.0, 2.0, 4.0]) / 2.0)
-    assert doubted.displacement_std_m[:-100] == pytest.approx(np.tile(expected, (at_s.size - 100, 1)), rel=1e-6)
-    ahead = with_antenna_doubt(round_, np.diag([0.01, 0.0, 0.0]))
-    assert ahead.displacement_std_m == pytest.approx(0.0, abs=1e-9)
+    assert doubted.displacement_std_m[:-100] == pytest.approx(np.tile(expected, (at_s.size - 100, 1)), rel=1e-5)
+    ahead = with_antenna_doubt(round_, np.diag([0.01, 0.0, 0.0]), fixes)
+    assert ahead.displacement_std_m == pytest.approx(1e-4, abs=1e-9)
+    metres = replace(sensors.gnss, variance_m2=np.full_like(sensors.gnss.variance_m2, 1.0))  # odometry tells the way
+    assert with_antenna_doubt(round_, np.diag([0.0, 0.01, 0.0]), metres).displacement_std_m == pytest.approx(
+        1e-4, rel=1e-3
+    )
 
 
 def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
