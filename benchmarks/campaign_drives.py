@@ -83,6 +83,8 @@ class Fault:
     """A regular expression that a finding or error is to hold; nothing has to be said where it is empty."""
     may_refuse: bool = False
     """Whether a run without a segment is right: no sensor is left that could tell who is wrong, or nothing is to be labelled."""
+    unseen_m: float = 0.0
+    """By how much start points may err as no sensor tells, though here they do not: this robot turns about base_link exactly."""
     route: str = "hills"
     calibrated: bool = False
     """Whether nothing is wrong at all: then deviations are to be as large as errors, and bits rare."""

@@ -22,6 +22,8 @@ from tcpipe.simulation.sensors import Doppler, Gnss, Mounting, Power, Reading, S
 MINUTE_S = (90.0, 150.0)
 """The window of faults that last a minute."""
 _TOPICS = TOPICS["ros2"]
+_APART_M = 0.03
+"""How far ahead or behind base_link a skid-steered robot turns: an antenna found by the turns is found against that point."""
 _ASIDE = np.array([0.4, 0.3, 0.0])
 """Half a metre, neither along nor across any axis."""
 
@@ -322,9 +324,9 @@ FAULTS: dict[str, Fault] = {
         Fault("IMU pitched by 5 deg", ("imu",), told=_placed("imu", (0.0, 5 * _DEG, 0.0), (0.0, 0.0, 0.0))),
         Fault("IMU pitched by 2 deg", ("imu",), told=_placed("imu", (0.0, 2 * _DEG, 0.0), (0.0, 0.0, 0.0))),
         Fault("IMU rolled by 5 deg", ("imu",), told=_placed("imu", (5 * _DEG, 0.0, 0.0), (0.0, 0.0, 0.0))),
-        Fault("arm wrong fore-aft", ("gnss",), None, "arm|placement", told=_placed("gnss", (0, 0, 0), (0.5, 0, 0))),
-        Fault("arm wrong sideways", ("gnss",), None, "arm|placement", told=_placed("gnss", (0, 0, 0), (0, 0.5, 0))),
-        Fault("arm unknown", ("gnss",), None, "placement", messages=_without_gnss_place),
+        Fault("arm wrong fore-aft", ("gnss",), None, "arm|placement", unseen_m=_APART_M, told=_placed("gnss", (0, 0, 0), (0.5, 0, 0))),
+        Fault("arm wrong sideways", ("gnss",), None, "arm|placement", unseen_m=_APART_M, told=_placed("gnss", (0, 0, 0), (0, 0.5, 0))),
+        Fault("arm unknown", ("gnss",), None, "placement", unseen_m=_APART_M, messages=_without_gnss_place),
         # Clocks
         Fault("GNSS 0.1 s late", ("gnss",), None, "late", readings=_of("gnss", _late(0.1))),
         Fault("GNSS 0.2 s late", ("gnss",), None, "late", readings=_of("gnss", _late(0.2))),

@@ -64,7 +64,7 @@ class Figures:
     rms: dict[str, float] = field(default_factory=dict)
     inside: dict[str, dict[int, Share]] = field(default_factory=dict)
     width: dict[str, float] = field(default_factory=dict)
-    """Median deviation over RMS error."""
+    """Median deviation over RMS error, with what no sensor could tell (`Fault.unseen_m`) in that."""
     doubted: float = float("nan")
     doubted_clean: float = 0.0
     """Of the same sensors without a fault."""
@@ -136,7 +136,7 @@ def figures_of(cell: Cell, results: Sequence[Result], clean: Sequence[Result]) -
         made.doubted = float(pool.doubt.mean())
         counted = Counter(name for o in outcomes for bits in o.bits for name in bit_names(bits & ~no_doubt))
         made.bits = {name: count / pool.doubt.size for name, count in counted.items()}
-        _measure(made, pool, sure)
+        _measure(made, pool, sure, cell.fault.unseen_m)
         _yield(made, pool, _pool(clean, None, no_doubt=no_doubt))
     made.refused = sum(not o.bits for o in outcomes)
     made.needlessly = sum(r.oracle is None or r.oracle > 0 for r in results if not r.outcome.bits)
@@ -154,14 +154,14 @@ def map_figures(result: MapResult) -> Figures:
     return Figures(NAME, 1, {}, refused=int(result.refused), said=said, failures=result.failures)
 
 
-def _measure(made: Figures, pool: _Pool, sure: np.ndarray) -> None:
+def _measure(made: Figures, pool: _Pool, sure: np.ndarray, unseen_m: float) -> None:
     for name in QUANTITIES:
         rows = sure & np.isfinite(pool.error[name]) & np.isfinite(pool.claimed[name])
         if rows.sum() < _FEWEST:
             continue
         error, claimed = pool.error[name][rows], pool.claimed[name][rows]
         made.rms[name] = float(np.sqrt(np.mean(error**2)))
-        made.width[name] = float(np.median(claimed)) / made.rms[name]
+        made.width[name] = float(np.median(claimed) / np.hypot(made.rms[name], unseen_m if name == "start" else 0.0))
         made.inside[name] = {k: _share(error <= k * claimed, pool.block[rows]) for k in BANDS}
 
 

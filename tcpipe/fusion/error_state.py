@@ -117,21 +117,28 @@ class _Case:
         self, timeline: EventTimeline, spans: Spans = (), *, follows: bool = True, keep: bool = False
     ) -> tuple[FilterPass, NDArray[np.float64]]:
         """Return the forward pass in which the error of the fixes is free in ``spans``, and its states at the wanted stamps."""
-        lags = lags_of(self.output_ns)
-        run = FilterPass(timeline, self.measurements, self.gate_probability, lags=lags)
+        run = self.prepared(timeline, spans, follows=follows)
+        return run, run.filtered(self.initial, keep=keep)
+
+    def prepared(self, timeline: EventTimeline, spans: Spans, *, follows: bool) -> FilterPass:
+        """Return the pass before it is made."""
+        run = FilterPass(timeline, self.measurements, self.gate_probability, lags=lags_of(self.output_ns))
         if self.errors is not None:
             run.doubt_fixes(self.errors, spans, follows=follows)
-        return run, run.filtered(self.initial, keep=keep)
+        return run
 
 
 def _wrong_fixes(case: _Case, timeline: EventTimeline) -> WrongFixes | None:
     """Return when the fixes erred together, where that explains what contradicts them."""
     follower, _ = case.passed(timeline)
     known = tuple((r.start_ns, r.end_ns) for r in reopenings(timeline, follower) if r.role == GNSS)
-    usual = case.passed(timeline, follows=False)[0].usual()
+    plain, _ = case.passed(timeline, follows=False)
+    usual = plain.usual()
 
     def tried(spans: Spans) -> Explained:
-        run, _ = case.passed(timeline, spans, follows=False)
+        run = case.prepared(timeline, spans, follows=False) if spans else plain
+        if spans:
+            run.filtered_like(plain, case.initial)
         return run.explained(spans, usual)
 
     return find_wrong_fixes(tried, (int(timeline.stamp_ns[0]), int(timeline.stamp_ns[-1])), known)

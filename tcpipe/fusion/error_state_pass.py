@@ -203,20 +203,32 @@ class FilterPass:
 
     def filtered(self, initial: InitialState, *, keep: bool = False) -> NDArray[np.float64]:
         """Forward states at the wanted stamps, rows as `state_kernel.saved` fills them; ``keep`` what `smooth` wants."""
-        count = self.timeline.stamp_ns.size
         outputs = np.full((self.timeline.output.max() + 1, kernel.SAVED), np.nan)
         blocks = self._blocks()
         memory = _start(initial, self.scale_stds, self.turn_scale_std, self.start_error_m2)
         self._checkpoints, self._kept = [], {}
-        if not keep:
-            self._forward(0, count, memory, outputs, None)
-        for index, (first, last) in enumerate(blocks if keep else ()):
+        for index, (first, last) in enumerate(blocks):
             self._checkpoints.append(memory.copy())
-            if index >= len(blocks) - _KEPT_BLOCKS:
+            if keep and index >= len(blocks) - _KEPT_BLOCKS:
                 self._kept[index] = self._store(first, last)
             self._forward(first, last, memory, outputs, self._kept.get(index))
         self.last = memory
         return outputs
+
+    def filtered_like(self, other: FilterPass, initial: InitialState) -> None:
+        """Filter, states not kept, what of a timeline differs from ``other``: from its checkpoint before the fixes' error is another."""
+        count = self.timeline.stamp_ns.size
+        changed = self.kept_error != other.kept_error
+        changed |= (self.error_noise_m2 != other.error_noise_m2).any(1)
+        changed |= (self.error_level_m2 != other.error_level_m2).any(1)
+        first = (int(np.argmax(changed)) if changed.any() else count - 1) // _BLOCK * _BLOCK
+        for name in ("nis", "innovation", "verdict"):
+            getattr(self, name)[:first] = getattr(other, name)[:first]
+        outputs = np.full((self.timeline.output.max() + 1, kernel.SAVED), np.nan)
+        memory = other._checkpoints[first // _BLOCK].copy()
+        if first == 0:  # the fixes' error at the start may be another, too
+            memory = _start(initial, self.scale_stds, self.turn_scale_std, self.start_error_m2)
+        self._forward(first, count, memory, outputs, None)
 
     def smoothed(self, initial: InitialState) -> NDArray[np.float64]:
         """Smoothed states at the wanted stamps."""

@@ -9,7 +9,7 @@ from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_of
 from tcpipe.fusion.error_state_pass import DOF, ROLES, FilterPass, lags_of
 from tcpipe.fusion.measurements import GNSS
-from tcpipe.fusion.process import GROUND, SLOPE_RAD, UNSEEN_TURN_RADPS
+from tcpipe.fusion.process import GROUND, UNSEEN_TURN_RADPS
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
@@ -25,7 +25,7 @@ def trajectory_of(
     """
     rate_radps = timeline.output_rate_radps
     if run.along_course:
-        rate_radps = _look_along(outputs, output_ns, run.antenna_m)
+        rate_radps = _look_along(outputs, output_ns, run.antenna_m, run.slope_std_rad)
     rotation = outputs[:, 0:9].reshape(-1, 3, 3)
     scale_std, speed_mps = run.unseen_scale_std, np.linalg.norm(outputs[:, 15:18], axis=1)
     outputs[:, 23:26] += run.lasting_m2
@@ -56,7 +56,7 @@ def trajectory_of(
 
 
 def _look_along(
-    outputs: NDArray[np.float64], output_ns: NDArray[np.int64], antenna_m: NDArray[np.float64]
+    outputs: NDArray[np.float64], output_ns: NDArray[np.int64], antenna_m: NDArray[np.float64], slope_std_rad: float
 ) -> NDArray[np.float64]:
     """Make the antenna's states the body's, level and along its course; return how fast that turns [rad/s], shape (N, 3)."""
     yaw = course_of(outputs[:, 15:18])
@@ -64,7 +64,7 @@ def _look_along(
     outputs[:, 0:9] = rotation.reshape(-1, 9)
     outputs[:, 18:21] -= rotation @ antenna_m
     # The antenna sways over ground that no sensor shows.
-    outputs[:, 23:25] += (SLOPE_RAD * antenna_m[2]) ** 2
+    outputs[:, 23:25] += (slope_std_rad * antenna_m[2]) ** 2
     outputs[:, 27] += (UNSEEN_TURN_RADPS * antenna_m[2]) ** 2
     rate = np.zeros((yaw.size, 3))
     if yaw.size > 1:
@@ -76,7 +76,7 @@ def _sway_m(run: FilterPass, speed_mps: NDArray[np.float64]) -> NDArray[np.float
     """Return by how much an antenna on a body of unseen attitude moves otherwise than the body over each displacement, shape (N, 4)."""
     if not run.along_course:
         return np.zeros((speed_mps.size, 1))
-    tilt2 = np.minimum(GROUND * speed_mps[:, None] * DISPLACEMENT_LAGS_S, 2 * SLOPE_RAD**2)
+    tilt2 = np.minimum(GROUND * speed_mps[:, None] * DISPLACEMENT_LAGS_S, 2 * run.slope_std_rad**2)
     return np.asarray(np.sqrt(tilt2) * abs(run.antenna_m[2]))
 
 

@@ -224,12 +224,16 @@ def lag_of(told: Sequence[ArmEvidence | None], moved_m: Floats) -> tuple[float, 
 
 
 def antenna_doubt(arm: Arm | None, tilt: Tilt | None, lever_arm_m: tuple[float, float, float]) -> Floats | None:
-    """Return the covariance of the arm that what was mended leaves [m²], shape (3, 3): a tilted IMU moves an antenna above it."""
+    """Return the covariance of the arm that what was mended leaves [m²], shape (3, 3): a tilted IMU moves an antenna above it.
+
+    A mounting that was not mended is as it is stated.
+    """
     if arm is None and tilt is None:
         return None
     covariance = np.zeros((3, 3)) if arm is None else arm.covariance[:3, :3].copy()
     if tilt is not None:
-        covariance[np.diag_indices(2)] += (tilt.std_rad[::-1] * lever_arm_m[2]) ** 2
+        left_rad = np.where(tilt.rad != 0.0, tilt.std_rad, 0.0)
+        covariance[np.diag_indices(2)] += (left_rad[::-1] * lever_arm_m[2]) ** 2
     return covariance
 
 
@@ -289,8 +293,8 @@ def solve_tilt(told: Sequence[TiltEvidence | None]) -> Tilt | None:
     turning, beside, moving, felt = (
         np.concatenate([getattr(e, name) for e in evidence]) for name in TiltEvidence.__slots__
     )
-    angles = np.array([_ratio(beside, turning), _ratio(-felt, moving)])
-    return Tilt(angles[:, 0], angles[:, 1])
+    (roll, roll_std), (pitch, pitch_std) = _ratio(beside, turning), _ratio(-felt, moving)
+    return Tilt(np.array([roll, pitch]), np.array([roll_std, np.hypot(pitch_std, _LEAST_TILT_STD_RAD)]))
 
 
 def _ratio(above: Floats, below: Floats) -> tuple[float, float]:
@@ -303,7 +307,7 @@ def _ratio(above: Floats, below: Floats) -> tuple[float, float]:
         return 0.0, _STATED_TILT_STD_RAD
     value = float(above.sum() / below.sum())
     std = float(np.sqrt(np.sum((above - value * below) ** 2) * blocks / (blocks - 1))) / float(below.sum())
-    return value, float(np.hypot(std, _LEAST_TILT_STD_RAD))
+    return value, std
 
 
 def levelled(imu: InertialMeasurements, tilt_rad: Floats) -> InertialMeasurements:

@@ -298,6 +298,30 @@ def test_the_noise_of_a_turn_rate_is_no_scale_of_it():
     assert (np.abs(scale) < 2.0 * std).all()
 
 
+@pytest.mark.parametrize("span_s", [(60.0, 90.0), (0.0, 40.0)])
+def test_a_pass_that_goes_on_from_another_ones_checkpoint_is_the_pass_itself(span_s):
+    measurements = drive.measure(truth(), 1)
+    standing, output_ns = standing_intervals(measurements), measurements.gnss.stamp_ns[:1]
+    timeline = build_timeline(measurements, standing, output_ns)
+    first_ns = int(timeline.stamp_ns[0])
+    initial = find_initial_state(measurements, standing, first_ns)
+    errors = find_fix_errors(measurements)
+    spans = (tuple(first_ns + int(at_s * 1e9) for at_s in span_s),)
+
+    def made(spans):
+        run = FilterPass(timeline, measurements, 0.999, lags=[1, 2, 4, 8])
+        run.doubt_fixes(errors, spans, follows=False)
+        return run
+
+    plain, whole, resumed = made(()), made(spans), made(spans)
+    plain.filtered(initial)
+    whole.filtered(initial)
+    resumed.filtered_like(plain, initial)
+    assert (whole.nis != plain.nis).any()
+    for name in ("nis", "innovation", "verdict"):
+        np.testing.assert_array_equal(getattr(resumed, name), getattr(whole, name))
+
+
 def test_noisy_fixes_alone_say_that_they_hardly_tell_a_speed():
     measurements = drive.measure(truth(), 1, imu=False, visual=False, wheels=False, gnss_std=2.3, gnss_hz=1.0)
     found = fuse(measurements)

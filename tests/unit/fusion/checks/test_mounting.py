@@ -205,9 +205,13 @@ def test_an_arms_error_that_goes_round_with_the_robot_is_an_error_of_ways_and_sp
 
 def test_a_tilt_that_is_known_so_well_moves_an_antenna_above_it():
     assert antenna_doubt(None, None, (0.0, 0.0, 1.0)) is None
-    tilt = Tilt(np.zeros(2), np.array([0.02, 0.01]))
+    tilt = Tilt(np.array([0.09, -0.03]), np.array([0.02, 0.01]))
     doubt = antenna_doubt(unknown_arm(), tilt, (0.0, 0.0, 0.9))
     assert np.diag(doubt) == pytest.approx([0.25 + 0.009**2, 0.25 + 0.018**2, 0.25])
+    rolled = antenna_doubt(
+        None, replace(tilt, rad=np.array([0.09, 0.0])), (0.0, 0.0, 0.9)
+    )  # its pitch is as it is stated
+    assert np.diag(rolled) == pytest.approx([0.0, 0.018**2, 0.0])
 
 
 def test_a_roll_that_no_turn_shows_stays_nothing(track, sensors):
