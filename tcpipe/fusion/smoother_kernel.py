@@ -194,6 +194,19 @@ def smooth_block(
 
 
 @kernel
+def _projected(K: Matrix, A: Matrix, B: Matrix) -> None:
+    """Fill B, shape (3, n), with K' A; K holds K'."""
+    n = A.shape[0]
+    for a in range(3):
+        for j in range(n):
+            B[a, j] = 0.0
+        for i in range(n):
+            f = K[a, i]
+            for j in range(n):
+                B[a, j] += f * A[i, j]
+
+
+@kernel
 def _before_update(
     K: Matrix, H: Matrix, y: Vector, adjoint: Vector, information: Matrix, chain: Matrix, B: Matrix
 ) -> None:
@@ -222,23 +235,11 @@ def _before_update(
         B[a, 0] = s
     for i in range(n):
         adjoint[i] -= H[0, i] * B[0, 0] + H[1, i] * B[1, 0] + H[2, i] * B[2, 0]
-    for a in range(3):  # K' chain
-        for j in range(n):
-            B[a, j] = 0.0
-        for i in range(n):
-            f = K[a, i]
-            for j in range(n):
-                B[a, j] += f * chain[i, j]
+    _projected(K, chain, B)
     for i in range(n):
         for j in range(n):
             chain[i, j] -= H[0, i] * B[0, j] + H[1, i] * B[1, j] + H[2, i] * B[2, j]
-    for a in range(3):  # K' L
-        for j in range(n):
-            B[a, j] = 0.0
-        for i in range(n):
-            f = K[a, i]
-            for j in range(n):
-                B[a, j] += f * information[i, j]
+    _projected(K, information, B)
     half = np.empty((3, 3))
     for a in range(3):
         for b in range(3):
