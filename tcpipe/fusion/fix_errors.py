@@ -72,7 +72,7 @@ def find_fix_errors(measurements: Measurements) -> FixErrors | None:
     least = np.minimum(np.maximum(0.01 * claimed, _LEAST_M**2), claimed)  # a robot that stands does not show it
     little = scatter < _LITTLE * claimed
     white[little] = np.maximum(scatter, least)[little]
-    lasting[little] = (claimed - white)[little]
+    lasting[little] = np.minimum(claimed - scatter, 0.99 * claimed)[little]
     if drawn is not None and gnss.unclaimed is not None:
         unclaimed = gnss.unclaimed & np.isfinite(scatter).all(1)
         white[unclaimed] = np.maximum(scatter, _LEAST_M**2)[unclaimed]

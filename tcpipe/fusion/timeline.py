@@ -26,7 +26,14 @@ from numpy.typing import NDArray
 from tcpipe.fusion import state_kernel as kernel
 from tcpipe.fusion.course import course_rate
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements
-from tcpipe.fusion.process import DOPPLER_LASTS_S, UNSEEN_TURN_RADPS, glides, level_stds_rad, shake_density, turn_sources
+from tcpipe.fusion.process import (
+    DOPPLER_LASTS_S,
+    UNSEEN_TURN_RADPS,
+    glides,
+    level_stds_rad,
+    shake_density,
+    turn_sources,
+)
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 
 _MAX_STEP_NS = 50_000_000
