@@ -33,6 +33,7 @@ from tcpipe.cli.report import report
 from tcpipe.cli.reproduce import reproduce
 from tcpipe.cli.schemas import schemas
 from tcpipe.cli.simulate import simulate
+from tcpipe.cli.status import status
 from tcpipe.cli.train import train
 from tcpipe.cli.verify import verify
 from tcpipe.errors import TcpipeError, UsageError
@@ -67,6 +68,7 @@ for command in (
     init,
     inspect,
     ingest,
+    status,
     accept,
     add_map,
     build_dataset,

@@ -58,6 +58,7 @@ if TYPE_CHECKING:
 )
 @click.option("--retry-failed", is_flag=True, help="Try again what is known to fail.")
 @click.option("--force", is_flag=True, help="Do again what is there already, and what is known to fail.")
+@click.option("--dry-run", is_flag=True, help="Say what would be done, and what it would take; do nothing.")
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
 @quiet_option
 def ingest(
@@ -75,6 +76,7 @@ def ingest(
     min_age_s: float,
     retry_failed: bool,
     force: bool,
+    dry_run: bool,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -87,7 +89,9 @@ def ingest(
     Exit code 3: some logs failed or are damaged, and that is news: it was not told before, and not accepted (tcpipe
     accept).
     """
-    from tcpipe.cli.output import print_json_line, progress, ruling_recipe
+    from dataclasses import replace
+
+    from tcpipe.cli.output import print_json_line, progress, ruling_recipe, say_result
     from tcpipe.formats.json_files import recast
     from tcpipe.pipeline.ingest import SummaryLine
     from tcpipe.pipeline.ingest import ingest as run
@@ -96,6 +100,25 @@ def ingest(
     ruling, source = ruling_recipe(recipe)
     if not as_json:
         say(f"recipe: {source}")
+    if dry_run:
+        from tcpipe.pipeline.status import status
+
+        planned = status(
+            logs,
+            store=store,
+            recipe=ruling,
+            robot=robot,
+            as_one=as_one,
+            shard=shard,
+            min_age_s=min_age_s,
+            message_definitions=Path(msgdef) if msgdef else None,
+            force=force,
+            retry_failed=retry_failed,
+            jobs=jobs,
+            create=True,
+        )
+        say_result(replace(planned, history=()), as_json=as_json)
+        return 0
     with progress("ingest", 1, quiet=quiet) as shown:
 
         def on_result(result: IngestResult) -> None:

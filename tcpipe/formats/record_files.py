@@ -6,8 +6,9 @@ The name of a record follows from the fact, so that the same fact is one file wh
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TypeVar
 
@@ -48,6 +49,47 @@ class Superseded:
     run_id: str
     by: str | None
     number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """What a call of ingest or build-dataset did and took; times are of the clock of where it ran."""
+
+    command: str
+    version: str
+    exit_code: int
+    counts: Mapping[str, int]
+    """Logs by what became of them; or samples and runs."""
+    jobs: int = 1
+    begin: str = ""
+    """UTC, ISO 8601."""
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    """Of its process and the workers on the same machine."""
+    logs: tuple[str, ...] = ()
+    """As they were given, in full."""
+    failed: Mapping[str, str] = field(default_factory=dict)
+    """By log, why it failed for what may pass."""
+    done_bytes: int = 0
+    """Size of the logs that came in [byte]."""
+    written_bytes: int = 0
+    """What was written for them, or the size of the dataset [byte]."""
+
+    @property
+    def end(self) -> str:
+        """When it ended, as ``begin``."""
+        return (datetime.fromisoformat(self.begin) + timedelta(seconds=self.wall_s)).isoformat(timespec="seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetMade:
+    """Which ingestions a dataset is made of, and where it was written; nothing that it refers to is removed."""
+
+    out: str
+    inputs: str
+    """The digest in its card."""
+    runs: tuple[tuple[str, str], ...]
+    """Runs and their recipes."""
 
 
 def record_name(digest: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
@@ -16,14 +17,15 @@ from typing import Literal, TypeVar
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
-from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
-from tcpipe.formats.record_files import Sighting, Superseded, record_name
+from tcpipe.formats.record_files import Call, record_name
 from tcpipe.formats.robot_files import profiles_of
+from tcpipe.pipeline.calls import INGEST, remember_call, room_of, started
 from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
+from tcpipe.pipeline.known_runs import KnownRuns, known_runs
 from tcpipe.pipeline.known_trouble import Trouble
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
@@ -36,7 +38,7 @@ from tcpipe.pipeline.log_sources import (
 )
 from tcpipe.pipeline.supersession import remember_earlier, superseded_by
 from tcpipe.recipe import Recipe
-from tcpipe.store import Ingestions, Store, add_by_hash, open_store
+from tcpipe.store import Store, add_by_hash, open_store
 
 R = TypeVar("R")
 
@@ -129,6 +131,7 @@ def ingest(
         When nothing can be begun; what goes wrong with one log or path stands in its result.
 
     """
+    watch = started()
     ruling = recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(_as_path(recipe), Path.cwd()))
     robot = robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
@@ -139,7 +142,7 @@ def ingest(
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(store, create=True)
         remember_earlier(opened)
-        known = _known(opened, force=force)
+        known = known_runs(opened, force=force)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
         root = opened.root
         if cluster is not None:  # its workers are elsewhere
@@ -159,38 +162,32 @@ def ingest(
             if source is not None:
                 _remember(opened, tasks[index], source, result, known)
         _keep_index(opened, known, results.values())
-        return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
+        summary = IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
+        if any(result.run_id for result in summary.results):  # else no store may remain
+            remember_call(opened, watch, _call_of(opened, summary, logs, tasks, jobs))
+        return summary
 
 
-@dataclass(frozen=True, slots=True)
-class _Known:
-    """What a store holds when the call begins."""
-
-    runs: Ingestions
-    made: Mapping[str, list[RunFacts]]
-    """Finished ingestions, by the sha256 of the log."""
-    seen: Mapping[str, list[Sighting]]
-    """Logs that were seen, by lineage; none where they are to be read again."""
-    parties: frozenset[str]
-    """Runs that another has taken the place of, or did once, and those others."""
-
-    def has_seen(self, source: LogSource, sha256: str) -> bool:
-        """Tell whether this is remembered of the log."""
-        return source.sighting(sha256) in self.seen.get(source.lineage, ())
-
-
-def _known(store: Store, *, force: bool) -> _Known:
-    runs, made = store.ingestions(), dict[str, list[RunFacts]]()
-    for facts in runs.rows.values():
-        if facts.log is not None:
-            made.setdefault(facts.log.source.sha256, []).append(facts)
-    parties = {
-        party for record in store.records("superseded", Superseded) for party in (record.run_id, record.by) if party
-    }
-    return _Known(runs, made, {} if force else store.seen_logs(), frozenset(parties))
+def _call_of(
+    store: Store, summary: IngestSummary, logs: Iterable[str | Path], tasks: Iterable[IngestTask], jobs: int
+) -> Call:
+    """Return what the history holds of a call."""
+    done = [result for result in summary.results if result.status in ("done", "damaged")]
+    sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
+    return Call(
+        INGEST,
+        __version__,
+        summary.exit_code,
+        Counter(result.status for result in summary.results),
+        jobs,
+        logs=tuple(str(log) if is_url(log) else str(Path(log).absolute()) for log in logs),
+        failed={result.log: result.problems[0] for result in summary.results if result.transient and result.problems},
+        done_bytes=sum(sizes.get(result.log, 0) for result in done),
+        written_bytes=room_of(store, [result.run_id for result in done if result.run_id]),
+    )
 
 
-def _keep_index(store: Store, known: _Known, results: Iterable[IngestResult]) -> None:
+def _keep_index(store: Store, known: KnownRuns, results: Iterable[IngestResult]) -> None:
     """Write the index, with what this call made."""
     if all(result.status in ("unchanged", "waiting") for result in results):
         store.keep_index(known.runs)
@@ -200,7 +197,7 @@ def _keep_index(store: Store, known: _Known, results: Iterable[IngestResult]) ->
 
 
 def _results(
-    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, known: _Known, *, jobs: int, cluster: str | None
+    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, known: KnownRuns, *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, LogSource | None, IngestResult]]:
     """Yield what became of each path that holds no log, and of each log as it ends, by its place; what needs no work is told first."""
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
@@ -222,7 +219,7 @@ def _results(
 
 
 def _without_work(
-    task: IngestTask, *, store: Store, known: _Known, runs: Mapping[str, Sequence[str]]
+    task: IngestTask, *, store: Store, known: KnownRuns, runs: Mapping[str, Sequence[str]]
 ) -> IngestResult | None:
     """Return the result of a log that is in the store, is known to fail, or has to wait; None where there is something to do."""
     source, sha256 = task.source, None if task.force else task.source.sha256
@@ -238,7 +235,7 @@ def _without_work(
 
 
 def _judged(
-    store: Store, source: LogSource, result: IngestResult, runs: dict[str, list[str]], known: _Known
+    store: Store, source: LogSource, result: IngestResult, runs: dict[str, list[str]], known: KnownRuns
 ) -> IngestResult:
     """Return a result with what the store says of it: whether its trouble is news, and which runs it supersedes."""
     notes = result.notes
@@ -256,7 +253,7 @@ def _judged(
     return replace(result, notes=notes, known=told_before, accepted=trouble.is_accepted(store))
 
 
-def _is_settled(source: LogSource, result: IngestResult, known: _Known) -> bool:
+def _is_settled(source: LogSource, result: IngestResult, known: KnownRuns) -> bool:
     """Tell whether a log is as it was, and its run has no part in what supersedes what."""
     unchanged = result.status == "unchanged" and result.run_id not in known.parties
     return unchanged and result.sha256 is not None and known.has_seen(source, result.sha256)
@@ -269,7 +266,7 @@ def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
     return Trouble(content, result.damage, source.origins, result.run_id, "damaged") if result.damage else None
 
 
-def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult, known: _Known) -> None:
+def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult, known: KnownRuns) -> None:
     """Remember what a log holds, and what is wrong with that; where it cannot be written it is told again the next time."""
     trouble = _trouble(source, result)
     try:

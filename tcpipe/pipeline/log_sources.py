@@ -207,7 +207,7 @@ def with_hashes(sources: Sequence[LogSource], seen: Callable[[str], Sequence[Sig
 
     ``seen`` returns what is remembered of a log by its `lineage`.
     """
-    known = [_remembered(source, seen(source.lineage)) for source in sources]
+    known = [remembered(source, seen(source.lineage)) for source in sources]
     sizes = Counter(_size(source) for source in known)
     return [source if source.sha256 or sizes[_size(source)] == 1 else _hashed(source) for source in known]
 
@@ -255,7 +255,7 @@ def _size(source: LogSource) -> int:
     return sum(size for size, _ in source.files)
 
 
-def _remembered(source: LogSource, seen: Sequence[Sighting]) -> LogSource:
+def remembered(source: LogSource, seen: Sequence[Sighting]) -> LogSource:
     """Return the source with its hash; where nothing is known of these sizes and times, or two different things, without."""
     found = {sighting.sha256 for sighting in seen if source.files and sighting.size_and_time == source.files}
     return replace(source, sha256=found.pop()) if len(found) == 1 else source

@@ -131,6 +131,8 @@ CALLS = [
     "report file",
     "reproduce other",
     "simulate other",
+    "status --store gone",
+    "status --store empty",
     "simulate az://bucket/site",
     "train empty",
     "train gone out",

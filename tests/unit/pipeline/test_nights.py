@@ -210,7 +210,7 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
     copy_part(tmp_path / "whole.mcap", cut, 0.5)
     assert night()[1] == 3  # that is another damage
     checked = verify(tmp_path / "store")
-    assert (checked.problems, checked.read["records"]) == ((), 9)
+    assert (checked.problems, checked.read["records"]) == ((), 14)
 
 
 # --- the memory of logs ---------------------------------------------------------------------------------------------

@@ -1,0 +1,50 @@
+"""``tcpipe status``: where every log stands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import ONE_OF_SEVERAL, duration_value, json_option, recipe_option, store_option
+from tcpipe.cli.output import say
+
+
+@click.command(short_help="Where every log stands")
+@click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
+@store_option
+@recipe_option
+@click.option("--robot", metavar="NAME", help="Robot profile that ingest is given.")
+@click.option(
+    "--min-age",
+    "min_age_s",
+    default="10m",
+    show_default=True,
+    metavar="T",
+    callback=duration_value,
+    help="A log that was written to since (90, 90s, 10m, 2h, 1d) is growing.",
+)
+@json_option
+def status(
+    paths: tuple[str, ...], *, store: str, recipe: str | None, robot: str | None, min_age_s: float, as_json: bool
+) -> int:
+    """Say of every log whether it is in the store, is still to be ingested, failed or grows, and why; and what the latest calls did.
+
+    Without LOG: of the logs and folders that the latest calls of ingest were given. Nothing of a log is read.
+
+    Exit code 3: a log failed or is damaged and nobody accepted that (tcpipe accept), or a run is not as it was written.
+    """
+    from tcpipe.cli.output import print_json, ruling_recipe, say_lines
+    from tcpipe.pipeline.status import status as run
+    from tcpipe.store import is_store
+
+    if paths and is_store(Path(paths[0])):
+        store, paths = paths[0], paths[1:]
+    found = run(paths, store=store, recipe=ruling_recipe(recipe)[0], robot=robot, min_age_s=min_age_s)
+    if as_json:
+        print_json(found)
+        return found.exit_code
+    say_lines(found)
+    for problem in found.problems:
+        say(f"tcpipe: {problem}", err=True)
+    return found.exit_code

@@ -1,0 +1,137 @@
+"""The history of a store: what each call of ingest and build-dataset did and took, a small record each; and estimates from it."""
+
+from __future__ import annotations
+
+import os
+import resource
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import digest
+from tcpipe.formats.record_files import Call, record_name
+from tcpipe.store import Store
+
+_LATEST = 50
+"""So many calls are looked back on."""
+
+INGEST, BUILD = "ingest", "build-dataset"
+
+
+@dataclass(frozen=True, slots=True)
+class Rates:
+    """What work takes: CPU seconds and bytes written, for a byte of log or for a sample."""
+
+    cpu_s: float
+    written_bytes: float
+
+
+MEASURED = {INGEST: Rates(0.2e-6, 1.1), BUILD: Rates(100e-6, 4_300.0)}
+"""Of drives without a camera, on one core of 2025, and of patches of three layers and 40 px (docs/how-to/nights.md)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is to be expected: work, time and room."""
+
+    of: str
+    amount: int
+    """Bytes of log, or samples."""
+    wall_s: float
+    written_bytes: int
+    source: str
+    """What it was taken from."""
+
+    def __str__(self) -> str:
+        """Return it as one line."""
+        amount = in_bytes(self.amount) if self.of == "logs" else f"{self.amount} {self.of}"
+        return f"{amount}: about {in_time(self.wall_s)} and {in_bytes(self.written_bytes)} ({self.source})"
+
+
+@dataclass(frozen=True, slots=True)
+class Stopwatch:
+    """When a call began: by the wall [ns since 1970], by a clock that only runs, and in CPU seconds."""
+
+    begin_ns: int
+    running_s: float
+    cpu_s: float
+
+
+def started() -> Stopwatch:
+    """Return that a call begins now."""
+    return Stopwatch(time.time_ns(), time.monotonic(), _cpu_s())
+
+
+def remember_call(store: Store, watch: Stopwatch, call: Call) -> None:
+    """Remember what a call did, with what it took; a store that cannot be written goes without."""
+    begin = datetime.fromtimestamp(watch.begin_ns / 1e9, UTC)
+    took = replace(
+        call,
+        begin=begin.isoformat(timespec="milliseconds"),
+        wall_s=round(time.monotonic() - watch.running_s, 3),
+        cpu_s=round(_cpu_s() - watch.cpu_s, 3),
+    )
+    with suppress(StoreError):
+        store.remember(f"calls/{begin:%Y%m%dT%H%M%S}-{record_name(digest(took))}", took)
+
+
+def latest_calls(store: Store) -> list[Call]:
+    """Return the latest calls, the last one first."""
+    names = sorted((name.removesuffix(".json") for name in _listed(store.records_path / "calls")), reverse=True)
+    found = (store.recall(f"calls/{name}", Call) for name in names[:_LATEST])
+    return [call for call in found if call is not None]
+
+
+def estimate(calls: Sequence[Call], command: str, amount: int, *, jobs: int) -> Estimate:
+    """Return what work will take: by the calls that did the like, or by what was measured elsewhere."""
+    like = [call for call in calls if call.command == command and _amount(call)]
+    of = "logs" if command == INGEST else "samples"
+    rates, source = MEASURED[command], "by figures measured elsewhere: this store has no history of it"
+    if like:
+        done = sum(_amount(call) for call in like)
+        rates = Rates(sum(call.cpu_s for call in like) / done, sum(call.written_bytes for call in like) / done)
+        source = f"by {len(like)} earlier call{'s' * (len(like) > 1)}"
+    return Estimate(of, amount, rates.cpu_s * amount / jobs, int(rates.written_bytes * amount), source)
+
+
+def room_of(store: Store, run_ids: Sequence[str]) -> int:
+    """Return what runs take in the store [byte]."""
+    files = (path for run_id in run_ids for path in (store.runs_path / run_id).rglob("*") if path.is_file())
+    return sum(path.stat().st_size for path in files)
+
+
+def in_time(seconds: float) -> str:
+    """Return a duration in words."""
+    for unit, size in (("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
+
+
+def in_bytes(count: float) -> str:
+    """Return a size in words."""
+    for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.3g} {unit}"
+    return f"{count:.0f} B"
+
+
+def _amount(call: Call) -> int:
+    return call.done_bytes if call.command == INGEST else call.counts.get("samples", 0)
+
+
+def _listed(directory: Path) -> list[str]:
+    try:
+        with os.scandir(directory) as entries:
+            return [of.name for of in entries if of.name.endswith(".json") and not of.name.startswith(".")]
+    except OSError:
+        return []
+
+
+def _cpu_s() -> float:
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(of.ru_utime + of.ru_stime for of in used)

@@ -1,0 +1,252 @@
+"""Where every log of a store's sources stands, why, and what is still to do; nothing is read of a log but its size and time."""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain
+from pathlib import Path
+from typing import Literal, get_args
+
+from tcpipe import __version__
+from tcpipe.errors import UsageError, plain_lines
+from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.places import local_output
+from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
+from tcpipe.formats.record_files import Call
+from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time, latest_calls
+from tcpipe.pipeline.ingest_task import IngestTask, too_young
+from tcpipe.pipeline.known_runs import KnownRuns, known_runs
+from tcpipe.pipeline.known_trouble import Trouble
+from tcpipe.pipeline.log_sources import FoundLogs, definitions_key, find_sources, in_shard, remembered
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store, open_store
+
+State = Literal[
+    "done", "partial", "pending", "outdated", "growing", "failed_permanent", "failed_transient", "quarantined", "superseded"
+]  # fmt: skip
+
+STATES: tuple[State, ...] = get_args(State)
+TO_DO: tuple[State, ...] = ("pending", "outdated", "failed_transient")
+"""What the next ingest takes on."""
+TROUBLE: tuple[State, ...] = ("failed_permanent", "failed_transient", "partial")
+"""What somebody should look at."""
+
+_MOST_NAMES = 3
+_MOST_CALLS = 7
+_IN_WORDS: Mapping[State, str] = {"failed_permanent": "failed for what it holds", "failed_transient": "failed for now"}
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Logs that stand at one point for one reason."""
+
+    state: State
+    cause: str
+    logs: tuple[str, ...]
+    size_bytes: int
+
+    def __str__(self) -> str:
+        """Return the group as one line."""
+        more = f" and {len(self.logs) - _MOST_NAMES} more" if len(self.logs) > _MOST_NAMES else ""
+        names = f": {', '.join(self.logs[:_MOST_NAMES])}{more}" if self.state != "done" else ""
+        cause = f", {self.cause}" if self.cause else ""
+        return f"{len(self.logs):>7} {_words(self.state)}{cause}{names}"
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """Where the logs of a store's sources stand."""
+
+    store: str
+    sources: tuple[str, ...]
+    counts: Mapping[State, int]
+    """Logs by state."""
+    groups: tuple[Group, ...]
+    """By state and cause."""
+    to_do: Estimate | None
+    """What the next ingest will take; None where nothing is to do."""
+    problems: tuple[str, ...]
+    """Sources that cannot be looked at, and runs that are not as they were written."""
+    superseded_runs: int
+    history: tuple[Call, ...]
+    """The latest calls, the last one first."""
+    exit_code: int
+    """3 where somebody should look at a log or a run, else 0."""
+
+    def __str__(self) -> str:
+        """Return the lines as one text."""
+        said = ", ".join(f"{count} {_words(state)}" for state, count in self.counts.items()) or "no logs"
+        lines = [f"{self.store}: {said}", *(str(group) for group in self.groups)]
+        lines += [f"to do: {self.to_do}"] if self.to_do else []
+        lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
+        lines += ["history:"] if self.history else []
+        return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
+
+
+def status(
+    logs: Iterable[str | Path] = (),
+    *,
+    store: str | Path = "tcpipe-store",
+    recipe: Recipe | str | Path | None = None,
+    robot: str | None = None,
+    as_one: bool = False,
+    shard: tuple[int, int] | None = None,
+    min_age_s: float = 600.0,
+    message_definitions: Path | None = None,
+    force: bool = False,
+    retry_failed: bool = False,
+    jobs: int = 1,
+    create: bool = False,
+) -> Status:
+    """Return where every log stands; parameters as those of `tcpipe.pipeline.ingest.ingest`.
+
+    Parameters
+    ----------
+    logs
+        Logs and folders; none: those that the store's latest calls of ingest were given.
+    min_age_s
+        A log that was written since so many seconds is growing.
+    create
+        The store need not be there, and nothing is written.
+
+    Raises
+    ------
+    StoreError, UsageError, RecipeError
+        There is no store, or nothing is known of its sources.
+
+    """
+    ruling = (
+        recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(Path(recipe) if recipe else None, Path.cwd()))
+    )
+    opened = Store(local_output(store)) if create else open_store(store)
+    calls = latest_calls(opened)
+    given = [str(log) for log in logs] or list(dict.fromkeys(log for call in calls for log in call.logs))
+    if not given:
+        raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
+    known, definitions = known_runs(opened, force=force), definitions_key(message_definitions)
+    if not create:
+        opened.keep_index(known.runs)
+    with tempfile.TemporaryDirectory(prefix="tcpipe-") as staging:
+        found = find_sources(given, as_one=as_one, staging=Path(staging), tables=ruling.tables)
+    mine = found.sources if shard is None else in_shard(found.sources, shard)
+    passing = _failed_for_now(calls)
+    groups: dict[tuple[State, str], list[IngestTask]] = {}
+    for source in mine:
+        task_source = remembered(source, known.seen.get(source.lineage, ()))
+        task = IngestTask(
+            task_source, opened.root, ruling, robot or ruling.robot, {}, force, message_definitions, definitions, retry_failed, min_age_s
+        )  # fmt: skip
+        groups.setdefault(_standing(task, opened, known, passing), []).append(task)
+    told = tuple(
+        Group(state, cause, tuple(task.source.name for task in tasks), sum(_bytes(task) for task in tasks))
+        for (state, cause), tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
+    )
+    return _summed(opened, told, found, known, calls, sources=given, jobs=jobs)
+
+
+def _standing(task: IngestTask, store: Store, known: KnownRuns, passing: Mapping[str, str]) -> tuple[State, str]:
+    """Return where a log stands, and why."""
+    source, sha256 = task.source, None if task.force else task.source.sha256
+    made = known.made.get(sha256, []) if sha256 else []
+    current = next((facts for facts in made if task.is_made_by(facts)), None)
+    if current is not None:
+        return _standing_of(current, task, store)
+    failed = None if task.force or task.retry_failed else store.recall(task.failure, Trouble)
+    if failed is not None:
+        accepted = replace(failed, kind="failed").is_accepted(store)
+        return "quarantined" if accepted else "failed_permanent", _cause("".join(failed.lines[:1]), task)
+    if too_young(task):
+        return "growing", ""
+    if source.name in passing:
+        return "failed_transient", _cause(passing[source.name], task)
+    return ("outdated", _why_outdated(made[-1], task)) if made else ("pending", _why_pending(task, known))
+
+
+def _standing_of(made: RunFacts, task: IngestTask, store: Store) -> tuple[State, str]:
+    """Return where a log stands that is in the store as it would be made now."""
+    if made.superseded_by:
+        return "superseded", "a longer recording has taken its place"
+    if not made.damage:
+        return "done", ""
+    trouble = Trouble(str(task.source.sha256), made.damage, task.source.origins, made.run_id, "damaged")
+    return ("done", "damaged, accepted") if trouble.is_accepted(store) else ("partial", _cause(made.damage[0], task))
+
+
+def _why_pending(task: IngestTask, known: KnownRuns) -> str:
+    """Return why a log that was seen before is to be ingested; "" of a new one."""
+    sha256 = task.source.sha256
+    if sha256 and any(path.parent.name.endswith(f"-{sha256[:8]}") for path in known.runs.damaged):
+        return "its run is not as it was written"
+    return "its content is another than before" if task.source.lineage in known.seen and not sha256 else ""
+
+
+def _why_outdated(made: RunFacts, task: IngestTask) -> str:
+    """Return in which an ingestion differs from what would be made now."""
+    if made.ingest_key != ingest_key(task.recipe):
+        return f"made under another recipe ({made.recipe_id})"
+    if made.tcpipe_version != __version__:
+        return f"made by tcpipe {made.tcpipe_version}"
+    return "made for another robot, or with other message definitions"
+
+
+def _failed_for_now(calls: Sequence[Call]) -> dict[str, str]:
+    """Return the logs whose latest failure may pass, and what that was."""
+    found: dict[str, str] = {}
+    for call in reversed(calls):
+        found.update(call.failed)
+    return found
+
+
+def _cause(line: str, task: IngestTask) -> str:
+    """Return what is wrong without what differs from log to log: its name, and numbers."""
+    for name in (task.source.name, *task.source.origins):
+        line = line.replace(f"{name}: ", "").replace(name, "it")
+    return re.sub(r"\d[\d.,]*", "#", line)
+
+
+def _summed(
+    store: Store,
+    told: tuple[Group, ...],
+    found: FoundLogs,
+    known: KnownRuns,
+    calls: Sequence[Call],
+    *,
+    sources: Sequence[str],
+    jobs: int,
+) -> Status:
+    counts = Counter[State]()
+    for group in told:
+        counts[group.state] += len(group.logs)
+    waiting = sum(group.size_bytes for group in told if group.state in TO_DO)
+    trouble = any(group.state in TROUBLE for group in told)
+    outdated = (f"run {name}: of data model {head.data_model_version}" for name, head in known.runs.outdated.items())
+    problems = (*chain(*found.problems.values()), *known.runs.damaged.values(), *outdated)
+    return Status(
+        store=str(store.root),
+        sources=tuple(sources),
+        counts=dict(counts),
+        groups=told,
+        to_do=estimate(calls, INGEST, waiting, jobs=jobs) if any(counts[state] for state in TO_DO) else None,
+        problems=problems,
+        superseded_runs=len(known.runs.superseded),
+        history=tuple(calls),
+        exit_code=3 if trouble or problems else 0,
+    )
+
+
+def _bytes(task: IngestTask) -> int:
+    return sum(size for size, _ in task.source.files)
+
+
+def _words(state: State) -> str:
+    return _IN_WORDS.get(state, state)
+
+
+def _told(call: Call) -> str:
+    """Return a call as one line."""
+    said = ", ".join(f"{count} {what}" for what, count in call.counts.items() if count) or "nothing"
+    return f"  {call.begin[:19]} {call.command}: {said}; {in_time(call.wall_s)}, CPU {in_time(call.cpu_s)}, exit code {call.exit_code}"

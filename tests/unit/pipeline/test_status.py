@@ -1,0 +1,136 @@
+"""Where every log stands: each state once, told by what ingest did, and the same after it."""
+
+import os
+import shutil
+from dataclasses import replace
+
+import pytest
+from click.testing import CliRunner
+from wheel_drives import START_NS, drive_at
+
+from tcpipe.cli import cli
+from tcpipe.errors import UsageError
+from tcpipe.formats.record_files import Call
+from tcpipe.pipeline import calls
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.known_trouble import accept
+from tcpipe.pipeline.status import status
+from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.store import Store
+
+OLD_NS = 10**18
+
+
+@pytest.fixture(scope="module")
+def first_night(tmp_path_factory):
+    """A folder of four logs, long written, and the store of its first night."""
+    root = tmp_path_factory.mktemp("status")
+    whole = drive_at(root / "logs" / "whole.mcap")
+    drive_at(root / "logs" / "second.mcap", seed=1, start_ns=START_NS + 10**13)
+    (root / "logs" / "cut.mcap").write_bytes(
+        drive_at(root / "third.mcap", seed=2, start_ns=START_NS + 10**14).read_bytes()[:-4000]
+    )
+    (root / "logs" / "junk.bag").write_bytes(b"junk" * 100)
+    for path in (root / "logs").iterdir():
+        os.utime(path, ns=(OLD_NS, OLD_NS))
+    assert ingest([root / "logs"], store=root / "store", recipe=Recipe()).exit_code == 3
+    assert whole.exists()
+    return root
+
+
+@pytest.fixture
+def night(first_night, tmp_path):
+    shutil.copytree(first_night, tmp_path / "n", symlinks=True, copy_function=shutil.copy2)
+    return tmp_path / "n"
+
+
+def where(root, *logs, **how):
+    return status(logs or [root / "logs"], store=root / "store", **{"recipe": Recipe(), **how})
+
+
+def states(found):
+    return {group.state: sorted(name.rsplit("/", 1)[-1] for name in group.logs) for group in found.groups}
+
+
+def test_what_ingest_did_is_what_status_says_and_the_calls_are_remembered(first_night):
+    found = where(first_night)
+    assert states(found) == {
+        "done": ["second.mcap", "whole.mcap"],
+        "partial": ["cut.mcap"],
+        "failed_permanent": ["junk.bag"],
+    }
+    assert (found.exit_code, found.to_do, found.problems) == (3, None, ())
+    (call,) = found.history
+    assert (call.command, call.counts, call.exit_code) == ("ingest", {"done": 2, "damaged": 1, "failed": 1}, 3)
+    assert call.logs == (str(first_night / "logs"),)
+    sizes = [(first_night / "logs" / f"{name}.mcap").stat().st_size for name in ("whole", "second", "cut")]
+    assert call.done_bytes == sum(sizes)
+    kept = [path for path in (first_night / "store" / "runs").rglob("*") if path.is_file()]
+    assert call.written_bytes == sum(path.stat().st_size for path in kept)
+    assert call.wall_s > 0.0
+    assert call.cpu_s > 0.0
+    assert call.end > call.begin
+
+
+def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
+    assert status(store=first_night / "store", recipe=Recipe()).counts == where(first_night).counts
+    with pytest.raises(UsageError, match="no call of ingest is remembered here; give the logs"):
+        status(store=tmp_path, recipe=Recipe())
+
+
+def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
+    logs, store = night / "logs", night / "store"
+    # The copy lies elsewhere: its logs were never seen there, until the second night.
+    assert states(where(night)) == {"pending": ["cut.mcap", "junk.bag", "second.mcap", "whole.mcap"]}
+    again = {result.log: result.run_id for result in ingest([logs], store=store, recipe=Recipe()).results}
+    found_run = again[str(logs / "cut.mcap")]
+    assert where(night).counts == {"done": 2, "partial": 1, "failed_permanent": 1}
+    accept([str(logs / "junk.bag")], store=store)
+    accept([found_run], store=store)
+    drive_at(logs / "growing.mcap", seed=4)
+    for name in ("new.mcap", "passing.mcap"):
+        drive_at(logs / name, seed=5)
+        os.utime(logs / name, ns=(OLD_NS, OLD_NS))
+    shutil.copy(logs / "second.mcap", logs / "whole.mcap")
+    os.utime(logs / "whole.mcap", ns=(OLD_NS, OLD_NS + 1))
+    line = f"{logs / 'passing.mcap'}: No space left on device (28)"
+    call = Call("ingest", "0", 3, {"failed": 1}, failed={str(logs / "passing.mcap"): line})
+    calls.remember_call(Store(store), calls.started(), call)
+    found = where(night)
+    assert found.counts == {"done": 2, "quarantined": 1, "growing": 1, "pending": 2, "failed_transient": 1}
+    told = {(group.state, group.cause): group.logs for group in found.groups}
+    assert told["pending", ""] == (str(logs / "new.mcap"),)
+    assert told["pending", "its content is another than before"] == (str(logs / "whole.mcap"),)
+    assert told["failed_transient", "No space left on device (#)"] == (str(logs / "passing.mcap"),)
+    assert told["done", "damaged, accepted"] == (str(logs / "cut.mcap"),)
+    assert found.exit_code == 3  # the disk is full
+    assert found.to_do.amount == sum((logs / f"{name}.mcap").stat().st_size for name in ("new", "passing", "whole"))
+    assert found.to_do.source == "by 1 earlier call"
+    assert "2 pending" in str(found)
+
+
+def test_a_run_of_another_recipe_or_superseded_is_told_so(first_night):
+    other = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
+    found = where(first_night, recipe=other)
+    (group,) = [group for group in found.groups if group.state == "outdated"]
+    assert group.cause.startswith("made under another recipe (")
+    assert len(group.logs) == 3
+
+
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_path):
+    told = CliRunner().invoke(
+        cli, ["ingest", str(first_night / "logs"), "--store", str(tmp_path / "none"), "--dry-run"]
+    )
+    assert told.exit_code == 0, told.output
+    assert "4 pending" in told.output
+    assert "by figures measured elsewhere: this store has no history of it" in told.output
+    assert not (tmp_path / "none").exists()
+
+
+def test_an_estimate_is_what_the_like_took():
+    night = Call("ingest", "0", 0, {}, cpu_s=20.0, done_bytes=100, written_bytes=50)
+    other = replace(night, cpu_s=10.0, done_bytes=50, written_bytes=10)
+    quiet, build = replace(night, done_bytes=0, cpu_s=9.0), replace(night, command="build-dataset")
+    found = calls.estimate([night, other, quiet, build], "ingest", 1_000, jobs=4)
+    assert (found.wall_s, found.written_bytes) == (pytest.approx(30 / 150 * 1_000 / 4), 400)
+    assert str(found) == "1 kB: about 50 s and 400 B (by 2 earlier calls)"
