@@ -225,7 +225,9 @@ def test_two_runs_and_any_number_of_workers_give_the_same_bytes(demo: Demo, tmp_
     here, _ = demo
     site, jobs = here / "site", ("--jobs", "2", "--quiet")
     _run("ingest", *_demo_logs(here), *jobs, cwd=tmp_path)
-    assert _hashes(tmp_path / "tcpipe-store", "*.parquet") == _hashes(here / "store", "*.parquet") != {}
+    assert (
+        _hashes(tmp_path / "tcpipe-store" / "runs", "*.parquet") == _hashes(here / "store" / "runs", "*.parquet") != {}
+    )
     rasters = {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif", "classes": "classes.csv"}
     layers = [item for name, file in rasters.items() for item in (f"--{name}", site / "maps" / file)]
     _run("add-map", "site", *layers, "--quiet", cwd=tmp_path)
