@@ -83,6 +83,7 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
     metavar="N",
     help="Build nothing from fewer runs; so many are enough: that others are left out or gone is a warning then.",
 )
+@click.option("--dry-run", is_flag=True, help="Say what would be done, and what it would take; do nothing.")
 @json_option
 @quiet_option
 def build_dataset(
@@ -101,6 +102,7 @@ def build_dataset(
     seed: int | None,
     keep_split: str | None,
     min_runs: int | None,
+    dry_run: bool,
     as_json: bool,
     quiet: bool,
 ) -> int:
@@ -132,6 +134,7 @@ def build_dataset(
             keep_split=keep_split,
             covariates=covariates,
             min_runs=min_runs,
+            dry_run=dry_run,
         )
         for problem in result.problems:
             shown.problem(problem)

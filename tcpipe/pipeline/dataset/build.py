@@ -5,13 +5,15 @@ from __future__ import annotations
 import logging
 import shutil
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pyarrow as pa
 
+from tcpipe import __version__
 from tcpipe.cost.budget import in_words
-from tcpipe.errors import DatasetError, RecipeError, UsageError, plain_lines
+from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding, Shard
@@ -31,12 +33,14 @@ from tcpipe.formats.dataset_files import (
     write_patches_zarr,
 )
 from tcpipe.formats.geojson import read_regions
-from tcpipe.formats.json_files import write_json
+from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+from tcpipe.formats.record_files import Call, DatasetMade, record_name
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.zarr_arrays import Compression
+from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, DRIVE_NEXT, measure_balance
 from tcpipe.pipeline.dataset.card import (
@@ -58,7 +62,7 @@ from tcpipe.report.overview import maps_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.regions import Regions
-from tcpipe.store import open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
@@ -71,7 +75,7 @@ class BuildResult:
 
     path: Path
     status: str
-    """``done`` or ``unchanged``."""
+    """``done``, ``unchanged``, or, of a dry run, ``planned``."""
     samples: int
     splits: Mapping[str, int]
     ledger_m: Mapping[str, float]
@@ -88,9 +92,15 @@ class BuildResult:
     """How many samples carry a quality flag."""
     findings: tuple[RunFinding, ...] = ()
     """What ingest found of the runs, by cause."""
+    estimate: Estimate | None = None
+    """What a dry run expects of the work: of all segments, as if each became a sample."""
 
     def __str__(self) -> str:
         """Return counts, the share of doubtful samples, the audit, where the metres went and how wrong a label may be, as plain lines."""
+        if self.estimate is not None:
+            return plain_lines(
+                (f"{self.path}: would be made of at most {self.estimate}", *(f"warning: {w}" for w in self.warnings))
+            )
         counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {self.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -122,6 +132,7 @@ def build_dataset(
     keep_split: str | Path | None = None,
     covariates: str | Path | Sequence[str | Path] = (),
     min_runs: int | None = None,
+    dry_run: bool = False,
 ) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
@@ -156,6 +167,8 @@ def build_dataset(
         Tables (CSV or Parquet) whose columns are joined to the samples by time, as the recipe's section ``covariates`` says.
     min_runs
         Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
+    dry_run
+        Choose the runs, look whether there is something to do, and estimate what it takes; write nothing.
 
     Raises
     ------
@@ -163,9 +176,10 @@ def build_dataset(
         Nothing is written then.
 
     """
-    ruling = _ruling(recipe, holdout=holdout, seed=seed)
+    watch, ruling = started(), _ruling(recipe, holdout=holdout, seed=seed)
     place, opened = local_output(out), open_store(store)
-    clear_beside(place)
+    if not dry_run:
+        clear_beside(place)
     known, proved = _card_in_place(place)
     regions = None if split is None else read_regions(Path(split))
     region = None if split is None else Path(split).read_bytes()
@@ -186,10 +200,41 @@ def build_dataset(
     problems, warnings = _left_out(inputs, known, robot=robot, tags=tags or {}, min_runs=min_runs)
     inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
     if proved and known is not None and known.inputs == inputs.digest and is_whole(place, known):
-        return _result(place, "unchanged", known, problems)
-    with atomic_directory(place.absolute()) as directory:
-        card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
-    return _result(place, "done", card, problems)
+        result = _result(place, "unchanged", known, problems)
+    elif dry_run:
+        return _planned(place, opened, inputs, jobs=jobs)
+    else:
+        with atomic_directory(place.absolute()) as directory:
+            card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
+        result = _result(place, "done", card, problems)
+    if not dry_run:
+        _remember(opened, watch, result, inputs, jobs)
+    return result
+
+
+def _planned(place: Path, store: Store, inputs: Inputs, *, jobs: int) -> BuildResult:
+    """Return what is to be expected of a build."""
+    most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
+    expected = estimate(latest_calls(store), BUILD, most, jobs=jobs)
+    exit_code = 3 if inputs.problems else 0
+    return BuildResult(
+        place, "planned", most, {}, {}, (), inputs.warnings, inputs.problems, exit_code=exit_code, estimate=expected
+    )
+
+
+def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Inputs, jobs: int) -> None:
+    """Leave a record in the store of the dataset, for what it refers to stays, and one of the call; without where that cannot be."""
+    made = DatasetMade(
+        str(result.path.absolute()), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs)
+    )
+    with suppress(StoreError):
+        store.remember(f"datasets/{record_name(digest(made))}", made)
+    counts, size = {"runs": len(inputs.runs), "samples": 0, "unchanged": 1}, 0
+    if result.status == "done":
+        counts |= {"samples": result.samples, "unchanged": 0}
+        size = sum(path.stat().st_size for path in result.path.rglob("*") if path.is_file())
+    call = Call(BUILD, __version__, result.exit_code, counts, jobs, written_bytes=size)
+    remember_call(store, watch, call)
 
 
 def _left_out(

@@ -39,6 +39,7 @@ class Chosen:
 def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
     found, key = store.ingestions(), ingest_key(recipe)
+    store.keep_index(found)
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_nothing_to_pool(store, found))
