@@ -8,6 +8,8 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, StoreError
+from tcpipe.formats.record_files import DatasetMade
+from tcpipe.pipeline.calls import latest_calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
@@ -81,3 +83,20 @@ def test_a_store_of_another_data_model_is_told_so(store, tmp_path):
         match=rf"3 runs in the store, all of data model 0\.9, wanted {DATA_MODEL_VERSION}; ingest their logs",
     ):
         runs(store, tmp_path)
+
+
+def test_a_dry_run_counts_and_estimates_and_a_build_is_remembered(store, tmp_path):
+    planned = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), dry_run=True)
+    assert (planned.status, planned.samples, planned.exit_code) == ("planned", 60, 0)
+    assert "at most 60 samples: about 0 s and 258 kB (by figures measured elsewhere" in str(planned)
+    assert not (tmp_path / "out").exists()
+    made = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    (record,) = store.records("datasets", DatasetMade)
+    assert record.out == str(tmp_path / "out")
+    assert [run_id for run_id, _ in record.runs] == ["a", "b", "c"]
+    assert build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), dry_run=True).status == "unchanged"
+    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    assert store.records("datasets", DatasetMade) == [record]
+    counted = [call.counts for call in latest_calls(store)]
+    assert sorted(counts["unchanged"] for counts in counted) == [0, 1]
+    assert {counts["samples"] for counts in counted} == {0, made.samples}
