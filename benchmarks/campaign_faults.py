@@ -389,7 +389,7 @@ _ELSEWHERE: tuple[tuple[str, float, tuple[str, ...]], ...] = (
         for name in ("all", "no visual", "no wheels", "no IMU", "GNSS, IMU", "GNSS, wheels")
     ),
     (f"GNSS alone{DOPPLER}", 1.0, ("clean", "metres, claimed", "float minute")),
-    (f"no visual{DOPPLER}", 5.0, ("wrong fix", "float minute")),
+    (f"no visual{DOPPLER}", 5.0, ("wrong fix", "wrong fix by a ramp", "float minute")),
     *(
         (f"{name}{DOPPLER}", hz, tuple(VELOCITY_FAULTS))
         for name, hz in (("all", 10.0), ("no visual", 5.0), ("GNSS alone", 1.0))

@@ -202,11 +202,16 @@ def _is_endless(spans: Spans, whole: Span) -> bool:
 def _rivals(other: Explained, best: Explained, *, alike: bool) -> bool:
     """Return whether another explanation is about as good and shares little with the best.
 
-    Of what follows a single jump nothing tells when it ends: then one that is much longer is no more ``alike``.
+    Of what follows a single jump nothing tells when it ends: then one that is much longer is no more ``alike``, and which is the shorter
+    tells nothing. Nor is one span alike several short ones: a filter that nothing holds follows wrong fixes after seconds.
     """
     shared = sum(max(0, min(b, d) - max(a, c)) * 1e-9 for a, b in best.spans for c, d in other.spans)
-    whole = _length(best.spans) if alike else max(_length(best.spans), _length(other.spans))
-    return _weight(other) < _weight(best) + _SURELY and shared < _SHARED * whole
+    longer = max(_length(best.spans), _length(other.spans))
+    whole = _length(best.spans) if alike and len(best.spans) == 1 else longer
+    better = _weight(other) - _weight(best)
+    if not alike:
+        better -= _A_SECOND * (_length(other.spans) - _length(best.spans))
+    return better < _SURELY and shared < _SHARED * whole
 
 
 def _near(spans: Spans, events: Spans) -> Iterator[Span]:

@@ -170,3 +170,11 @@ def test_power_that_is_too_slow_for_a_metre_is_said_with_what_sets_its_rate(tmp_
     if said:
         assert "/status comes at 1 Hz, sampled" in lines[0]
         assert "diagnostic_frequency of husky_base" in lines[0]
+
+
+def test_a_topic_that_plays_two_roles_names_both(tmp_path):
+    log_ns = START_NS + np.arange(20) * 10**9
+    columns = {"sentence": np.full(20, "$GPGGA,", "S")}
+    _, topics = inspected(tmp_path / "a.mcap", [MessageStream("/gps/nmea", "nmea_msgs/msg/Sentence", log_ns, columns)])
+    assert topics["/gps/nmea"].role == "gnss, gnss_velocity"
+    assert topics["/gps/nmea"].why == "the only nmea_msgs/msg/Sentence; the receiver's sentences"
