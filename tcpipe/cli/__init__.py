@@ -29,6 +29,7 @@ from tcpipe.cli.output import say_failure
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
 from tcpipe.cli.process import Ended, prepare_process
+from tcpipe.cli.prune import prune
 from tcpipe.cli.report import report
 from tcpipe.cli.reproduce import reproduce
 from tcpipe.cli.schemas import schemas
@@ -70,6 +71,7 @@ for command in (
     ingest,
     status,
     accept,
+    prune,
     add_map,
     build_dataset,
     train,

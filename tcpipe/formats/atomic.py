@@ -104,6 +104,12 @@ def atomic_directory(path: Path, *, instead_of: PlaceState | None = None) -> Ite
         _sync_directory(place.parent)
 
 
+def remove_directory(path: Path) -> None:
+    """Remove a directory whole or not at all: it goes from its place in one step; `StoreError` where it cannot."""
+    with _told(path), _holder_beside(path) as holder:
+        path.rename(holder / path.name)
+
+
 def write_text(path: Path, text: str) -> None:
     """Write a text file whole or not at all."""
     with atomic_file(path) as temporary:

@@ -70,6 +70,13 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
         yield f"{directory}: holds no finished ingestion; ingest its log again"
 
 
+def strangers_in(directory: Path) -> Iterator[Path]:
+    """Yield what no call of tcpipe has written into the directory of a run, or of one of its ingestions."""
+    known = {f"{role}.parquet" for role in STREAMS} | {f"{name}.parquet" for name in _TABLES}
+    known |= {_RUN, _MANIFEST, _REPORT, CHECKSUMS}
+    yield from (path for path in sorted(directory.rglob("*")) if not path.is_dir() and path.name not in known)
+
+
 def verify_map(path: Path) -> Iterator[Finding]:
     """Yield the same of one map: every file, and every tile of every layer and level decoded."""
     yield "maps", 1

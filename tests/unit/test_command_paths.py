@@ -33,6 +33,7 @@ TEXTS = {
     "strays",
     "shard",
     "min_age_s",
+    "keep",
 }
 """Parameters of commands that are text and no path."""
 
@@ -126,6 +127,7 @@ CALLS = [
     "plan-path other --from 15,47 --to 15.1,47 --store empty --out other",
     "predict-path empty --path gone.geojson",
     "predict-path empty --path path.geojson --store gone",
+    "prune --store gone",
     "report gone",
     "report empty",
     "report file",

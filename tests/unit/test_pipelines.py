@@ -1,9 +1,13 @@
-"""The shipped recipes parse, and say what their comments claim."""
+"""The shipped recipes parse and say what their comments claim; schedulers call what there is."""
 
+import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import polars as pl
 
+from tcpipe.cli import cli
 from tcpipe.formats.logs.table_log import TableLog
 from tcpipe.formats.recipe_toml import ingest_key, load_recipe
 from tcpipe.formats.robot_files import profiles_of
@@ -79,3 +83,26 @@ def test_rellis_plays_its_roles_by_the_topics_of_its_readme() -> None:
     assert found.problems == ()
     assert set(found.roles) == {"gnss", "imu", "wheel_odometry", "command", "power"}
     assert len(found.roles["power"].topics) == 4
+
+
+def test_schedulers_call_commands_and_options_that_exist() -> None:
+    """Their own parsers read them in addition (systemd-analyze verify, crontab -n, bash -n), where those are."""
+    checks = {
+        "slurm/night.sbatch": ["bash", "-n"],
+        "crontab": ["crontab", "-n"],
+        "systemd/tcpipe-night.timer": ["systemd-analyze", "calendar"],
+    }
+    seen = 0
+    for path in (PIPELINES / "systemd/tcpipe-night.service", *(PIPELINES / name for name in checks)):
+        for call in re.findall(
+            r"(?<!Description=)\btcpipe (ingest|build-dataset|status)\b([^;|>&\n]*)", path.read_text()
+        ):
+            options = {option for of in cli.commands[call[0]].params for option in of.opts}
+            assert set(re.findall(r"--[a-z-]+", call[1])) <= options, (path, call)
+            seen += 1
+    assert seen >= 6
+    for name, checker in checks.items():
+        if shutil.which(checker[0]):
+            what = "*-*-* 02:15:00" if checker[1] == "calendar" else PIPELINES / name
+            assert subprocess.run([*checker, what], capture_output=True, check=False).returncode == 0
+    assert "OnCalendar=*-*-* 02:15:00\n" in (PIPELINES / "systemd/tcpipe-night.timer").read_text()

@@ -1,0 +1,37 @@
+"""``tcpipe prune``: what a store no longer needs."""
+
+from __future__ import annotations
+
+import click
+
+from tcpipe.cli.options import duration_value, json_option, recipe_option, store_option
+
+
+@click.command(short_help="Remove what a store no longer needs")
+@store_option
+@recipe_option
+@click.option("--keep", multiple=True, metavar="RUN|RECIPE", help="Nothing of this run or recipe goes; repeatable.")
+@click.option(
+    "--min-age",
+    "min_age_s",
+    default="1d",
+    show_default=True,
+    metavar="T",
+    callback=duration_value,
+    help="What killed calls left is removed when it is so old (90, 90s, 10m, 2h, 1d).",
+)
+@click.option("--dry-run", is_flag=True, help="Say what would be removed; do nothing.")
+@json_option
+def prune(
+    *, store: str, recipe: str | None, keep: tuple[str, ...], min_age_s: float, dry_run: bool, as_json: bool
+) -> int:
+    """Remove results of older recipes where the ruling one has its own, superseded runs, and what killed calls left.
+
+    Nothing goes that a dataset refers to, built from this store wherever it lies now, nor a directory that holds a file of somebody else.
+    """
+    from tcpipe.cli.output import ruling_recipe, say_result
+    from tcpipe.pipeline.prune import prune as run
+
+    found = run(store=store, recipe=ruling_recipe(recipe)[0], keep=keep, min_age_s=min_age_s, dry_run=dry_run)
+    say_result(found, as_json=as_json)
+    return 0

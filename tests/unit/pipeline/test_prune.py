@@ -1,0 +1,113 @@
+"""What goes from a store and what stays: nothing of a dataset, nothing of somebody else, each thing whole or not at all."""
+
+import os
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from synthetic_store import add_run, lanes, segments
+
+from tcpipe.errors import UsageError
+from tcpipe.formats import atomic
+from tcpipe.formats.record_files import DatasetMade
+from tcpipe.pipeline.prune import prune
+from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.store import Store
+
+OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
+
+
+@pytest.fixture
+def store(tmp_path):
+    """Runs a and b under an older recipe and the ruling one, c under the older alone; b is superseded by a."""
+    store = Store(tmp_path / "store")
+    for recipe in (OLD, Recipe()):
+        for number, run_id in enumerate(("a", "b", "c")[: 3 if recipe is OLD else 2]):
+            add_run(store, run_id, segments(run_id, *lanes(np.array([number]), -10.0, 10.0)), recipe=recipe)
+    for path in store.root.glob(f"runs/*/{old_recipe(store)}/manifest.json"):
+        os.utime(path, ns=(10**18, 10**18))
+    store.supersede("b", "a")
+    return store
+
+
+def old_recipe(store):
+    return next((store.runs_path / "c").glob("[!r]*")).name
+
+
+def there(store):
+    return {(path.parent.parent.name, path.parent.name) for path in store.root.glob("runs/*/*/manifest.json")}
+
+
+def test_old_recipes_and_superseded_runs_go_and_a_dry_run_says_the_same(store):
+    before, old = there(store), old_recipe(store)
+    planned = prune(store=store.root, recipe=Recipe(), dry_run=True)
+    assert there(store) == before
+    size = sum(path.stat().st_size for path in store.root.glob(f"runs/a/{old}/*"))
+    assert (planned.removed[0].what, planned.removed[0].size_bytes) == ("old recipe", size)
+    done = prune(store=store.root, recipe=Recipe())
+    assert (done.removed, done.size_bytes) == (planned.removed, planned.size_bytes)
+    assert [(each.what, each.path) for each in done.removed] == [
+        ("old recipe", store.runs_path / "a" / old),
+        ("superseded run", store.runs_path / "b"),
+    ]
+    assert {run for run, _ in there(store)} == {"a", "c"}, "c has no other"
+    assert len(there(store)) == 2
+    assert not (store.runs_path / "b").exists()
+    assert str(prune(store=store.root, recipe=Recipe())).endswith("there is nothing to remove")
+    assert not list(store.root.rglob(".tmp-*"))
+
+
+def test_what_is_newer_than_the_ruling_recipe_is_not_old(store):
+    assert not [each for each in prune(store=store.root, recipe=OLD).removed if each.what == "old recipe"]
+
+
+def test_what_a_dataset_refers_to_stays_also_where_that_was_moved(store, tmp_path):
+    ids = {run_id: recipe_id for run_id, recipe_id in there(store) if recipe_id == old_recipe(store)}
+    store.remember("datasets/one", DatasetMade(str(tmp_path / "moved"), "0" * 64, (("a", ids["a"]), ("b", ids["b"]))))
+    found = prune(store=store.root, recipe=Recipe())
+    assert found.removed == ()
+    assert {each.stays for each in found.kept} == {f"dataset {tmp_path / 'moved'} refers to it"}
+    assert len(there(store)) == 5
+
+
+def test_what_is_kept_and_what_is_somebody_else_s_stays(store):
+    old = old_recipe(store)
+    (store.runs_path / "b" / "notes.txt").write_text("mine")
+    found = prune(store=store.root, recipe=Recipe(), keep=[old])
+    assert found.removed == ()
+    stays = [each.stays for each in found.kept]
+    assert stays == ["--keep names it", "--keep names it"]
+    found = prune(store=store.root, recipe=Recipe(), keep=["a"])
+    assert [each.stays for each in found.kept] == [
+        "--keep names it",
+        f"{store.runs_path / 'b' / 'notes.txt'} is no file of this store",
+    ]
+    with pytest.raises(UsageError, match="no run or recipe is called nosuch; nothing is removed"):
+        prune(store=store.root, recipe=Recipe(), keep=["nosuch"])
+
+
+def test_what_a_killed_call_left_goes_when_it_is_old(store):
+    holder = store.runs_path / ".tmp-d-12345678"
+    (holder / "d").mkdir(parents=True)
+
+    def planned():
+        found = prune(store=store.root, recipe=Recipe(), keep=["a", "b"], dry_run=True)
+        return [each.path for each in found.removed]
+
+    assert planned() == []
+    os.utime(holder, (0, 0))
+    assert planned() == [holder]
+    prune(store=store.root, recipe=Recipe())
+    assert not holder.exists()
+
+
+def test_a_kill_in_the_midst_of_it_leaves_the_place_empty(store, monkeypatch):
+    def killed(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(atomic.shutil, "rmtree", killed)
+    with pytest.raises(KeyboardInterrupt):
+        prune(store=store.root, recipe=Recipe())
+    monkeypatch.undo()
+    assert ("a", old_recipe(store)) not in there(store)
+    assert len(store.ingestions("a").finished) == 1
