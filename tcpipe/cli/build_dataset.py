@@ -12,6 +12,7 @@ from tcpipe.cli.options import (
     INPUT_FILE,
     OUTPUT_DIRECTORY,
     SEED,
+    cluster_option,
     json_option,
     quiet_option,
     recipe_option,
@@ -56,6 +57,7 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
 @click.option(
     "--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help="Runs sampled side by side."
 )
+@cluster_option
 @click.option("--format", "file_format", default="zarr", show_default=True, type=click.Choice(["zarr", "parquet"]))
 @click.option(
     "--holdout",
@@ -96,6 +98,7 @@ def build_dataset(
     store: str,
     recipe: str | None,
     jobs: int,
+    cluster: str | None,
     file_format: Literal["zarr", "parquet"],
     holdout: str | None,
     covariates: tuple[str, ...],
@@ -128,6 +131,7 @@ def build_dataset(
             tags=tags,
             recipe=ruling,
             jobs=jobs,
+            cluster=cluster,
             file_format=file_format,
             holdout=holdout,
             seed=seed,

@@ -105,8 +105,9 @@ class BucketPlace:
             found = obstore.list_with_delimiter(store, prefix=key or None)["common_prefixes"]
         return sorted(name.rpartition("/")[2] for name in found)
 
-    def put(self, name: str, data: bytes) -> None:
+    def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write an object."""
+        del lasting
         import obstore  # noqa: PLC0415
 
         store, key = self._store(name)

@@ -59,8 +59,8 @@ class Place(Protocol):
     def folders(self, prefix: str = "") -> list[str]:
         """Return the first parts of all names of more parts below ``prefix/``, sorted: the folders that lie there."""
 
-    def put(self, name: str, data: bytes) -> None:
-        """Write a file, in the place of what is there."""
+    def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
+        """Write a file, in the place of what is there; without ``lasting`` it is not synced, and may be half there after a kill."""
 
     def put_new(self, name: str, data: bytes) -> bool:
         """Write a file where there is none; of several writers the first wins. Return whether this call did."""
@@ -129,8 +129,13 @@ class DirectoryPlace:
             return sorted(name for name in found if not name.startswith(TEMPORARY_PREFIX))
         return []
 
-    def put(self, name: str, data: bytes) -> None:
-        """Write a file by a rename."""
+    def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
+        """Write a file by a rename; without ``lasting`` as it is."""
+        if not lasting:
+            with _told(self.where(name), "written"):
+                self._path(name).parent.mkdir(parents=True, exist_ok=True)
+                self._path(name).write_bytes(data)
+            return
         put_file(self._path(name), data, staging=self._staging(), over=True)
 
     def put_new(self, name: str, data: bytes) -> bool:

@@ -9,6 +9,7 @@ pytest.importorskip("distributed", reason="the extra cluster is not installed")
 from dask_cluster import dask_cluster
 from installed_command import plain_lines, tcpipe
 
+from tcpipe.pipeline.maps import add_map
 from tcpipe.simulation import Faults, simulate, tiny
 
 
@@ -24,8 +25,12 @@ def test_a_cluster_makes_the_bytes_that_this_machine_makes(tmp_path):
     assert tcpipe("ingest", *logs, "--store", "here", cwd=tmp_path).returncode == 0
     with dask_cluster(tmp_path, workers=1) as cluster:
         there = tcpipe("ingest", *logs, "--store", "there", "--cluster", cluster.address, cwd=tmp_path)
+        add_map("site", **site.rasters, store=tmp_path / "there")
+        built = tcpipe("build-dataset", "far", "--store", "there", "--cluster", cluster.address, cwd=tmp_path)
+    tcpipe("build-dataset", "near", "--store", "there", cwd=tmp_path)
+    assert (built.returncode, _files(tmp_path / "far")) == (3, _files(tmp_path / "near")), built.stderr
     assert (there.returncode, "segments from" in there.stdout) == (0, True), there.stderr
-    assert _files(tmp_path / "there") == _files(tmp_path / "here")
+    assert _files(tmp_path / "there" / "runs") == _files(tmp_path / "here" / "runs")
     again = tcpipe("ingest", *logs, "--store", "there", "--cluster", cluster.address, cwd=tmp_path)
     assert "nothing to do" in again.stdout, "what needs no worker asks for none: the cluster is gone"
     gone = tcpipe("ingest", *logs, "--store", "there", "--force", cwd=tmp_path, env={"TCPIPE_CLUSTER": cluster.address})

@@ -35,6 +35,7 @@ from tcpipe.formats.dataset_files import (
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
+from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.record_files import Call, DatasetMade, record_name
@@ -126,6 +127,7 @@ def build_dataset(
     tags: Mapping[str, str] | None = None,
     recipe: Recipe | str | Path | None = None,
     jobs: int = 1,
+    cluster: str | None = None,
     file_format: FileFormat = "zarr",
     holdout: str | None = None,
     seed: int | None = None,
@@ -157,6 +159,8 @@ def build_dataset(
         A `Recipe`, a path to one, or None for the one that rules here.
     jobs
         Processes that sample side by side; the bytes do not depend on it.
+    cluster
+        Address of a Dask scheduler whose workers sample instead; they see maps and ``out`` under the same absolute paths.
     file_format
         ``zarr`` or ``parquet``.
     holdout, seed
@@ -205,7 +209,9 @@ def build_dataset(
         return _planned(place, opened, inputs, jobs=jobs)
     else:
         with atomic_directory(place.absolute()) as directory:
-            card = _build(directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs)
+            card = _build(
+                directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs, cluster=cluster
+            )
         result = _result(place, "done", card, problems)
     if not dry_run:
         _remember(opened, watch, result, inputs, jobs)
@@ -318,11 +324,13 @@ def _build(
     *,
     file_format: FileFormat,
     jobs: int,
+    cluster: str | None,
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
     waiting = directory / "spool"
     waiting.mkdir()
-    content = gather_content(waiting, inputs, recipe, regions, earlier, jobs=jobs)
+    pixels = DirectoryPlace(waiting / "pixels")
+    content = gather_content(waiting, inputs, recipe, regions, earlier, spool_place=pixels, jobs=jobs, cluster=cluster)
     logger.info("writing %d samples", len(content.samples))
     with parquet_rows(directory / SAMPLES, content.samples.schema) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.place import Place
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.pipeline.dataset.added_columns import added_columns, narrow_patches, tag_of_each
 from tcpipe.pipeline.dataset.findings import findings_in_words, findings_of_runs
@@ -131,9 +132,17 @@ class Content:
 
 
 def gather_content(
-    directory: Path, inputs: Inputs, recipe: Recipe, regions: Regions | None, earlier: pa.Table | None, *, jobs: int
+    directory: Path,
+    inputs: Inputs,
+    recipe: Recipe,
+    regions: Regions | None,
+    earlier: pa.Table | None,
+    *,
+    spool_place: Place,
+    jobs: int,
+    cluster: str | None,
 ) -> Content:
-    """Sample, split and order; segments and pixels wait in files in ``directory``, which must be empty.
+    """Sample, split and order; segments wait in files in ``directory``, pixels at ``spool_place``; both must be empty.
 
     Raises
     ------
@@ -146,7 +155,14 @@ def gather_content(
     ranks = _ranks(pool.segments, seed=recipe.split.seed)
     gnss_crs = recipe.read.gnss_crs
     sampled, slot, spool = sample_all_segments(
-        pool.segments, ranks, inputs.map_paths, recipe.sample, gnss_crs=gnss_crs, directory=directory, jobs=jobs
+        pool.segments,
+        ranks,
+        inputs.map_paths,
+        recipe.sample,
+        gnss_crs=gnss_crs,
+        spool_place=spool_place,
+        jobs=jobs,
+        cluster=cluster,
     )
     sources = tuple(open_map(path) for path in inputs.map_paths)
     lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)

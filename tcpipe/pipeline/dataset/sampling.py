@@ -17,6 +17,7 @@ from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.execution import run_all
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.place import Place
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled
 from tcpipe.stages.sample_maps import check_alike, sample_on_maps
@@ -30,8 +31,8 @@ from tcpipe.terrain.tiles import TilePool, level_for
 _BATCH_ROWS = 8_192
 """Segments sampled together: 50 MB of patches."""
 
-_BUCKET_ROWS = 16_384
-"""Segments in a bucket of the spool: 0.1 GB of patches, read together."""
+_ROW_BITS = 32
+_ROW_MASK = (1 << _ROW_BITS) - 1
 
 _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that a map tile is decoded for few of them."""
@@ -44,50 +45,51 @@ _HELD_MAPS = 2
 
 @dataclass(frozen=True, slots=True)
 class Spool:
-    """Pixels on disk while they wait for their place in the dataset: one file a layer, one slot a segment.
+    """Pixels that wait for their place in the dataset: one file a batch, one layer after another, in the order of the dataset.
 
-    Slots are buckets of segments whose ranks are near, in the order of the ranks; what is sampled together lies side by side in a bucket.
-    So pixels are written in stretches as they come, and read in the dataset's order one bucket after another: shuffled on disk, never
-    held in memory.
+    What is read together, a stretch of the dataset, is then one stretch of every file: shuffled on disk, never held in memory, and in a
+    bucket as good as in a directory. A slot is the number of a batch (upper 32 bits) and a row of its file.
     """
 
-    directory: Path
+    place: Place
     layers: Mapping[str, Layer]
-    slots: int
     patch_px: int
+    counts: tuple[int, ...] = ()
+    """Patches by batch."""
 
-    def create(self) -> None:
-        """Make the files; a slot that is never written takes no room."""
-        for layer in self.layers:
-            with self._path(layer).open("wb") as file:
-                file.truncate(self.slots * self._slot_bytes(layer))
-
-    def write(self, layer: str, slots: NDArray[np.int64], pixels: LayerPixels) -> None:
-        """Write patches, shape (n, px, px), to their slots, (n,)."""
-        order = np.argsort(slots)
-        stretches = np.split(order, np.flatnonzero(np.diff(slots[order]) != 1) + 1)
-        with self._path(layer).open("r+b", buffering=0) as file:
-            for stretch in stretches:
-                if len(stretch):
-                    file.seek(int(slots[stretch[0]]) * self._slot_bytes(layer))
-                    file.write(np.ascontiguousarray(pixels[stretch]).data)
+    def write(self, batch: int, order: NDArray[np.intp], pixels: Mapping[str, LayerPixels]) -> None:
+        """Write the patches of a batch, each layer of shape (n, px, px), in an order of its rows, (n,)."""
+        whole = b"".join(np.ascontiguousarray(pixels[layer][order]).data for layer in self.layers)
+        self.place.put(f"{batch}", whole, lasting=False)
 
     def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
-        """Return the patches in ``slots``, shape (n, px, px); the file is mapped only while they are copied."""
-        shape = (self.slots, self.patch_px, self.patch_px)
-        return np.asarray(np.memmap(self._path(layer), self.layers[layer].stored, "r", shape=shape)[slots])
+        """Return the patches in ``slots``, shape (n, px, px); of each batch one stretch is read."""
+        dtype, made = self.layers[layer].stored, np.empty((len(slots), *self._shape), self.layers[layer].stored)
+        order = np.argsort(slots, kind="stable")
+        batches, rows = slots[order] >> _ROW_BITS, slots[order] & _ROW_MASK
+        for stretch in np.split(np.arange(len(slots)), np.flatnonzero(np.diff(batches)) + 1) if len(slots) else []:
+            batch, first, last = int(batches[stretch[0]]), int(rows[stretch[0]]), int(rows[stretch[-1]])
+            each = self._patch_bytes(layer)
+            start = self.counts[batch] * sum(self._patch_bytes(name) for name in self._before(layer)) + first * each
+            data = self.place.read_range(f"{batch}", start, (last - first + 1) * each)
+            made[order[stretch]] = np.frombuffer(data, dtype).reshape(-1, *self._shape)[rows[stretch] - first]
+        return made
 
-    def _path(self, layer: str) -> Path:
-        return self.directory / layer
+    @property
+    def _shape(self) -> tuple[int, int]:
+        return self.patch_px, self.patch_px
 
-    def _slot_bytes(self, layer: str) -> int:
+    def _before(self, layer: str) -> Sequence[str]:
+        return list(self.layers)[: list(self.layers).index(layer)]
+
+    def _patch_bytes(self, layer: str) -> int:
         return self.patch_px**2 * self.layers[layer].stored.itemsize
 
 
 @dataclass(frozen=True, slots=True)
 class _Batch:
-    rows: NDArray[np.int64]
-    slots: NDArray[np.int64]
+    number: int
+    ranks: NDArray[np.uint64]
     segments: pa.Table
     map_paths: tuple[Path, ...]
     config: SampleConfig
@@ -110,7 +112,7 @@ class _Batches(Sequence[_Batch]):
     """The batches, each made when it is asked for, so that one copy of its segments exists at a time."""
 
     rows: Sequence[NDArray[np.int64]]
-    slot_of: NDArray[np.int64]
+    ranks: NDArray[np.uint64]
     segments: pa.Table
     map_paths: tuple[Path, ...]
     config: SampleConfig
@@ -131,7 +133,7 @@ class _Batches(Sequence[_Batch]):
             return replace(self, rows=self.rows[index])
         rows = self.rows[index]
         segments = self.segments.take(pa.array(rows))
-        return _Batch(rows, self.slot_of[rows], segments, self.map_paths, self.config, self.gnss_crs, self.spool)
+        return _Batch(index, self.ranks[rows], segments, self.map_paths, self.config, self.gnss_crs, self.spool)
 
 
 def sample_all_segments(
@@ -141,10 +143,11 @@ def sample_all_segments(
     config: SampleConfig,
     *,
     gnss_crs: str,
-    directory: Path,
+    spool_place: Place,
     jobs: int,
+    cluster: str | None = None,
 ) -> tuple[Sampled, NDArray[np.int64], Spool]:
-    """Sample every segment from the first map that has data for it; pixels go to files in ``directory``, the rest is returned.
+    """Sample every segment from the first map that has data for it; pixels go to files at ``spool_place``, the rest is returned.
 
     Beside it, in the order of its ``kept``, which rises: the slots of the spool.
 
@@ -156,10 +159,10 @@ def sample_all_segments(
         Their ranks in the dataset's order, uniform over 64 bits, shape (M,).
     map_paths, config, gnss_crs
         What is sampled, in order of priority, how, and the CRS of the segments' positions.
-    directory
+    spool_place
         Where the pixels wait.
-    jobs
-        Processes side by side.
+    jobs, cluster
+        Processes side by side, or the address of a Dask scheduler whose workers sample instead; they see maps and ``spool_place``.
 
     Raises
     ------
@@ -169,23 +172,26 @@ def sample_all_segments(
     """
     sources = [open_map(path) for path in map_paths]
     check_alike(sources)
+    if cluster is not None:  # its workers are elsewhere
+        map_paths = tuple(path.absolute() for path in map_paths)
     rows = list(_batch_rows(segments))
-    spool = Spool(directory, in_order(joint([source.layers for source in sources])), segments.num_rows, config.patch_px)
-    spool.create()
+    spool = Spool(spool_place, in_order(joint([source.layers for source in sources])), config.patch_px)
     placed = segments.select(PLACED_SEGMENTS.names())
-    batches = _Batches(rows, _slots(rows, ranks), placed, map_paths, config, gnss_crs, spool)
-    lost_by = np.zeros(segments.num_rows, np.uint32)
-    columns: dict[str, NDArray[Any]] = {}
+    batches = _Batches(rows, ranks, placed, map_paths, config, gnss_crs, spool)
+    lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
+    counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     warnings: dict[int, tuple[str, ...]] = {}
     try:
-        with closing(run_all(_sample_batch, batches, jobs=jobs)) as outcomes:
+        with closing(run_all(_sample_batch, batches, jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                part = _sound(outcome.result)
-                lost_by[rows[outcome.index]] = part.lost_by
-                warnings[outcome.index] = part.warnings
+                part, batch = _sound(outcome.result), outcome.index
+                kept = rows[batch][part.kept]
+                lost_by[rows[batch]] = part.lost_by
+                slots[kept[_in_order(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
+                counts[batch], warnings[batch] = len(kept), part.warnings
                 for name, values in _columns(part).items():
                     whole = columns.setdefault(name, np.zeros((len(lost_by), *values.shape[1:]), values.dtype))
-                    whole[rows[outcome.index][part.kept]] = values
+                    whole[kept] = values
     finally:
         _held.clear()
     kept = np.flatnonzero(lost_by == 0)
@@ -194,7 +200,12 @@ def sample_all_segments(
     said = dict.fromkeys(warning for index in sorted(warnings) for warning in warnings[index])
     placing = {name: columns.pop(name) for name in _PLACING}
     sampled = Sampled(kept=kept, patches=Patches({}, **columns), lost_by=lost_by, warnings=tuple(said), **placing)
-    return sampled, batches.slot_of[kept], spool
+    return sampled, slots[kept], replace(spool, counts=tuple(counts))
+
+
+def _in_order(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
+    """Return the rows of a batch in the order of the dataset."""
+    return np.argsort(ranks, kind="stable")
 
 
 def _columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
@@ -219,26 +230,15 @@ def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
         yield np.sort(order[first : first + _BATCH_ROWS])
 
 
-def _slots(batches: Sequence[NDArray[np.int64]], ranks: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Return the slot of every segment, (M,): by bucket of near ranks, then by batch."""
-    sequence = np.concatenate(batches)
-    buckets = np.uint64(-(-len(ranks) // _BUCKET_ROWS))
-    bucket = (ranks[sequence] >> np.uint64(32)) * buckets >> np.uint64(32)
-    slots = np.empty(len(ranks), np.int64)
-    slots[sequence[np.argsort(bucket, kind="stable")]] = np.arange(len(ranks))
-    return slots
-
-
 def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
-    """Sample one batch; its pixels go to its slots of the spool."""
+    """Sample one batch; its pixels go to its file of the spool."""
     try:
         held = [_held_map(path, batch.config) for path in batch.map_paths]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
+        batch.spool.write(batch.number, _in_order(batch.ranks[sampled.kept]), sampled.patches.pixels)
     except TcpipeError as error:
         return error
-    for layer in batch.spool.layers:
-        batch.spool.write(layer, batch.slots[sampled.kept], sampled.patches.pixels[layer])
     return replace(sampled, patches=replace(sampled.patches, pixels={}))
 
 
