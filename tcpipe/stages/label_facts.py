@@ -17,6 +17,7 @@ from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import EnergyBudget, LabelFacts, PhysicsFacts
 
+_MUCH_SLIP = 0.05  # of the segments
 _MUCH_STANDING = 0.5
 _FEW_WATT = 20.0
 
@@ -87,6 +88,12 @@ def label_warnings(facts: LabelFacts) -> tuple[str, ...]:
     if facts.energy_joule is not None and facts.segments and facts.segments_without_power:
         count = f"{facts.segments_without_power} of {facts.segments} segments"
         warnings.append(f"{count} have no label: the power record does not reach over them")
+    slips = facts.quality["high_slip"]
+    if slips > _MUCH_SLIP * facts.segments:
+        warnings.append(
+            f"wheel_odometry: on {slips} of {facts.segments} segments wheels and ground differ by more than 20 % of speed (high_slip): "
+            "they slip there, or what tells the speed over ground is wrong"
+        )
     standing, driving = facts.physics.standing_watt, facts.median_power_watt
     if standing is not None and driving is not None and standing > max(_MUCH_STANDING * driving, _FEW_WATT):
         warnings.append(

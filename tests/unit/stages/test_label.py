@@ -183,6 +183,7 @@ def test_slip_weak_position_curve_and_command():
     assert flagged(labelled, Quality.HIGH_SLIP)[late].all()
     assert not flagged(labelled, Quality.HIGH_SLIP)[~late][:-1].any()
     assert not flagged(labelled, Quality.NO_COMMAND).any()
+    assert sum("wheels and ground differ" in text for text in labelled.info.findings.warnings) == 1
 
     weak = label(straight_track(SPEED, std_m=0.2), power_streams({"drive": record()}))
     assert flagged(weak, Quality.WEAK_GNSS).all()
