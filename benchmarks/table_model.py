@@ -12,11 +12,12 @@ import time
 
 import numpy as np
 
-from tcpipe.learning.forest import grow
 from tcpipe.learning.patch_features import patch_features
+from tcpipe.learning.table_model import fit_table
 
 WANTED_S, WANTED_A_SECOND = 20.0, 200_000
 TOGETHER, TOLD = 1_000, 100_000
+CHANNELS, CLASSES = ("ortho", "terrain", "height"), 7
 
 
 def main() -> None:
@@ -25,7 +26,7 @@ def main() -> None:
     patches[..., 1] = np.rint(patches[..., 1] * 6.0) / 6.0
     began = time.process_time()
     for _ in range(0, count, TOGETHER):
-        patch_features(patches, channels=("ortho", "terrain", "height"), class_count=7, patch_m=1.0)
+        patch_features(patches, channels=CHANNELS, class_count=CLASSES, patch_m=1.0)
     seen_s = time.process_time() - began
     features = rng.normal(size=(count, 16))
     ground = np.column_stack(
@@ -33,17 +34,20 @@ def main() -> None:
     )
     labels = [100.0, 0.8] + [20.0, 0.1] * ground + rng.normal(size=ground.shape) * [5.0, 0.02]
     began = time.process_time()
-    forest = grow(features, labels, np.ones_like(labels), rng.integers(0, 5, count)).forest
+    folds, rules = rng.integers(0, 5, count), {"channels": CHANNELS, "class_count": CLASSES}
+    model, _ = fit_table(features, labels, np.ones_like(labels), folds, **rules)
     grown_s = time.process_time() - began
     many = np.resize(features, (TOLD, 16))
-    forest.predict(many[:10])  # compiles
+    model.predict(many[:10])  # compiles
     began = time.process_time()
-    forest.predict(many)
+    model.predict(many)
     rate = TOLD / (time.process_time() - began)
     print(
         f"{count} samples: {seen_s:.1f} s for features, {grown_s:.1f} s for trees (goal together at most {WANTED_S:.0f} s of 10,000)"
     )
-    print(f"{forest.root.size} trees, {rate:,.0f} predictions/s given the features (goal at least {WANTED_A_SECOND:,})")
+    print(
+        f"{model.forest.root.size} trees, {rate:,.0f} predictions/s given the features (goal at least {WANTED_A_SECOND:,})"
+    )
 
 
 if __name__ == "__main__":

@@ -109,8 +109,8 @@ def _physics(train: Split, ours: Model) -> Predictor:
 
 def _trees(train: Split, ours: Model) -> Predictor:
     """Return trees over features of all layers, and of the turn."""
-    from tcpipe.learning.forest import grow  # noqa: PLC0415  numba loads with it, and with the next
-    from tcpipe.learning.table_fitting import features_of  # noqa: PLC0415
+    from tcpipe.learning.table_fitting import features_of  # noqa: PLC0415  numba loads with it, and with the next
+    from tcpipe.learning.table_model import fit_table  # noqa: PLC0415
 
     folds, labels = train.column("fold"), train.labels.astype(np.float64)
     if len(np.unique(folds)) < 2:
@@ -123,8 +123,10 @@ def _trees(train: Split, ours: Model) -> Predictor:
             [features_of(split, ours.patch_m, ours.classes.count), np.nan_to_num(beside_of(split).turn_radpm)]
         )
 
-    forest = grow(features(train), labels, np.ones_like(labels), folds).forest
-    return lambda split: forest.predict(features(split))
+    model, _ = fit_table(
+        features(train), labels, np.ones_like(labels), folds, channels=train.channels, class_count=ours.classes.count
+    )
+    return lambda split: model.predict(features(split))
 
 
 def _groups(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], NDArray[np.generic]]:

@@ -6,11 +6,14 @@ curve lies near that of all ground: the difference counts as if as many samples 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tcpipe.errors import ModelError
 
 Floats = NDArray[np.float64]
 Form: TypeAlias = Literal["mean", "linear", "spline"]
@@ -42,6 +45,24 @@ class Curves:
         for known, numbers in zip(self.class_id.tolist(), self.own, strict=True):
             out[class_id == known] = made[class_id == known] @ numbers
         return out
+
+    def arrays(self) -> dict[str, NDArray[np.generic]]:
+        """Return everything but the form by name, as `curves_of` takes it."""
+        return {f"{_STORED}{name}": getattr(self, name) for name in _ARRAYS}
+
+
+_ARRAYS, _STORED = ("knots_rad", "pooled", "class_id", "own"), "curve_"
+
+
+def curves_of(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Curves, dict[str, NDArray[Any]]]:
+    """Return the curves that `Curves.arrays` told of, and what else is there; `ModelError` if they are not there."""
+    rest = dict(arrays)
+    try:
+        return Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS)), rest
+    except KeyError:
+        raise ModelError(
+            f"{where}: holds the weights of another model, or of an older kind; train the model again"
+        ) from None
 
 
 def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats) -> Curves:

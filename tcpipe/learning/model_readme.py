@@ -26,8 +26,9 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
   What was measured feeds {{ includes }}, too.
 {%- endif %}
 {% if config.model == "table" -%}
-- Table: up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM), as many as are best where each fold of
-  train is predicted by the others; their loss {{ config.loss }} there is {{ "%.4f" | format(told.held_out_loss) }}.
+- Table: a curve over the slope of each class, and up to {{ told.best_epoch }} boosted trees a label over features of the patch (LightGBM),
+  as many as are best where each fold of train is predicted by the others; the loss {{ config.loss }} there is
+  {{ "%.4f" | format(told.held_out_loss) }}.
 {% elif config.model == "physics" -%}
 - Physics: standing, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted robustly. Its
   loss {{ config.loss }} where each fold of train is predicted by the others is {{ "%.4f" | format(told.held_out_loss) }}. Of a patch it

@@ -3,7 +3,7 @@
 ::
 
     model.json         what it takes, gives, and has seen; how it was trained; checksums of the rest
-    weights.npz        every weight by its path in the network; the arrays of a table's trees; coefficients of physics
+    weights.npz        every weight by its path in the network; a table's curves and trees; coefficients of physics
     residuals.parquet  labels and predictions of the fold that stopped a network; else of all samples, by the other folds
     history.csv        losses of every epoch
     MODEL.md           the same for people
@@ -37,8 +37,8 @@ from tcpipe.tables.findings import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
 if TYPE_CHECKING:
-    from tcpipe.learning.forest import Forest
     from tcpipe.learning.network import ResNet18
+    from tcpipe.learning.table_model import TableModel
 
 Floats = NDArray[np.float32]
 Arrays = Mapping[str, NDArray[np.generic]]
@@ -80,11 +80,12 @@ class Model:
         return network
 
     @cached_property
-    def forest(self) -> Forest:
-        """Return the trees of a table."""
-        from tcpipe.learning.forest import forest_of  # noqa: PLC0415  numba takes a second
+    def table(self) -> TableModel:
+        """Return the curves and trees of a table."""
+        from tcpipe.learning.table_model import table_model_of  # noqa: PLC0415  numba takes a second
 
-        return forest_of(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
+        arrays = read_arrays(self.place / WEIGHTS)
+        return table_model_of(arrays, str(self.place / WEIGHTS), self.channels, self.classes.count)
 
     @cached_property
     def physics_model(self) -> PhysicsModel:
@@ -198,7 +199,7 @@ class Model:
             features = patch_features(
                 patches[rows], channels=self.channels, class_count=self.classes.count, patch_m=self.patch_m
             )
-            out[rows] = self.forest.predict(np.column_stack([features, numbers[rows]]))
+            out[rows] = self.table.predict(np.column_stack([features, numbers[rows]]))
         return out
 
     @cached_property

@@ -24,6 +24,9 @@ from tcpipe.terrain.layers import HEIGHT_RANGE_M
 Floats = NDArray[np.float64]
 Patches = NDArray[np.float32]
 
+_OF_GROUND, _OF_OTHERS = 6, 3
+"""Features of a channel."""
+
 
 def patch_features(patches: Patches, *, channels: Sequence[str], class_count: int, patch_m: float) -> Floats:
     """Return the features of tensors of shape (N, px, px, channels), shape (N, features).
@@ -51,6 +54,18 @@ def patch_features(patches: Patches, *, channels: Sequence[str], class_count: in
             texture = np.abs(np.diff(values, axis=2)).mean(axis=(1, 2))
             parts.append(np.column_stack([values.mean(axis=(1, 2)), values.std(axis=(1, 2)), texture]))
     return np.column_stack(parts).astype(np.float64)
+
+
+def slope_and_class(features: Floats, channels: Sequence[str], class_count: int) -> tuple[Floats, NDArray[np.int64]]:
+    """Return slope [rad] and most frequent class of patches by their features, shape (N,) each; 0 without heights, or classes."""
+    slope, class_id, at = np.zeros(len(features)), np.zeros(len(features), np.int64), 0
+    for channel in channels:
+        if channel == "height":
+            slope = features[:, at]
+        elif channel == "terrain":
+            class_id = features[:, at : at + class_count].argmax(axis=1) + 1
+        at += {"height": _OF_GROUND, "terrain": class_count}.get(channel, _OF_OTHERS)
+    return slope, class_id
 
 
 def _of_ground(height_m: Patches, patch_m: float) -> NDArray[np.float32]:

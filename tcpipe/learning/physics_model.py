@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -14,13 +14,12 @@ from tcpipe.dataset import Split
 from tcpipe.dataset.beside import Beside
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError
-from tcpipe.learning.curves import Curves, fit_curves
+from tcpipe.learning.curves import Curves, curves_of, fit_curves
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 
 Floats = NDArray[np.float64]
 
 _CLASSES = 256
-_SPEED = "speed_"
 _NO_LOAD_QUANTILES = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5)
 """Of the power, that are tried for what is drawn without any load."""
 
@@ -54,19 +53,18 @@ class PhysicsModel:
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return everything by name, as `physics_model_of` takes it."""
-        own = {of.name: getattr(self, of.name) for of in fields(self) if of.name != "speed"}
-        told = {name: value for name, value in asdict(self.speed).items() if name != "form"}
-        return {**own, **{f"{_SPEED}{name}": value for name, value in told.items()}}
+        return {**{name: getattr(self, name) for name in _NUMBERS}, **self.speed.arrays()}
+
+
+_NUMBERS = tuple(of.name for of in fields(PhysicsModel) if of.name != "speed")
 
 
 def physics_model_of(arrays: Mapping[str, NDArray[Any]], where: str) -> PhysicsModel:
     """Return the model that `PhysicsModel.arrays` told of; `ModelError` if these are another's."""
-    speed = {name.removeprefix(_SPEED): value for name, value in arrays.items() if name.startswith(_SPEED)}
-    own = {name: value for name, value in arrays.items() if not name.startswith(_SPEED)}
-    try:
-        return PhysicsModel(Curves("linear", **speed), **own)
-    except TypeError:
-        raise ModelError(f"{where}: holds the weights of another model; remove it and train the model again") from None
+    speed, rest = curves_of("linear", arrays, where)
+    if rest.keys() != set(_NUMBERS):
+        raise ModelError(f"{where}: holds the weights of another model; train the model again")
+    return PhysicsModel(speed, **rest)
 
 
 def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | None) -> PhysicsModel:

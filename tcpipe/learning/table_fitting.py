@@ -13,10 +13,10 @@ from tcpipe.dataset import Split
 from tcpipe.dataset.beside import beside_of, numbers_of
 from tcpipe.learning.checkpoint import TrainingProgress
 from tcpipe.learning.fitting import FitConfig, Fitted, Spent, Task, label_scale, labels_of
-from tcpipe.learning.forest import grow
 from tcpipe.learning.losses import loss_factors, mean_loss
 from tcpipe.learning.patch_features import Floats, patch_features
 from tcpipe.learning.physics_model import fit_physics_model, standing_of
+from tcpipe.learning.table_model import fit_table
 
 logger = logging.getLogger("tcpipe")
 
@@ -75,9 +75,11 @@ def _trees(task: Task, labels: Floats, weights: Floats, patch_m: float, class_co
     numbers = numbers_of(task.beside, beside_of(split))
     features = np.column_stack([features_of(split, patch_m, class_count), numbers])
     fed_s = time.perf_counter() - began
-    grown = grow(features, labels, weights, split.column("fold"))
-    rounds = int(np.bincount(grown.forest.output).max())
-    return _Made(grown.forest.arrays(), grown.forest.predict(features), grown.held_out, rounds, fed_s)
+    model, held_out = fit_table(
+        features, labels, weights, split.column("fold"), channels=split.channels, class_count=class_count
+    )
+    rounds = int(np.bincount(model.forest.output).max())
+    return _Made(model.arrays(), model.predict(features), held_out, rounds, fed_s)
 
 
 def _physics(split: Split, labels: Floats) -> _Made:

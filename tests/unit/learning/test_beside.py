@@ -37,7 +37,7 @@ def _column(split, name):
 
 def _labels(split):
     beside = beside_of(split)
-    return (real_labels(split) + np.column_stack([400.0 * beside.turn_radpm, 0.2 * beside.command_mps])).astype(
+    return (real_labels(split) + np.column_stack([400.0 * beside.turn_radpm, 1.0 * beside.command_mps])).astype(
         np.float32
     )
 
@@ -63,7 +63,7 @@ def test_what_is_told_beside_a_patch_is_heeded(told, tmp_path, kind):
     full, half = (at_speed(model, mps).predict(split.patches)[:, 1] for mps in (1.0, 0.5))
     assert np.abs(full - half).max() > 0.0
     if kind == "table":
-        assert 0.05 < (full - half).mean() < 0.12  # 0.1 was put in
+        assert 0.35 < (full - half).mean() < 0.6  # 0.5 was put in
         assert np.std(said[:, 0] - split.labels[:, 0]) < np.std(usual[:, 0] - split.labels[:, 0])
     assert "usually" in (tmp_path / "model" / "MODEL.md").read_text()
 

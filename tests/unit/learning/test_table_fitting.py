@@ -43,7 +43,7 @@ def test_it_predicts_what_it_was_made_of(trained, dataset):
     assert model.predict(split.patches[3:4]) == pytest.approx(said[3:4])
     assert sum(model.class_counts.values()) == len(split)
     assert verify(place).problems == ()
-    assert "Table: up to" in (place / README).read_text()
+    assert "Table: a curve over the slope" in (place / README).read_text()
 
 
 def test_every_sample_was_held_out_once(trained, dataset):
