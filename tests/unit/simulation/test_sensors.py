@@ -4,13 +4,18 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
+from simulated_streams import log_of, streams_of
 
+from tcpipe.fusion.preparation import find_datum
+from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.simulation import scenario, simulated_drive
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.robot import GRAVITY_MPS2
-from tcpipe.simulation.scenarios import small_world
-from tcpipe.simulation.sensors import CLOCK_STEP_NS, Noise, Power, Sensors, Visual, record
+from tcpipe.simulation.scenarios import HUSKY_ROS1, HUSKY_ROS2, small_world, tiny
+from tcpipe.simulation.sensors import CLOCK_STEP_NS, Doppler, Noise, Power, Sensors, Visual, record
+from tcpipe.tables.columns import floats, integers
 
 SITE = small_world().site
 
@@ -259,3 +264,27 @@ def test_seeds_differ_and_repeat(truth):
     first, again, other = (readings(truth, "gnss_noise", seed=seed)["gnss"] for seed in (1, 1, 2))
     assert same(first, again)
     assert not same(first, other)
+
+
+@pytest.mark.parametrize("container", ["mcap", "bag"])
+def test_a_receivers_velocity_is_that_of_its_antenna_within_what_it_claims(container, tmp_path):
+    """Through a log on disk: the mean of the fixes' way is the integral of the velocity, and its scatter is what is claimed."""
+    quiet = Faults.only("gnss_noise", "gnss_lever_arm")
+    recorder = HUSKY_ROS2 if container == "mcap" else HUSKY_ROS1
+    made = tiny(
+        quiet, container=container, recorder=recorder, sensors=replace(Sensors(), doppler=Doppler()), seconds=20.0
+    )
+    told = streams_of(log_of(made, made.drives[0], tmp_path))
+    velocity, fixes = told.tables["gnss_velocity"], told.tables["gnss"]
+    assert velocity["stamp_ns"].to_pylist() == fixes["stamp_ns"].to_pylist()  # one receiver
+    variance = floats(velocity, "east_var_m2ps2")
+    assert variance == pytest.approx(np.full(variance.size, 0.03**2 + 0.04**2))
+    lonlatalt = [floats(fixes, name) for name in ("lon_deg", "lat_deg", "alt_m")]
+    place = enu_from_geodetic(*lonlatalt, datum_deg_m=find_datum(*lonlatalt))
+    at_s = (integers(fixes, "stamp_ns") - integers(fixes, "stamp_ns")[0]) * 1e-9
+    for axis, name in enumerate(("east", "north")):
+        way_m = cumulative_trapezoid(floats(velocity, f"{name}_velocity_mps"), at_s, initial=0.0)
+        drift_m = way_m - (place[:, axis] - place[0, axis])
+        assert np.abs(drift_m).max() < 4 * np.sqrt(variance[0] * 3.0 * at_s[-1])
+        assert np.ptp(place[:, axis]) > 1.0
+    assert np.isfinite(floats(velocity, "up_velocity_mps")).all()
