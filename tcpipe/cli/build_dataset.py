@@ -8,9 +8,9 @@ from typing import Literal
 import click
 
 from tcpipe.cli.options import (
-    INPUT_DIRECTORY,
     INPUT_FILE,
-    OUTPUT_DIRECTORY,
+    PUBLISHED,
+    SEALED,
     SEED,
     cluster_option,
     json_option,
@@ -29,7 +29,7 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
 
 
 @click.command("build-dataset", short_help="Segments and map to a dataset")
-@click.argument("out", default="dataset", type=OUTPUT_DIRECTORY, metavar="[OUT]")
+@click.argument("out", default="dataset", type=PUBLISHED, metavar="[OUT]")
 @click.option(
     "--split",
     type=INPUT_FILE,
@@ -75,7 +75,7 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
 @click.option("--seed", type=SEED, help="Seed of split and row order (default: the recipe's).")
 @click.option(
     "--keep-split",
-    type=INPUT_DIRECTORY,
+    type=SEALED,
     metavar="OLD",
     help="An earlier dataset (OUT, too): its samples keep their split and fold.",
 )

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from tcpipe.cli.options import (
-    INPUT_DIRECTORY,
     OUTPUT_DIRECTORY,
+    SEALED,
     FloatRange,
     LonLat,
     json_option,
@@ -20,7 +20,7 @@ from tcpipe.cli.options import (
 
 
 @click.command("cost-map", short_help="Directional cost maps of a whole map")
-@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
+@click.argument("model", type=SEALED, metavar="MODEL")
 @click.argument("out", default="cost-map", type=OUTPUT_DIRECTORY, metavar="[OUT]")
 @map_option
 @click.option(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY, json_option
+from tcpipe.cli.options import SEALED, json_option
 
 
 @click.command(short_help="What changed between two datasets, by cause")
-@click.argument("a", type=INPUT_DIRECTORY, metavar="A")
-@click.argument("b", type=INPUT_DIRECTORY, metavar="B")
+@click.argument("a", type=SEALED, metavar="A")
+@click.argument("b", type=SEALED, metavar="B")
 @json_option
 def diff(a: str, b: str, *, as_json: bool) -> int:
     """Name what changed from A to B and why (log, recipe key, map, region, code), with the labels' shift; exit code 1 if they differ."""

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, SEALED, SEED, json_option, quiet_option
 
 
 @click.command(short_help="Measure a model, beside the paper's tables")
-@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
-@click.argument("dataset", type=INPUT_DIRECTORY, metavar="DATASET")
+@click.argument("model", type=SEALED, metavar="MODEL")
+@click.argument("dataset", type=SEALED, metavar="DATASET")
 @click.argument("out", default="evaluation", type=OUTPUT_DIRECTORY, metavar="[OUT]")
 @click.option(
     "--draws",

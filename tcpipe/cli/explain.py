@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY, json_option, quiet_option, store_option
+from tcpipe.cli.options import SEALED, json_option, quiet_option, store_option
 
 
 @click.command(short_help="Where a sample came from; make it again")
@@ -13,7 +13,7 @@ from tcpipe.cli.options import INPUT_DIRECTORY, json_option, quiet_option, store
     "--dataset",
     default="dataset",
     show_default=True,
-    type=INPUT_DIRECTORY,
+    type=SEALED,
     metavar="DIR",
     help="The dataset that holds it.",
 )

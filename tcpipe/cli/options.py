@@ -61,6 +61,10 @@ OUTPUT_DIRECTORY = Place(places.output_directory, written=True)
 OUTPUT_FILE = Place(places.output_file, written=True)
 INPUT_FILE = Place(places.input_file)
 INPUT_DIRECTORY = Place(places.input_directory)
+SEALED = Place(places.input_directory, urls=True)
+"""A dataset or a model, here or in a bucket."""
+PUBLISHED = Place(places.output_directory, written=True, urls=True)
+"""Where a dataset or a model is written, here or in a bucket."""
 LOG = Place(places.input_path, urls=True)
 """A log, here or in object storage."""
 ONE_OF_SEVERAL = Place(str)

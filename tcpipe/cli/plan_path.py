@@ -8,8 +8,8 @@ from typing import Literal
 import click
 
 from tcpipe.cli.options import (
-    INPUT_DIRECTORY,
     OUTPUT_FILE,
+    SEALED,
     FloatRange,
     LonLat,
     json_option,
@@ -21,7 +21,7 @@ from tcpipe.cli.options import (
 
 
 @click.command("plan-path", short_help="The path of least energy, time or distance")
-@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
+@click.argument("model", type=SEALED, metavar="MODEL")
 @click.option("--from", "start", required=True, type=LonLat(), help="Where it begins (WGS84, degrees).")
 @click.option("--to", "goal", required=True, type=LonLat(), help="Where it ends.")
 @click.option(
@@ -40,7 +40,7 @@ from tcpipe.cli.options import (
 )
 @click.option(
     "--cost-map",
-    type=INPUT_DIRECTORY,
+    type=SEALED,
     metavar="DIR",
     help="A cost map of this model and map; without one only what is needed is predicted.",
 )

@@ -7,9 +7,9 @@ from pathlib import Path
 import click
 
 from tcpipe.cli.options import (
-    INPUT_DIRECTORY,
     INPUT_FILE,
     OUTPUT_FILE,
+    SEALED,
     json_option,
     map_option,
     physics_option,
@@ -20,7 +20,7 @@ from tcpipe.cli.options import (
 
 
 @click.command("predict-path", short_help="Time and energy of a path")
-@click.argument("model", type=INPUT_DIRECTORY, metavar="MODEL")
+@click.argument("model", type=SEALED, metavar="MODEL")
 @click.option(
     "--path",
     "path_file",

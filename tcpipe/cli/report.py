@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY
+from tcpipe.cli.options import SEALED
 
 
 @click.command(short_help="HTML page of a run, dataset or store")
-@click.argument("path", type=INPUT_DIRECTORY, metavar="PATH")
+@click.argument("path", type=SEALED, metavar="PATH")
 def report(path: str) -> None:
     """Write report.html for PATH: a run directory, a dataset, or a store (one page a run), and print the physics of each robot.
 
@@ -19,9 +17,9 @@ def report(path: str) -> None:
     from tcpipe.cli.output import say
     from tcpipe.pipeline.report import report as run
 
-    written = run(Path(path))
+    written = run(path)
     for page in written:
-        say(str(page.path))
+        say(page.path)
         for line in page.physics:
             say(f"  {line}")
     if not any(page.changed for page in written):

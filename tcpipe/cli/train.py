@@ -7,15 +7,15 @@ from typing import Any
 import click
 from click.core import ParameterSource
 
-from tcpipe.cli.options import INPUT_DIRECTORY, OUTPUT_DIRECTORY, SEED, FloatRange, json_option, quiet_option
+from tcpipe.cli.options import PUBLISHED, SEALED, SEED, FloatRange, json_option, quiet_option
 
 _OF_THE_NETWORK = {"epochs", "patience", "batch", "learning_rate", "fold", "mirror", "width", "seed"}
 """Options that a table and physics do not heed: who gives one wants the network."""
 
 
 @click.command(short_help="Train a model on a dataset")
-@click.argument("dataset", type=INPUT_DIRECTORY, metavar="DATASET")
-@click.argument("out", default="model", type=OUTPUT_DIRECTORY, metavar="[OUT]")
+@click.argument("dataset", type=SEALED, metavar="DATASET")
+@click.argument("out", default="model", type=PUBLISHED, metavar="[OUT]")
 @click.option(
     "--model", type=click.Choice(["resnet18", "table", "physics"]),
     help="The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, --weights, "

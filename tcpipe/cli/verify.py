@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
-from tcpipe.cli.options import INPUT_DIRECTORY, json_option
+from tcpipe.cli.options import SEALED, json_option
 
 
 @click.command(short_help="Re-read everything, compare counts and checksums")
-@click.argument("path", type=INPUT_DIRECTORY, metavar="PATH")
+@click.argument("path", type=SEALED, metavar="PATH")
 @json_option
 def verify(path: str, *, as_json: bool) -> int:
     """Re-read the dataset, run, store, map, model or cost map at PATH: compare counts, checksums, contracts.
@@ -20,7 +18,7 @@ def verify(path: str, *, as_json: bool) -> int:
     from tcpipe.cli.output import print_json, say
     from tcpipe.pipeline.verify import verify as run
 
-    found = run(Path(path))
+    found = run(path)
     if as_json:
         print_json(found)
     else:

@@ -13,7 +13,8 @@ from tcpipe.dataset.split import SampleColumns, Split
 from tcpipe.dataset.tensor import tensor_form
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import open_patches, read_current_card, read_samples, rows_in_files
+from tcpipe.formats.dataset_files import is_shard, open_patches, read_current_card, read_samples, rows_in_files
+from tcpipe.formats.published import here_by_range
 from tcpipe.terrain.layers import LAYERS
 
 
@@ -52,7 +53,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
     Parameters
     ----------
     path
-        Its directory, of either format.
+        Its directory, of either format, or the URL of one in a bucket (``s3://…``): patches are fetched when they are read, and cached.
     layers
         The tensor's channels, in this order; None: the paper's ``ortho``, ``terrain``, ``height``, those of them that are there.
     label
@@ -69,7 +70,8 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
         There is no dataset, it is of another data model, or its samples do not fit its card, or it has no such layer or label.
 
     """
-    directory, energy = Path(path), energy_called(label)
+    energy = energy_called(label)
+    directory, fetched = here_by_range(path, by_range=is_shard)
     card = read_current_card(directory)
     split = read_samples(directory, ["split"]).column("split").to_numpy()
     if len(split) != card.samples:
@@ -77,7 +79,7 @@ def open_dataset(path: str | Path, *, layers: Sequence[str] | None = None, label
             f"{directory}: samples.parquet has {len(split)} rows, its card says {card.samples}; build it again"
         )
     _refuse_without(energy, directory, card)
-    files = open_patches(directory, card)
+    files = open_patches(directory, card, fetched)
     asked = [name for name in LAYERS if name in files.layers] if layers is None else layers
     form = tensor_form(asked, files.layers)
     parts = {}

@@ -91,6 +91,7 @@ class StoredPixels:
         pool = {layer: np.empty(shape, files.layers[layer].stored) for layer in layers}
         for first in range(0, len(parts), pieces):
             here, places = parts[first : first + pieces], []
+            files.expect([int(piece_of[part[0]]) for part in here], layers)
             for number, part in enumerate(here):
                 piece, head = int(piece_of[part[0]]), spare + number * files.piece_rows
                 files.read(piece, layers, out={layer: pixels[head:] for layer, pixels in pool.items()})
@@ -104,7 +105,10 @@ class StoredPixels:
         px = self.files.patch_px
         out: Pixels = {layer: np.empty((len(rows), px, px), self.files.layers[layer].stored) for layer in layers}
         piece_of = np.searchsorted(self.files.starts, rows, side="right") - 1
-        for piece in np.unique(piece_of).tolist():
+        pieces = np.unique(piece_of).tolist()
+        for number, piece in enumerate(pieces):
+            if number % CACHED_PIECES == 0:
+                self.files.expect(pieces[number : number + CACHED_PIECES], layers)
             here = np.flatnonzero(piece_of == piece)
             pixels = self._piece(piece, tuple(layers))
             for layer in layers:

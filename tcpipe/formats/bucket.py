@@ -136,7 +136,7 @@ class BucketPlace:
         import obstore  # noqa: PLC0415
 
         def upload(path: Path) -> None:
-            name = f"{prefix}/{path.relative_to(directory).as_posix()}"
+            name = "/".join(part for part in (prefix, path.relative_to(directory).as_posix()) if part)
             store, key = self._store(name)
             with told(self.where(name), StoreError, what="written"):
                 obstore.put(store, key, path)

@@ -17,11 +17,15 @@ from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import atomic_file
 
 _MOST_BYTES = 8_000_000_000
+_SHARE_UNSEEN = 64
+"""The cache may be larger than its bound by one part in so many: looking at all of its files takes time."""
+_unseen_bytes = [float("inf")]
+"""What this process has put there since it last looked."""
 _IN_USE_S = 60.0
 """What was used so lately stays: another process may be about to open it."""
 
 
-def cached(key: str, fetch: Callable[[Path], None]) -> Path:
+def cached(key: str, fetch: Callable[[Path], object]) -> Path:
     """Return the file of a key; where there is none, ``fetch`` writes it.
 
     Raises
@@ -37,7 +41,11 @@ def cached(key: str, fetch: Callable[[Path], None]) -> Path:
     with atomic_file(path) as temporary:
         fetch(temporary)
         temporary.touch()
-    _make_room(path.parent.parent, now=path.stat().st_mtime)
+    put = path.stat()
+    _unseen_bytes[0] += put.st_size
+    if _unseen_bytes[0] * _SHARE_UNSEEN > (most := _most_bytes()):
+        _make_room(path.parent.parent, most, now=put.st_mtime)
+        _unseen_bytes[0] = 0
     return path
 
 
@@ -50,11 +58,15 @@ def _directory() -> Path:
     return Path(tempfile.gettempdir()) / f"tcpipe-cache-{os.getuid()}"
 
 
-def _make_room(directory: Path, *, now: float) -> None:
-    """Remove what was not used for longest until the bound holds."""
+def _most_bytes() -> int:
     given = os.environ.get("TCPIPE_CACHE_BYTES", str(_MOST_BYTES))
     if not given.isdecimal():
         raise UsageError(f"TCPIPE_CACHE_BYTES is {given!r}, wanted a number of bytes")
+    return int(given)
+
+
+def _make_room(directory: Path, most: int, *, now: float) -> None:
+    """Remove what was not used for longest until the bound holds."""
     files = []
     for path in directory.glob("??/*"):
         with suppress(OSError):
@@ -62,7 +74,7 @@ def _make_room(directory: Path, *, now: float) -> None:
             files.append((seen.st_mtime, seen.st_size, path))
     total = sum(size for _, size, _ in files)
     for used, size, path in sorted(files):
-        if total <= int(given) or now - used < _IN_USE_S:
+        if total <= most or now - used < _IN_USE_S:
             return
         path.unlink(missing_ok=True)
         total -= size

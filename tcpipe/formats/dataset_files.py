@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -24,6 +24,7 @@ from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.json_files import typed
 from tcpipe.formats.layer_descriptions import cf_attributes, layers_described
 from tcpipe.formats.parquet import column_names, read_row_group, read_table, write_table
+from tcpipe.formats.published import FetchedShards
 from tcpipe.formats.seals import prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
@@ -281,11 +282,19 @@ class PatchFiles:
     """Zarr: the array of each layer; a piece is a chunk."""
     groups: tuple[tuple[str, int], ...] = ()
     """Parquet: file and row group of each piece."""
+    fetched: FetchedShards | None = None
+    """Where the files are; None: on this machine."""
 
     @property
     def piece_rows(self) -> int:
         """Room that a piece needs; the last one may hold fewer rows."""
         return CHUNK_ROWS if self.arrays else GROUP_ROWS
+
+    def expect(self, pieces: Iterable[int], layers: Iterable[str]) -> None:
+        """Have pieces brought here that are read soon, where they lie in a bucket."""
+        if self.fetched is not None and self.arrays:
+            for layer in layers:
+                self.arrays[layer].expect((piece, 0, 0) for piece in pieces)
 
     def read(
         self, piece: int, layers: Iterable[str], out: Mapping[str, NDArray[Any]] | None = None
@@ -308,8 +317,9 @@ class PatchFiles:
                 for layer in layers:
                     self.arrays[layer].chunk((piece, 0, 0), out=into[layer][: self.piece_rows])
             else:
-                path, group = self.groups[piece]
-                table = read_row_group(self.directory / path, group, list(layers))
+                name, group = self.groups[piece]
+                path = self.directory / name
+                table = read_row_group(path if self.fetched is None else self.fetched.whole(path), group, list(layers))
                 for layer in layers:
                     flat = table.column(layer).combine_chunks().flatten().to_numpy()
                     into[layer][:rows] = flat.reshape(rows, *shape[1:])
@@ -322,8 +332,13 @@ class PatchFiles:
         return {layer: into[layer][:rows] for layer in layers}
 
 
-def open_patches(directory: Path, card: DatasetCard) -> PatchFiles:
-    """Return where the patches of a dataset lie; `DatasetError` if they are gone, or not what the card says."""
+def is_shard(name: str) -> bool:
+    """Tell whether a file of a dataset holds patches, of which a part is read at a time."""
+    return name.startswith(f"{SHARDS}/") or (name.startswith(f"{PATCHES}/") and "/c/" in name)
+
+
+def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | None = None) -> PatchFiles:
+    """Return where the patches of a dataset lie, here or ``fetched``; `DatasetError` if they are gone, or not what the card says."""
     px, samples = card.patch_px, card.samples
     layers = in_order(layers_described(card.layers, card.classes, directory / CARD))
     known = card.format in get_args(FileFormat)
@@ -335,9 +350,9 @@ def open_patches(directory: Path, card: DatasetCard) -> PatchFiles:
     if "terrain" in layers and not card.classes:
         raise DatasetError(f"{directory / CARD}: a layer terrain, but no classes; build the dataset again")
     if card.format == "parquet":
-        return _in_shards(directory, layers, px, card)
+        return replace(_in_shards(directory, layers, px, card), fetched=fetched)
     try:
-        arrays = {layer: open_sharded(directory / PATCHES / layer) for layer in layers}
+        arrays = {layer: open_sharded(directory / PATCHES / layer, fetched=fetched) for layer in layers}
     except StoreError as error:
         raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
     for layer, array in arrays.items():
@@ -346,7 +361,7 @@ def open_patches(directory: Path, card: DatasetCard) -> PatchFiles:
         if found != wanted:
             raise DatasetError(f"{array.path}: holds {found}, the card says {wanted}; build the dataset again")
     starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
-    return PatchFiles(directory, layers, px, starts, arrays)
+    return PatchFiles(directory, layers, px, starts, arrays, fetched=fetched)
 
 
 def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:

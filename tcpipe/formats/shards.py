@@ -14,11 +14,14 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import google_crc32c
 import numcodecs
@@ -37,6 +40,19 @@ _ABSENT = 2**64 - 1
 _BLOSC_SHUFFLES = {"noshuffle": 0, "shuffle": 1, "bitshuffle": 2}
 
 
+class Fetched(Protocol):
+    """Shards that lie elsewhere, by the path that they would have here."""
+
+    def size(self, path: Path) -> int:
+        """Return the size of a shard [byte]; `FileNotFoundError` where there is none."""
+
+    def read(self, path: Path, offset: int, size: int) -> bytes:
+        """Return a piece of a shard that ends with its checksum."""
+
+    def expect(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
+        """Have pieces (shard, offset, size) brought here, which are read soon."""
+
+
 @dataclass(frozen=True, slots=True)
 class ShardedArray:
     """An array on disk, by its chunks; ``chunk_shape`` divides ``shard_shape``."""
@@ -51,6 +67,8 @@ class ShardedArray:
     """A shard without a file is all fill value, as in Zarr; otherwise it is damage."""
     codec: Any
     """What encodes and decodes a chunk, beneath its checksum."""
+    fetched: Fetched | None = None
+    """Where the shards are; None: on this machine."""
     _indices: dict[tuple[int, ...], NDArray[np.uint64]] = field(default_factory=dict)
 
     def chunk(self, index: tuple[int, ...], out: NDArray[Any] | None = None) -> NDArray[Any]:
@@ -62,18 +80,23 @@ class ShardedArray:
             Its shard is gone or damaged.
 
         """
-        per_shard = self.per_shard
-        shard = tuple(i // n for i, n in zip(index, per_shard, strict=True))
+        shard, place = self._shard_and_place(index)
         out = np.empty(self.chunk_shape, self.dtype) if out is None else out
         path = self._shard_path(shard)
         try:
-            with path.open("rb", buffering=0) as file:
-                place = tuple(i % n for i, n in zip(index, per_shard, strict=True))
-                offset, size = (int(value) for value in self._index(shard, file.fileno())[place])
-                if offset == _ABSENT:
-                    out[...] = self.fill
-                    return out
-                data = _checked(file.fileno(), size, offset)
+            if self.fetched is not None:
+                data = self._encoded_at(
+                    shard, place, partial(self.fetched.size, path), partial(self.fetched.read, path)
+                )
+            else:
+                with path.open("rb", buffering=0) as file:
+                    of = file.fileno()
+                    data = self._encoded_at(
+                        shard, place, lambda: os.fstat(of).st_size, lambda at, size: os.pread(of, size, at)
+                    )
+            if data is None:
+                out[...] = self.fill
+            else:
                 self.codec.decode(data, out=out)
         except FileNotFoundError:
             if not self.sparse:
@@ -82,6 +105,25 @@ class ShardedArray:
         except (OSError, RuntimeError, ValueError) as error:
             raise StoreError(f"{path}: chunk {index} is damaged ({error})") from None
         return out
+
+    def expect(self, indices: Iterable[tuple[int, ...]]) -> None:
+        """Have chunks brought here that are read soon, where they lie elsewhere; what cannot be had is told when it is read."""
+        if self.fetched is None:
+            return
+        pieces = []
+        for index in indices:
+            shard, place = self._shard_and_place(index)
+            path = self._shard_path(shard)
+            with suppress(FileNotFoundError, ValueError):
+                table = self._index(shard, partial(self.fetched.size, path), partial(self.fetched.read, path))
+                offset, size = (int(value) for value in table[place])
+                pieces += [(path, offset, size)] if offset != _ABSENT else []
+        self.fetched.expect(pieces)
+
+    def _shard_and_place(self, index: Sequence[int]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        per_shard = self.per_shard
+        shard = tuple(i // n for i, n in zip(index, per_shard, strict=True))
+        return shard, tuple(i % n for i, n in zip(index, per_shard, strict=True))
 
     def window(self, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
         """Return rows ``row0:row1`` and columns ``col0:col1`` of an array of two axes; `StoreError` as `chunk`."""
@@ -140,19 +182,30 @@ class ShardedArray:
     def _shard_path(self, shard: tuple[int, ...]) -> Path:
         return self.path.joinpath("c", *(str(i) for i in shard))
 
-    def _index(self, shard: tuple[int, ...], descriptor: int) -> NDArray[np.uint64]:
+    def _encoded_at(
+        self, shard: tuple[int, ...], place: tuple[int, ...], end: Callable[[], int], read: Callable[[int, int], bytes]
+    ) -> bytes | None:
+        """Return a chunk as it is stored, proved; None for one that is all fill value."""
+        offset, size = (int(value) for value in self._index(shard, end, read)[place])
+        return None if offset == _ABSENT else _checked(read, size, offset)
+
+    def _index(
+        self, shard: tuple[int, ...], end: Callable[[], int], read: Callable[[int, int], bytes]
+    ) -> NDArray[np.uint64]:
         """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
         if shard not in self._indices:
             per_shard = self.per_shard
             size = 16 * math.prod(per_shard) + _CRC_BYTES
-            end = os.fstat(descriptor).st_size
-            table = _checked(descriptor, size, max(end - size, 0))
+            table = _checked(read, size, max(end() - size, 0))
             self._indices[shard] = np.frombuffer(table, "<u8").reshape(*per_shard, 2)
         return self._indices[shard]
 
 
-def open_sharded(path: Path, *, sparse: bool = False) -> ShardedArray:
-    """Return the array whose description is ``path``/zarr.json; `StoreError` if it is none that this program writes."""
+def open_sharded(path: Path, *, sparse: bool = False, fetched: Fetched | None = None) -> ShardedArray:
+    """Return the array whose description is ``path``/zarr.json; `StoreError` if it is none that this program writes.
+
+    Its shards lie beside the description, or are ``fetched``.
+    """
     try:
         described = json.loads((path / DESCRIPTION).read_text(encoding="utf-8"))
         sharding = described["codecs"][0]["configuration"]
@@ -169,6 +222,7 @@ def open_sharded(path: Path, *, sparse: bool = False) -> ShardedArray:
             fill=float(described["fill_value"]),
             sparse=sparse,
             codec=_codec(sharding["codecs"][1]),
+            fetched=fetched,
         )
     except FileNotFoundError:
         raise StoreError(f"{path}: is gone") from None
@@ -196,9 +250,10 @@ def _crc(data: bytes) -> bytes:
     return checksum.to_bytes(_CRC_BYTES, "little")
 
 
-def _checked(descriptor: int, size: int, offset: int) -> bytes:
+def _checked(read: Callable[[int, int], bytes], size: int, offset: int) -> bytes:
     """Read so many bytes, the last of which are a checksum, and return the others; `ValueError` if it does not agree."""
-    content = os.pread(descriptor, size - _CRC_BYTES, offset)
-    if _crc(content) != os.pread(descriptor, _CRC_BYTES, offset + size - _CRC_BYTES):
+    found = read(offset, size)
+    content = found[:-_CRC_BYTES]
+    if _crc(content) != found[-_CRC_BYTES:]:
         raise ValueError("its checksum does not agree")
     return content

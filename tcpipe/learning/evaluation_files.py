@@ -11,8 +11,9 @@ from tcpipe import __version__
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
-from tcpipe.formats.dataset_files import read_card
+from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, read_as, read_json, write_json
+from tcpipe.formats.published import here, here_by_range
 from tcpipe.formats.seals import sealed
 from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
@@ -93,8 +94,8 @@ def run_evaluation(
 def _key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:
     """Return what tells one evaluation from another."""
     told = [
-        sealed(read_model_card(Path(model))),
-        dataset_checksum(read_card(Path(dataset))),
+        sealed(read_model_card(here(model))),
+        dataset_checksum(read_card(here_by_range(dataset, by_range=is_shard)[0])),
         asdict(config),
         simulated,
         __version__,

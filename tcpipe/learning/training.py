@@ -19,6 +19,8 @@ from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.formats.json_files import digest, read_json
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import has_card, here, published
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.checkpoint import read_checkpoint
 from tcpipe.learning.fitting import FitConfig, Fitted, ModelKind, Spent, Task, fit, labels_of
@@ -54,7 +56,7 @@ class Variant:
 class TrainResult:
     """What became of a training; ``str`` of it is what the command prints."""
 
-    path: Path
+    path: str
     status: str
     """``done`` or ``unchanged``."""
     model: ModelKind
@@ -124,7 +126,8 @@ def train(
         What ``tcpipe build-dataset`` wrote.
     out
         The folder: new, or a model and nothing else, which is replaced unless it is whole and was trained on the same with the same
-        options. While training runs its state is kept beside it, in ``<out>.checkpoint``, and gone on from.
+        options; or a URL in a bucket, where nothing is replaced. While training runs its state is kept beside a folder, in
+        ``<out>.checkpoint``, and gone on from.
     config
         How.
     variant
@@ -140,12 +143,15 @@ def train(
         The dataset has nothing to train on or to weigh by, ``out`` is something else, or the state is cut short or of another training.
 
     """
-    rules, other, place = config or FitConfig(), variant or Variant(), Path(out)
+    rules, other = config or FitConfig(), variant or Variant()
     data = open_dataset(dataset, label=rules.label)
     if rules.model == "physics":
         other = replace(other, channels=("height",))  # the patch itself is not looked at; every dataset has heights
-    clear_beside(place)
     key = digest({"dataset": dataset_checksum(data.card), "config": asdict(rules), "variant": asdict(other)})
+    if is_url(out):
+        return _into_bucket(dataset, str(out).rstrip("/"), key, rules, other)
+    place = Path(out)
+    clear_beside(place)
     checkpoint = _checkpoint_of(place)
     if (known := _known(place)) is not None and known.training.key == key and not fresh and _is_whole(place):
         _drop_what_is_done(checkpoint, key)
@@ -166,7 +172,7 @@ def train(
     checkpoint.unlink(missing_ok=True)
     progress = fitted.progress
     return TrainResult(
-        place,
+        str(place),
         "done",
         rules.model,
         card.training.samples,
@@ -177,6 +183,16 @@ def train(
         fitted.spent,
         fitted.spent.feeding_share,
     )
+
+
+def _into_bucket(dataset: str | Path, url: str, key: str, rules: FitConfig, other: Variant) -> TrainResult:
+    """Train on this machine, and put the model to a URL; what is there already is not replaced."""
+    known = read_model_card(here(url)) if has_card(url) else None
+    if known is not None and known.training.key == key:
+        return _unchanged(url, known.training)
+    with published(url, CARD) as place:
+        result = train(dataset, place, config=rules, variant=other)
+    return replace(result, path=url)
 
 
 def _fitted(task: Task, rules: FitConfig, data: Dataset, *, name: str, key: str, checkpoint: Path) -> Fitted:
@@ -336,9 +352,9 @@ def _refuse_without_deviations(task: Task, data: Dataset) -> None:
         )
 
 
-def _unchanged(place: Path, told: Training) -> TrainResult:
+def _unchanged(place: Path | str, told: Training) -> TrainResult:
     return TrainResult(
-        place,
+        str(place),
         "unchanged",
         told.config.model,
         told.samples,

@@ -83,4 +83,4 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     pages = (*report(dataset_path), *report(store_path))
     statuses = {added.status, built.status, *(result.status for result in ingested.results)}
     unchanged = statuses == {"unchanged"} and not any(page.changed for page in pages)
-    return DemoResult(directory, ingested, built, tuple(page.path for page in pages), unchanged)
+    return DemoResult(directory, ingested, built, tuple(Path(page.path) for page in pages), unchanged)

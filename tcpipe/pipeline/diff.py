@@ -15,6 +15,7 @@ from tcpipe.errors import plain_lines
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
 from tcpipe.formats.dataset_files import open_patches, read_card, read_samples, rows_in_files, sample_columns
 from tcpipe.formats.json_files import plain
+from tcpipe.formats.published import here
 from tcpipe.pipeline.explain import flat_recipe
 from tcpipe.splits.assignment import SPLITS
 
@@ -33,8 +34,8 @@ Ints = NDArray[np.int64]
 class Difference:
     """Two datasets held against each other; ``str`` of it is what the command prints."""
 
-    a: Path
-    b: Path
+    a: str
+    b: str
     causes: tuple[str, ...]
     """What the two are made from differently."""
     samples: Mapping[str, int]
@@ -66,10 +67,10 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     Parameters
     ----------
     a, b
-        Their directories, the older one first.
+        Their directories or URLs, the older one first.
 
     """
-    first, second = Path(a), Path(b)
+    first, second = here(a), here(b)
     cards = read_card(first), read_card(second)
     there = [sample_columns(directory) for directory in (first, second)]
     shared = [name for name in there[0] if name in there[1]]
@@ -92,7 +93,7 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     train = [table.filter(pc.equal(table.column("split"), "train")) for table in tables]
     causes = tuple(_causes(*cards))
     same = not (causes or moved or any(counts[name] for name in _CHANGES))
-    return Difference(first, second, causes, counts, moved, _shifts(tables), _shifts(train), same)
+    return Difference(str(a), str(b), causes, counts, moved, _shifts(tables), _shifts(train), same)
 
 
 def _shifts(tables: Sequence[pa.Table]) -> dict[str, dict[str, float]]:

@@ -18,6 +18,8 @@ from tcpipe.errors import DatasetError, StoreError, TcpipeError, plain_lines
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import (
     SAMPLES,
+    PatchFiles,
+    is_shard,
     open_patches,
     read_current_card,
     read_samples,
@@ -28,6 +30,7 @@ from tcpipe.formats.json_files import plain
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
+from tcpipe.formats.published import here_by_range
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.seals import file_checksum
 from tcpipe.pipeline.run_stages import run_stages
@@ -191,7 +194,8 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
         There is no such dataset, sample or store, the dataset is of another data model, or the store no longer holds the sample's run.
 
     """
-    directory, opened = Path(dataset), open_store(store)
+    opened = open_store(store)
+    directory, fetched = here_by_range(dataset, by_range=is_shard)
     card, sample = read_current_card(directory), _sample(directory, sample_id)
     run = _run(opened, directory, card, sample)
     told = run.manifest
@@ -199,7 +203,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     streams = opened.read_streams(run.run_id, key=f"{read_with}-{told.tcpipe_version}")
     source = open_map(opened.map_path(sample.map))
     made = _made_again(sample, run, streams, source, card.recipe)
-    differences = tuple(_differences(directory, card, sample, made))
+    differences = tuple(_differences(open_patches(directory, card, fetched), card, sample, made))
     if differences:
         differences += tuple(_reasons(card, sample, run, source))
     return Explained(sample_id, _history(opened, card, sample, run, streams=streams, source=source), differences)
@@ -373,7 +377,7 @@ def _made_again(
 
 
 def _differences(
-    directory: Path, card: DatasetCard, sample: _Sample, made: tuple[Mapping[str, Value], Patches] | str
+    files: PatchFiles, card: DatasetCard, sample: _Sample, made: tuple[Mapping[str, Value], Patches] | str
 ) -> Iterator[str]:
     """Yield a line for each value and each layer that is not, bit for bit, what the dataset holds."""
     if isinstance(made, str):
@@ -387,7 +391,7 @@ def _differences(
         now = None if name.startswith("terrain") and "terrain" not in patches.pixels else values[0].item()
         if now != sample.values[name]:
             yield f"{name}: {now!r} now, {sample.values[name]!r} in the dataset"
-    for layer, stored in _stored(directory, card, sample.row).items():
+    for layer, stored in _stored(files, card, sample.row).items():
         pixels = patches.pixels.get(layer)
         if pixels is None:
             yield f"{layer}: map {sample.map} has no such layer any more"
@@ -409,10 +413,9 @@ def _reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, source: MapF
             yield f"run {run.run_id} was ingested anew since, with other segments"
 
 
-def _stored(directory: Path, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
+def _stored(files: PatchFiles, card: DatasetCard, row: int) -> dict[str, NDArray[np.generic]]:
     """Return the stored layers of the sample in a row of samples.parquet, each of shape (px, px)."""
-    files = open_patches(directory, card)
-    split = read_samples(directory, ["split"]).column("split").to_numpy()
+    split = read_samples(files.directory, ["split"]).column("split").to_numpy()
     place = rows_in_files(card, split)[split[row]][int((split[:row] == split[row]).sum())]
     piece = int(np.searchsorted(files.starts, place, side="right")) - 1
     return {name: pixels[place - files.starts[piece]] for name, pixels in files.read(piece, files.layers).items()}

@@ -15,6 +15,7 @@ from tcpipe.formats.logs.joined import opened
 from tcpipe.formats.logs.log_file import logs_below
 from tcpipe.formats.logs.table_folders import table_files, table_folders
 from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import has_card, here_by_range
 from tcpipe.formats.run_documents import Counts, LogOrigin
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import remote_logs
@@ -125,17 +126,12 @@ def inspect(
     """
     ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):
-        with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
-            urls = list(remote_logs(str(path), Path(directory) / "logs").values())
-        return _logs_at(urls, str(path).rstrip("/"), ask)
+        return _at_url(str(path).rstrip("/"), ask)
     path = Path(path)
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
-        from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as below
-        from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
-
-        return recast(read_current_card(path), InspectedDataset, kind="dataset", path=str(path))
+        return _dataset(path, str(path))
     if is_store(path):
         return _store(Store(path))
     found = run_at(path)
@@ -147,6 +143,23 @@ def inspect(
 
         return recast(open_map(path).summary(), InspectedMap, path=str(path))
     return _logs_or_tables(path, recipe, ask)
+
+
+def _at_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> InspectedDataset | InspectedLog | InspectedLogs:
+    if has_card(url):
+        from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
+
+        return _dataset(here_by_range(url, by_range=is_shard)[0], url)
+    with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
+        urls = list(remote_logs(url, Path(directory) / "logs").values())
+    return _logs_at(urls, url, ask)
+
+
+def _dataset(directory: Path, name: str) -> InspectedDataset:
+    from tcpipe.formats.dataset_files import read_current_card  # noqa: PLC0415  as above
+    from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
+
+    return recast(read_current_card(directory), InspectedDataset, kind="dataset", path=name)
 
 
 def _logs_or_tables(

@@ -2,31 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import clear, write_text
+from tcpipe.formats.bucket import open_place
 from tcpipe.formats.dataset_files import read_current_card
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import here
 from tcpipe.formats.seals import sealed_page
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.physics import physics_in_words
 from tcpipe.report.run_report import run_report
 from tcpipe.store import RunDirectory, Store, is_store, run_at
 
+_PAGE = "report.html"
+
 
 @dataclass(frozen=True, slots=True)
 class Page:
     """A page, and whether it had to be written."""
 
-    path: Path
+    path: str
     changed: bool
     physics: tuple[str, ...] = ()
     """What the page says of the robots' physics, a line a robot."""
 
 
-def report(path: Path) -> list[Page]:
-    """Write ``report.html`` into a run's recipe directory or a dataset, or into every run of a store; return the pages.
+def report(path: Path | str) -> list[Page]:
+    """Write ``report.html`` into a run's recipe directory or a dataset (also at a URL), or into every run of a store; return the pages.
 
     One that would be the same is left alone.
 
@@ -36,6 +41,12 @@ def report(path: Path) -> list[Page]:
         When the path is none of these.
 
     """
+    if is_url(path):
+        (page,) = report(here(path))
+        if page.changed:
+            open_place(path).put(_PAGE, Path(page.path).read_bytes())
+        return [replace(page, path=f"{str(path).rstrip('/')}/{_PAGE}")]
+    path = Path(path)
     if (path / "dataset.json").is_file():
         fits = read_current_card(path).physics
         said = tuple(physics_in_words(robot, fit) for robot, fit in fits.items())
@@ -56,8 +67,8 @@ def _physics_of(run: RunDirectory) -> tuple[str, ...]:
 
 def _write(directory: Path, html: str, physics: tuple[str, ...]) -> Page:
     clear(directory)
-    path, html = directory / "report.html", sealed_page(html)
+    path, html = directory / _PAGE, sealed_page(html)
     changed = not path.is_file() or path.read_bytes() != html.encode()
     if changed:
         write_text(path, html)
-    return Page(path, changed, physics)
+    return Page(str(path), changed, physics)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tcpipe.errors import TcpipeError, UsageError, plain_lines
+from tcpipe.errors import StoreError, TcpipeError, UsageError, plain_lines
 from tcpipe.formats.atomic import left_beside
 from tcpipe.formats.dataset_files import CARD
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import here, others_beside
 from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
@@ -30,7 +32,7 @@ _BESIDE = ".aux.xml"
 class Verified:
     """What was read again, and each thing that is not as it was written; ``str`` of it is what the command prints."""
 
-    path: Path
+    path: str
     kind: str
     """``dataset``, ``run``, ``store``, ``map``, ``model`` or ``cost map``."""
     read: Mapping[str, int]
@@ -48,8 +50,8 @@ class Verified:
         return [f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems]
 
 
-def verify(path: Path) -> Verified:
-    """Re-read a dataset, a run, a store, a map, a model or a cost map.
+def verify(path: Path | str) -> Verified:
+    """Re-read a dataset, a run, a store, a map, a model or a cost map; a dataset, a model or a cost map also at a URL.
 
     Raises
     ------
@@ -57,6 +59,14 @@ def verify(path: Path) -> Verified:
         When the path is none of these.
 
     """
+    if is_url(path):
+        try:
+            found = verify(here(path))
+        except StoreError as error:  # of what is fetched, the first that is not what its card says
+            return Verified(str(path), "dataset, model or cost map", {}, error.problems)
+        strangers = (f"{name}: is no file of this {found.kind}" for name in others_beside(str(path)))
+        return replace(found, path=str(path), problems=(*found.problems, *strangers))
+    path = Path(path)
     if not path.exists():
         raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
     kind, findings = _what(path)
@@ -73,7 +83,7 @@ def verify(path: Path) -> Verified:
     if kind != "store":
         again = "the next command that writes it removes it"
         problems += [f"{left}: was left behind by a command that was killed; {again}" for left in left_beside(path)]
-    return Verified(path, kind, read, tuple(dict.fromkeys(problems)))
+    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)))
 
 
 def _what(path: Path) -> tuple[str, Iterator[Finding]]:

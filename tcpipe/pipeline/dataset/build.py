@@ -15,6 +15,7 @@ from tcpipe import __version__
 from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
+from tcpipe.formats.bucket import open_place
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding, Shard
 from tcpipe.formats.dataset_files import (
@@ -34,9 +35,11 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import digest, write_json
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
+from tcpipe.formats.published import has_card, here_by_range, published
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.record_files import Call, DatasetMade, record_name
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
@@ -65,7 +68,7 @@ from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import EnergyBudget
-from tcpipe.tables.levels import DATA_MODEL_VERSION
+from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 
 logger = logging.getLogger("tcpipe")
 
@@ -74,7 +77,8 @@ logger = logging.getLogger("tcpipe")
 class BuildResult:
     """What became of a dataset; ``str`` of it is what the command prints."""
 
-    path: Path
+    path: str
+    """Its directory, or its URL in a bucket."""
     status: str
     """``done``, ``unchanged``, or, of a dry run, ``planned``."""
     samples: int
@@ -144,7 +148,8 @@ def build_dataset(
     Parameters
     ----------
     out
-        Directory of the dataset: new, empty, or a dataset, which is replaced unless it is made from the same inputs.
+        Directory of the dataset: new, empty, or a dataset, which is replaced unless it is made from the same inputs; or the URL of one
+        in a bucket (``s3://…``), where nothing is replaced.
     store
         Where runs and maps are kept.
     split
@@ -181,15 +186,16 @@ def build_dataset(
 
     """
     watch, ruling = started(), _ruling(recipe, holdout=holdout, seed=seed)
-    place, opened = local_output(out), open_store(store)
-    if not dry_run:
+    place = str(out).rstrip("/") if is_url(out) else local_output(out)
+    opened = open_store(store)
+    if isinstance(place, Path) and not dry_run:
         clear_beside(place)
-    known, proved = _card_in_place(place)
+    known, proved = _card_in_bucket(place) if isinstance(place, str) else _card_in_place(place)
     regions = None if split is None else read_regions(Path(split))
     region = None if split is None else Path(split).read_bytes()
     robot = robot or ruling.robot
     tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
-    earlier = None if keep_split is None else earlier_splits(Path(keep_split))
+    earlier = None if keep_split is None else earlier_splits(keep_split)
     inputs = choose_inputs(
         opened,
         ruling,
@@ -203,43 +209,39 @@ def build_dataset(
     )
     problems, warnings = _left_out(inputs, known, robot=robot, tags=tags or {}, min_runs=min_runs)
     inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
-    if proved and known is not None and known.inputs == inputs.digest and is_whole(place, known):
+    if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
         result = _result(place, "unchanged", known, problems)
     elif dry_run:
         return _planned(place, opened, inputs, jobs=jobs)
     else:
-        with atomic_directory(place.absolute()) as directory:
-            card = _build(
+        with published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute()) as directory:
+            known = _build(
                 directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs, cluster=cluster
             )
-        result = _result(place, "done", card, problems)
+        result = _result(place, "done", known, problems)
     if not dry_run:
-        _remember(opened, watch, result, inputs, jobs)
+        _remember(opened, watch, result, inputs, jobs, size=sum(of.size_bytes for of in known.checksums.values()))
     return result
 
 
-def _planned(place: Path, store: Store, inputs: Inputs, *, jobs: int) -> BuildResult:
+def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> BuildResult:
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
     expected = estimate(latest_calls(store), BUILD, most, jobs=jobs)
-    exit_code = 3 if inputs.problems else 0
-    return BuildResult(
-        place, "planned", most, {}, {}, (), inputs.warnings, inputs.problems, exit_code=exit_code, estimate=expected
-    )
+    code, told = 3 if inputs.problems else 0, (inputs.warnings, inputs.problems)
+    return BuildResult(str(place), "planned", most, {}, {}, (), *told, exit_code=code, estimate=expected)
 
 
-def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Inputs, jobs: int) -> None:
+def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Inputs, jobs: int, *, size: int) -> None:
     """Leave a record in the store of the dataset, for what it refers to stays, and one of the call; without where that cannot be."""
-    made = DatasetMade(
-        str(result.path.absolute()), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs)
-    )
+    where = result.path if is_url(result.path) else str(Path(result.path).absolute())
+    made = DatasetMade(where, inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
     with suppress(StoreError):
         store.remember(f"datasets/{record_name(digest(made))}", made)
-    counts, size = {"runs": len(inputs.runs), "samples": 0, "unchanged": 1}, 0
+    counts, written = {"runs": len(inputs.runs), "samples": 0, "unchanged": 1}, 0
     if result.status == "done":
-        counts |= {"samples": result.samples, "unchanged": 0}
-        size = sum(path.stat().st_size for path in result.path.rglob("*") if path.is_file())
-    call = Call(BUILD, __version__, result.exit_code, counts, jobs, written_bytes=size)
+        counts, written = counts | {"samples": result.samples, "unchanged": 0}, size
+    call = Call(BUILD, __version__, result.exit_code, counts, jobs, written_bytes=written)
     remember_call(store, watch, call)
 
 
@@ -257,10 +259,26 @@ def _left_out(
     return chosen.damaged, fewer
 
 
-def _result(place: Path, status: str, card: DatasetCard, problems: Sequence[str]) -> BuildResult:
+def _is_all_there(place: Path | str, card: DatasetCard) -> bool:
+    if isinstance(place, Path):
+        return is_whole(place, card)
+    sizes = {entry.name: entry.size_bytes for entry in open_place(place).entries()}
+    return all(sizes.get(name) == entry.size_bytes for name, entry in card.checksums.items())
+
+
+def _card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
+    """Return the card of the dataset that lies at a URL, if one does, and whether it is as it was written."""
+    open_place(url).check()
+    if not has_card(url):
+        return None, False
+    card = read_card(here_by_range(url, by_range=lambda _: True)[0])
+    return card, card.data_model_version in READ_VERSIONS
+
+
+def _result(place: Path | str, status: str, card: DatasetCard, problems: Sequence[str]) -> BuildResult:
     said = (*problems, *empty_splits(card))
     return BuildResult(
-        path=place,
+        path=str(place),
         status=status,
         samples=card.samples,
         splits={name: card.splits[name] for name in SPLITS},

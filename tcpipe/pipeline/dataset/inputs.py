@@ -18,11 +18,13 @@ from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import (
     FileFormat,
+    is_shard,
     read_card,
     read_samples,
     sample_columns,
 )
 from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.published import here_by_range
 from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_checksums
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
@@ -109,8 +111,9 @@ def _map_digest(name: str, path: Path) -> str:
     return digest({name: (entry.size_bytes, entry.sha256) for name, entry in found.items()})
 
 
-def earlier_splits(directory: Path) -> pa.Table:
+def earlier_splits(dataset: str | Path) -> pa.Table:
     """Return ``sample_id``, ``split`` and, where there is one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
+    directory, _ = here_by_range(dataset, by_range=is_shard)
     read_card(directory)
     there = sample_columns(directory)
     missing = [name for name in ("sample_id", "split") if name not in there]

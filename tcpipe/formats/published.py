@@ -1,0 +1,218 @@
+"""Directories with a sealed card (datasets, models, cost maps) in a bucket: fetched to this machine, and put there, card last (ADR 86).
+
+The card lists every other file with its checksum. So a reader sees all of one attempt or none, what is cached is told by its content, and
+whoever else puts the same content helps.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import google_crc32c
+
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.bucket import open_place
+from tcpipe.formats.content_cache import cached
+from tcpipe.formats.json_files import parse_json, typed
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.place import Place
+from tcpipe.formats.seals import Checksum, Checksums, broken_checksums
+
+logger = logging.getLogger("tcpipe")
+
+CARDS = ("dataset.json", "model.json", "cost-map.json")
+"""Documents that prove all files beside them."""
+_UNLISTED = ("report.html",)
+"""What lies beside a card that does not list it, since it is made of it."""
+CLAIM = "writing.json"
+"""The card of who puts a directory there, as long as that goes on."""
+_CRC_BYTES = 4
+_AT_ONCE = 8
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedShards:
+    """Shards of a dataset in a bucket, below ``root`` as if they were there; pieces are fetched by range, and cached."""
+
+    place: Place
+    root: Path
+    checksums: Mapping[str, Checksum]
+
+    def size(self, path: Path) -> int:
+        """Return the size of a shard [byte]; `FileNotFoundError` where there is none."""
+        return self._checksum(path).size_bytes
+
+    def read(self, path: Path, offset: int, size: int) -> bytes:
+        """Return a piece of a shard that ends with the CRC-32C of the rest; of which the cache holds another it is fetched anew."""
+        for _ in range(2):
+            held = self._held(path, offset, size)
+            data = held.read_bytes()
+            if google_crc32c.value(data[:-_CRC_BYTES]).to_bytes(_CRC_BYTES, "little") == data[-_CRC_BYTES:]:
+                break
+            held.unlink(missing_ok=True)
+        return data
+
+    def expect(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
+        """Have pieces (shard, offset, size) cached that are read soon, fetched side by side."""
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            list(pool.map(lambda piece: self._held(*piece), pieces))
+
+    def whole(self, path: Path) -> Path:
+        """Return a cached copy of a whole file."""
+        return self.place.local(self._name(path), self._checksum(path))
+
+    def _held(self, path: Path, offset: int, size: int) -> Path:
+        name, sha256 = self._name(path), self._checksum(path).sha256
+        return cached(f"{sha256} {offset} {size}", lambda to: to.write_bytes(self.place.read_range(name, offset, size)))
+
+    def _name(self, path: Path) -> str:
+        return path.relative_to(self.root).as_posix()
+
+    def _checksum(self, path: Path) -> Checksum:
+        found = self.checksums.get(self._name(path))
+        if found is None:
+            raise FileNotFoundError(str(path))
+        return found
+
+
+def here(path: str | Path) -> Path:
+    """Return a directory of this machine: the one that is named, or a copy of what a card in a bucket lists while this process runs.
+
+    Raises
+    ------
+    UsageError
+        There is no card at the URL.
+    StoreError
+        It cannot be read, or a file is not as the card says.
+    """
+    return Path(path) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda _: True)[0]
+
+
+def here_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
+    """Return a directory as `here`, without the files whose names are ``by_range``, and where these are read; None on this machine."""
+    return (Path(path), None) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda name: not by_range(name))
+
+
+def has_card(url: str) -> bool:
+    """Tell whether a directory with a card lies at a URL."""
+    return _card_at(open_place(url)) is not None
+
+
+def others_beside(url: str) -> list[str]:
+    """Return what lies at a URL and is not listed by the card there."""
+    place = open_place(url)
+    name, data = _card_at(place) or ("", b"{}")
+    listed = typed(parse_json(data, Path(place.where(name))), Checksums, Path(place.where(name))).checksums
+    names = {entry.name for entry in place.entries()}
+    return [place.where(other) for other in sorted(names - {*listed, *_UNLISTED, name})]
+
+
+def _card_at(place: Place) -> tuple[str, bytes] | None:
+    return next(((name, data) for name in CARDS if (data := place.read(name)) is not None), None)
+
+
+def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
+    place = open_place(url)
+    found = _card_at(place)
+    if found is None:
+        raise UsageError(f"{url}: there is no dataset, model or cost map here: none of {', '.join(CARDS)}")
+    name, data = found
+    where = place.where(name)
+    checksums = typed(parse_json(data, Path(where)), Checksums, Path(where)).checksums
+    if outside := [file for file in checksums if file.startswith("/") or ".." in file.split("/")]:
+        raise StoreError(f"{where}: names {outside[0]!r}, which is no file beside it")
+    root = _directory_of(url, data)
+    (root / name).write_bytes(data)
+    for unlisted in _UNLISTED:
+        if (page := place.read(unlisted)) is not None:
+            (root / unlisted).write_bytes(page)
+    absent = [(file, checksum) for file, checksum in checksums.items() if wanted(file) and not (root / file).exists()]
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        list(pool.map(lambda of: _bring(place, of[0], of[1], root / of[0]), absent))
+    return root, FetchedShards(place, root, checksums)
+
+
+@cache
+def _kept(url: str, card: bytes) -> tempfile.TemporaryDirectory[str]:
+    """Return a directory for a card at a URL, which goes when the process ends."""
+    del url, card
+    return tempfile.TemporaryDirectory(prefix="tcpipe-")
+
+
+def _directory_of(url: str, card: bytes) -> Path:
+    """Return where a copy lies: so that lines about its files show where they are from."""
+    path = Path(_kept(url, card).name, *(part for part in url.split("/") if part not in ("", "..")))
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def _bring(place: Place, name: str, checksum: Checksum, to: Path) -> None:
+    """Link or copy the cached content of a file to where it is wanted; a cached copy that is not as it was goes and is fetched anew."""
+    to.parent.mkdir(parents=True, exist_ok=True)
+    for _ in range(2):
+        held = place.local(name, checksum)
+        with suppress(FileExistsError):
+            try:
+                os.link(held, to)
+            except OSError:
+                shutil.copyfile(held, to)
+        if not list(broken_checksums(to.parent, {to.name: checksum})):
+            return
+        held.unlink(missing_ok=True)
+        to.unlink()
+    raise StoreError(f"{place.where(name)}: is not as its card says, {checksum.sha256[:12]}…")
+
+
+@contextmanager
+def published(url: str, card: str) -> Iterator[Path]:
+    """Yield a directory; what lies in it at the end, with a card, is put to a URL: the card last, and only where there is none.
+
+    Of two that put the same there, either completes it, and a killed one is completed by the next call. Two whose contents differ are never
+    mixed: the second is refused.
+
+    Raises
+    ------
+    StoreError
+        Another one puts something else there, something lies there already, or the place cannot be written.
+    """
+    place = open_place(url)
+    refuse_others(place, card)
+    with tempfile.TemporaryDirectory(prefix="tcpipe-") as held:
+        directory = Path(held, url.rstrip("/").rpartition("/")[2])
+        directory.mkdir()
+        yield directory
+        document = (directory / card).read_bytes()
+        claim = place.read(CLAIM) if not place.put_new(CLAIM, document) else document
+        if claim != document:
+            raise StoreError(
+                f"{url}: another one writes something else there since ({CLAIM}); wait for it, or give another place; "
+                "if it was killed, remove what lies there"
+            )
+        if place.read(card) is not None:
+            place.delete(CLAIM)
+            raise StoreError(f"{url}: another one has written it meanwhile; what lies in a bucket is not replaced")
+        (directory / card).rename(Path(held, card))
+        place.put_files("", directory)
+        if not place.put_new(card, document) and place.read(card) != document:
+            raise StoreError(f"{url}: another one has written it meanwhile; what lies in a bucket is not replaced")
+        place.delete(CLAIM)
+
+
+def refuse_others(place: Place, card: str) -> None:
+    """Raise `UsageError` where something lies that is no directory of this card and was not left by one that was being put there."""
+    names = {entry.name for entry in place.entries()}
+    if names and not names & {card, CLAIM}:
+        raise UsageError(f"{place.where()}: holds {min(names)} and no {card}; it is left alone; give another place")
+    if card in names:
+        raise UsageError(
+            f"{place.where()}: is there already; what lies in a bucket is not replaced: give another place"
+        )
