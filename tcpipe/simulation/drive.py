@@ -149,7 +149,10 @@ def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, b
     slope = np.arctan((gx * np.cos(direction) + gy * np.sin(direction)) / scale)
     ground = robot.ground_table()[world.terrain_class(x, y)]
     speed_factor = robot.speed_factor(moving_average(ground[:, 0], robot.wheelbase_m), np.sin(slope))
-    speed_factor = speed_factor * (1.0 - _slowdown(world, robot, x, y, direction))
+    if robot.wheels is not None:
+        usual = moving_average(ground[:, 2], robot.wheelbase_m)
+        excess = rolling_resistance(world, robot, x, y, direction) - usual
+        speed_factor = speed_factor * (1.0 - robot.wheels.slowdown * excess)
     slip = robot.slip(moving_average(ground[:, 1], robot.wheelbase_m), np.sin(slope))
     command_mps = command * robot.max_velocity_mps
     brake_at_m = max(path.stop_m - _BRAKE_BEFORE_M * command, 0.1)
@@ -168,14 +171,6 @@ def _along(world: World, path: Path, command: float, robot: SimulatedRobot, *, b
     commanded = np.where(braking, 0.0, sign * command_mps)
     commanded_rate = np.where(braking, 0.0, np.gradient(yaw, _DT_S)) if s.size > 1 else np.zeros(1)
     return _Stretch(uv, yaw, sign * wheel, np.interp(s, grid, slip), commanded, commanded_rate)
-
-
-def _slowdown(world: World, robot: SimulatedRobot, x: Float, y: Float, direction_rad: Float) -> Float:
-    """Return the share of wheel speed that is lost where the ground resists more than its class does, along a path."""
-    if robot.wheels is None:
-        return robot.hidden_slowdown * (moving_average(world.resistance_factor(x, y), robot.wheelbase_m) - 1.0)
-    usual = moving_average(robot.ground_table()[world.terrain_class(x, y)][:, 2], robot.wheelbase_m)
-    return robot.wheels.slowdown * (rolling_resistance(world, robot, x, y, direction_rad) - usual)
 
 
 def _truth(world: World, driven: _Stretch, robot: SimulatedRobot, start_ns: int, rng: np.random.Generator) -> Truth:

@@ -69,8 +69,6 @@ class SimulatedRobot:
     """Wheel speed lost on 22.5° uphill, as a fraction."""
     slope_slip: float = 0.05
     """Slip added on 22.5° uphill, taken away downhill."""
-    hidden_slowdown: float = 0.0
-    """Wheel speed lost where the rolling resistance is higher than its class's, as a fraction of that excess."""
     wheelbase_m: float = 0.5
     """Ground properties are averaged over it."""
     scrub_torque_nm: float = 190.0
