@@ -31,6 +31,7 @@ STATUS_AND_STD_OF_QUALITY: dict[int, tuple[int, float]] = {
 """GGA quality to NavSatStatus and horizontal standard deviation at HDOP 1 [m]; others (none, estimated, manual, simulated) are no fix."""
 
 KNOT_MPS = 1852.0 / 3600.0
+_VAST = 1e6
 _STATUS_OF_MODE = {"": 0, "A": 0, "P": 0, "D": 1, "R": 2, "F": 2}
 """Mode to NavSatStatus; others (estimated, manual, simulated, none) are no measurement."""
 _RMC_OR_VTG = re.compile(r"\$([A-Z]{2}(RMC|VTG),[^*$\r\n]*)(?:\*([0-9A-Fa-f]{2}))?")
@@ -134,7 +135,11 @@ def _over_ground(body: str, kind: str, checksum: str | None) -> tuple[int, float
 
 
 def _number(text: str) -> float:
-    return float(text) if text else np.nan
+    """Return a speed or a course, NaN for an empty field; `ValueError` for what neither can be."""
+    value = float(text) if text else np.nan
+    if abs(value) > _VAST:
+        raise ValueError(text)
+    return value
 
 
 def _fields(body: str, checksum: str | None) -> tuple[int, tuple[float, ...]] | None:

@@ -4,7 +4,9 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from tcpipe.logs.messages import read_messages
 from tcpipe.logs.nmea import NS_PER_DAY, read_gga, read_over_ground, with_date
+from tcpipe.logs.roles import NMEA_SENTENCE
 
 S = 1_000_000_000
 
@@ -98,6 +100,21 @@ def test_speed_in_knots_and_course_from_north() -> None:
     assert abs(found.speed_mps[1] - 1.0000800) < 1e-9
     assert found.status.tolist() == [0, 2, -1, -1, -1]
     assert found.broken.tolist() == [False, False, False, False, True]  # the last: its checksum tells
+
+
+def test_numbers_that_no_receiver_means_make_a_sentence_broken() -> None:
+    odd = ("inf", "-inf", "1e300", "x", "1,2")
+    sentences = [
+        signed(f"GNRMC,101325.00,A,,,,,{speed},{course},130324,,,R")
+        for text in odd
+        for speed, course in ((text, "1.0"), ("1.0", text))
+    ]
+    found = read_over_ground([*sentences, "$GNRMC", "$GNRMC,", "$GPRMC,1*00", signed("GNRMC,9,A,,,,,nan,nan,,,,R")])
+    told = read_messages(
+        {"log_time_ns": np.arange(len(sentences)) + S, "sentence": np.array(sentences)}, "gnss_velocity", NMEA_SENTENCE
+    )
+    assert np.isfinite(told.columns["east_velocity_mps"]).all()
+    assert found.broken[:8].all()
 
 
 def test_vtg_speaks_where_there_is_no_rmc_and_has_no_time() -> None:
