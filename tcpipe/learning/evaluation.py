@@ -29,16 +29,18 @@ from tcpipe.learning.evaluation_facts import (
     SplitErrors,
 )
 from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.leakage import by_blocks, leakage_of
 from tcpipe.learning.metrics import (
     ALL,
     Array,
     Errors,
+    Spread,
     errors_by_class,
     label_floor,
     mean_of_draws,
 )
 from tcpipe.learning.models import Model, load_model
-from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs
+from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs, spreads_of
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
 from tcpipe.learning.wei_isler import FEWEST, OURS, PER_CLASS, Trained, energy_table
 from tcpipe.robots.profiles import Robot
@@ -117,12 +119,13 @@ def evaluate(
         model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
         dataset=EvaluatedDataset(data.card.name, dataset_checksum(data.card), data.card.splits),
         config=config,
-        splits={name: _split_errors(found, said[name], plant) for name, found in sets.items()},
+        splits={name: _split_errors(ours, data, found, said[name], plant) for name, found in sets.items()},
         ablation=tuple(ablation),
         energy=energy.errors,
         networks=tuple(energy.compared),
         time=_time(ours, sets, said, max_velocity_mps=_fastest_mps(ours.robot, data)),
         baselines=tuple(baselines),
+        blocks=by_blocks(ours, names),
         repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
         warnings=(*lacking, *_warnings(ours, data, sets), *_left_out(data, sets, energy.errors)),
         plots={name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
@@ -141,16 +144,19 @@ def _repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]
     return {quantity: found.get(column) for quantity, column in columns.items()}
 
 
-def _split_errors(found: Measured, said: Mapping[str, Array], plant: PlantCosts | None) -> SplitErrors:
-    def errors_of(costs: Mapping[str, Array]) -> ErrorsByClass:
-        return errors_by_class(costs, found.costs, found.class_ids, found.names)
+def _split_errors(
+    ours: Model, data: Dataset, found: Measured, said: Mapping[str, Array], plant: PlantCosts | None
+) -> SplitErrors:
+    def errors_of(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
+        return errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
 
     counts = {name: int((found.class_ids == class_id).sum()) for class_id, name in found.names.items()}
     return SplitErrors(
         samples=len(found.split),
         classes=counts,
         class_order=tuple(counts),
-        errors=errors_of(said),
+        errors=errors_of(said, spreads_of(ours, said, found.class_ids)),
+        leakage=leakage_of(data, found.split),
         label_floor=label_floor(found.deviations, found.costs, found.class_ids, found.names),
         simulation_floor=None if plant is None else errors_of(plant(found.split)),
     )
@@ -166,7 +172,7 @@ def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained)
         for at, (name, found) in enumerate(sets.items()):
             draws = [
                 _all_errors(
-                    predicted_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found
+                    predicted_costs(ours, found.split, noise=noise, seed=(config.seed, number, at, draw)), found, ours
                 )
                 for draw in range(config.draws if noise else 1)
             ]
@@ -174,7 +180,9 @@ def _ablation(ours: Model, sets: Sets, config: EvaluateConfig, trained: Trained)
         yield AblationRow(letters, "noise", **by_split)
         if config.retrain and noise:
             anew = trained("ablation_" + "".join(letters), Variant(channels=left))
-            by_split = {name: _all_errors(predicted_costs(anew, found.split), found) for name, found in sets.items()}
+            by_split = {
+                name: _all_errors(predicted_costs(anew, found.split), found, anew) for name, found in sets.items()
+            }
             yield AblationRow(letters, "retrained", **by_split)
 
 
@@ -185,8 +193,10 @@ def _input_sets(ours: Model) -> list[tuple[str, ...]]:
     return list(dict.fromkeys(letters for letters in found if letters))
 
 
-def _all_errors(said: Mapping[str, Array], found: Measured) -> dict[str, Errors]:
-    by_class = errors_by_class(said, found.costs, found.class_ids, found.names)
+def _all_errors(said: Mapping[str, Array], found: Measured, by: Model | None = None) -> dict[str, Errors]:
+    """Return the errors of all classes, and how well a model told them; ``by`` None tells none."""
+    spreads = None if by is None else spreads_of(by, said, found.class_ids)
+    by_class = errors_by_class(said, found.costs, found.class_ids, found.names, spreads)
     return {quantity: by_class[quantity][ALL] for quantity in by_class}
 
 
@@ -198,7 +208,7 @@ def _fastest_mps(robot: str, data: Dataset) -> float | None:
 
 def _time(ours: Model, sets: Sets, said: Said, *, max_velocity_mps: float | None) -> dict[str, dict[str, Errors]]:
     """Return table V: T by this model, and T_e = d / v_e at the robot's greatest speed."""
-    found = {OURS: {name: _all_errors(said[name], part)["T"] for name, part in sets.items()}}
+    found = {OURS: {name: _all_errors(said[name], part, ours)["T"] for name, part in sets.items()}}
     if max_velocity_mps is not None:
         expected = {
             name: {"T": np.full(len(part.split), ours.chord_m / max_velocity_mps)} for name, part in sets.items()

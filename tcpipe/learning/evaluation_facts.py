@@ -60,6 +60,19 @@ class EvaluatedDataset:
 
 
 @dataclass(frozen=True, slots=True)
+class Leakage:
+    """What of a split stands beside training, of the dataset that the evaluation is on."""
+
+    holdout: str
+    """How test was drawn: by sample, as in the paper, block, run or tag."""
+    within_m: float
+    near_percent: float
+    """Samples whose middle is within that of one of train."""
+    sharing_percent: float | None
+    """Samples whose footprint shares ground with one of train, by the dataset's own audit."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SplitErrors:
     """Tables I and II of one split, and what its labels' deviations, or the simulator, allow."""
 
@@ -68,6 +81,8 @@ class SplitErrors:
     """Samples by the name of their class."""
     class_order: tuple[str, ...]
     errors: ErrorsByClass
+    leakage: Leakage | None = None
+    """How much of it was met in training; None where nothing trains, or places are not known."""
     label_floor: ErrorsByClass
     simulation_floor: ErrorsByClass | None = field(default=None, metadata=ABSENT)
     """Of what can be predicted at best where the samples were simulated."""
@@ -142,6 +157,8 @@ class Evaluation:
     """Those of the networks of Wei and Isler, with the ratios of the model's to them."""
     time: Mapping[str, Mapping[str, Errors]]
     """Table V: errors of T by predictor and split."""
+    blocks: ErrorsByClass | None = field(default=None, metadata=ABSENT)
+    """Of the model on blocks of ground that it was not fitted on, which it keeps as its held-out samples."""
     baselines: tuple[Compared, ...] = ()
     """Of all classes together, by split, baseline and quantity."""
     repeatability: Mapping[str, Floor | None]

@@ -18,7 +18,7 @@ from tcpipe.formats.seals import sealed
 from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
-from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows
+from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows, leakage_line
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.training import dataset_checksum
@@ -40,9 +40,14 @@ class EvaluationResult:
         lines = [f"warning: {text}" for text in self.values.warnings]
         for split, part in self.values.splits.items():
             figures = (
-                f"{quantity} {part.errors[quantity][ALL].mape_percent or float('nan'):.2f} %" for quantity in QUANTITIES
+                f"{quantity} {of.mape_percent or float('nan'):.2f} % ({of.mape_count})"
+                for quantity, of in ((quantity, part.errors[quantity][ALL]) for quantity in QUANTITIES)
             )
-            lines.append(f"{split}: {part.samples} samples, MAPE {', '.join(figures)}")
+            lines.append(f"{split}: {part.samples} samples, MAPE (of so many labels) {', '.join(figures)}")
+            energy = part.errors["E"][ALL]
+            if energy.held_percent is not None:
+                lines.append(f"{split}: 90 % intervals hold {energy.held_percent:.1f} % of E, CRPS {energy.crps:.2f} J")
+            lines.append(f"{split}: {leakage_line(part.leakage)}")
         lines += verdicts(self.values.baselines)
         return plain_lines((*lines, f"open {self.path / PAGE}"))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple
+from dataclasses import astuple, fields
 from typing import Literal
 
 import numpy as np
@@ -11,8 +11,8 @@ import numpy as np
 from tcpipe.learning import paper_tables as paper
 from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import EXPECTED
-from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation
-from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS, Errors
+from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
+from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
 from tcpipe.learning.wei_isler import GRASS_ONLY, OURS, PER_CLASS
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.prediction_figures import MOST_PERCENT, predictions_by_patch
@@ -21,6 +21,14 @@ FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's 
 """What an error can hardly be less than, and what the page calls it."""
 
 MEASURES = {"rmse": "RMSE", "mape_percent": "MAPE"}
+SCORES = {"held_percent": "held by 90 %", "nll": "NLL", "crps": "CRPS"}
+"""How well a model told its own errors (`tcpipe.learning.metrics`)."""
+
+COUNTED = (
+    "Beside a MAPE stands of how many labels it is: those of at least "
+    + ", ".join(f"{least:g} {UNITS[quantity]} ({quantity})" for quantity, least in LEAST.items())
+    + ". "
+)
 _DIGITS = {"w": 2, "v": 3, "T": 3, "E": 2}
 _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"}
 
@@ -43,8 +51,8 @@ def evaluation_page(
         lead=lead,
         numbers=[
             Number(
-                _figure(found.splits[name].errors[quantity][ALL], "mape_percent", quantity) + " %",
-                f"MAPE of {quantity}, {name}",
+                f"{found.splits[name].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",
+                f"MAPE of {quantity}, {name}, {found.splits[name].errors[quantity][ALL].mape_count} labels",
             )
             for name in found.ordered_splits
             for quantity in ("E", "T")
@@ -55,7 +63,7 @@ def evaluation_page(
 
 
 def evaluation_rows(found: Evaluation) -> list[tuple[str | int | float | None, ...]]:
-    """Return every figure as one row: table, split, what, quantity, unit, class, count, RMSE, MAPE [%], count of the MAPE."""
+    """Return every figure as one row: table, split, what, quantity, unit, class, then the fields of `Errors`."""
     rows = (*_rows_by_class(found), *_rows_of_ablation(found), *_rows_compared(found))
     return [(*keys[:4], UNITS[keys[3]], keys[4], *astuple(error)) for keys, error in rows]
 
@@ -69,6 +77,9 @@ def _rows_by_class(found: Evaluation) -> Iterator[_Row]:
             for quantity, by_class in by_quantity.items():
                 for name, error in by_class.items():
                     yield ("by class", split, what, quantity, name), error
+    for quantity, by_class in (found.blocks or {}).items():
+        for name, error in by_class.items():
+            yield ("by class", "held out", "blocks", quantity, name), error
 
 
 def _rows_of_ablation(found: Evaluation) -> Iterator[_Row]:
@@ -87,13 +98,19 @@ def _rows_compared(found: Evaluation) -> Iterator[_Row]:
         yield ("baselines", row.split, row.baseline, row.quantity, ALL), row.errors
 
 
-COLUMNS = ("table", "split", "what", "quantity", "unit", "class", "count", "rmse", "mape_percent", "mape_count")
+ERRORS = tuple(of.name for of in fields(Errors))
+
+COLUMNS = ("table", "split", "what", "quantity", "unit", "class", "count", *ERRORS[1:])
 """Of `evaluation_rows`."""
 
 
 def _figure(error: Errors | None, measure: str, quantity: str) -> str:
-    value = None if error is None else error.mape_percent if measure == "mape_percent" else error.rmse
-    return "–" if value is None else f"{value:.{2 if measure == 'mape_percent' else _DIGITS[quantity]}f}"
+    value = None if error is None else getattr(error, measure)
+    if error is None or value is None:
+        return "–"
+    if measure == "mape_percent":
+        return f"{value:.2f} ({error.mape_count})"
+    return f"{value:.{1 if measure == 'held_percent' else 2 if measure == 'nll' else _DIGITS[quantity]}f}"
 
 
 def _paper_figure(value: float | None) -> str:
@@ -101,7 +118,7 @@ def _paper_figure(value: float | None) -> str:
 
 
 def _unit(measure: str, quantity: str) -> str:
-    return "%" if measure == "mape_percent" else UNITS[quantity]
+    return "%" if measure.endswith("percent") else "nat" if measure == "nll" else UNITS[quantity]
 
 
 def _baselines(found: Evaluation) -> Section:
@@ -111,19 +128,29 @@ def _baselines(found: Evaluation) -> Section:
         for quantity in QUANTITIES:
             ours = found.splits[split].errors[quantity][ALL]
             rows.append(
-                (split, quantity, "the model", *(_figure(ours, measure, quantity) for measure in MEASURES), "", "")
+                (
+                    split,
+                    quantity,
+                    "the model",
+                    *(_figure(ours, measure, quantity) for measure in (*MEASURES, *SCORES)),
+                    "",
+                    "",
+                )
             )
             for row in found.baselines:
                 if (row.split, row.quantity) == (split, quantity):
                     figures = (_figure(row.errors, measure, quantity) for measure in MEASURES)
-                    rows.append(("", "", row.baseline, *figures, str(row.rmse_ratio), str(row.mape_ratio)))
-    header = ("", "", "", "RMSE", "MAPE [%]", "ratio of RMSE", "ratio of MAPE")
+                    blank = [""] * len(SCORES)
+                    rows.append(
+                        ("", "", row.baseline, *figures, *blank, str(row.rmse_ratio), str(row.mape_ratio))
+                    )
+    header = ("", "", "", "RMSE", "MAPE [%]", "held by 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
     text = (
         "Fitted on the samples that the model was fitted on, measured on the same as it. Ratios are the model's error over the "
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
         "are told the turn of each metre, too. "
     )
-    text += ". ".join(verdicts(found.baselines))
+    text += COUNTED + ". ".join(verdicts(found.baselines))
     if not found.baselines:
         return Section("Beside what is simplest")
     return Section("Beside what is simplest", text, header=header, rows=rows, figures_from=3)
@@ -144,6 +171,9 @@ def _by_class(found: Evaluation) -> list[Section]:
                 rows.append((f"{quantity}, {called} [{_unit(measure, quantity)}]", "here", *ours))
                 told = dict(zip(paper.CLASSES, paper.BY_CLASS[name, quantity, measure], strict=True))
                 rows.append(("", "the paper", *(_paper_figure(told.get(entry)) for entry in classes)))
+                if name == "test" and found.blocks is not None:
+                    blocks = [_figure(found.blocks[quantity].get(entry), measure, quantity) for entry in classes]
+                    rows.append(("", "held-out blocks of train", *blocks))
                 for said, floors in _floors(found, name):
                     noise = [_figure(floors[quantity].get(entry), measure, quantity) for entry in classes]
                     rows.append(("", said, *noise))
@@ -151,6 +181,10 @@ def _by_class(found: Evaluation) -> list[Section]:
                 if measure == "rmse" and repeats is not None:
                     blank = [""] * len(part.classes)
                     rows.append(("", "repeats to, driven again", *blank, f"{repeats.std:.{_DIGITS[quantity]}f}"))
+            if part.errors[quantity][ALL].nll is not None:
+                for score, called in SCORES.items():
+                    ours = [_figure(part.errors[quantity].get(entry), score, quantity) for entry in classes]
+                    rows.append((f"{quantity}, {called} [{_unit(score, quantity)}]", "here", *ours))
         header = (
             "",
             "",
@@ -158,13 +192,31 @@ def _by_class(found: Evaluation) -> list[Section]:
             f"all ({part.samples})",
         )
         sections.append(
-            Section(f"Table {number}: {_CALLED[name]}", _TEXT[name], header=header, rows=rows, figures_from=2)
+            Section(
+                f"Table {number}: {_CALLED[name]}",
+                f"{_TEXT[name]} {COUNTED}{leakage_line(part.leakage)}",
+                header=header,
+                rows=rows,
+                figures_from=2,
+            )
         )
     return sections
 
 
+def leakage_line(leakage: Leakage | None) -> str:
+    """Return how much of a split was met in training, in words."""
+    if leakage is None:
+        return "Nothing is known of its distance from training."
+    sharing = "" if leakage.sharing_percent is None else f"; {leakage.sharing_percent:.0f} % share ground with one"
+    return (
+        f"Audit (test held out by {leakage.holdout}): the middles of {leakage.near_percent:.0f} % of these samples are within "
+        f"{leakage.within_m:.2f} m of a training sample's{sharing}."
+    )
+
+
 _TEXT = {
-    "test": "Label noise alone is what a perfect prediction would show for the labels' own standard deviations.",
+    "test": "Held-out blocks of train are those that the model was not fitted on (a network was stopped by them). "
+    "Label noise alone is what a perfect prediction would show for the labels' own standard deviations.",
     "unseen": "The paper calls it validation; nothing was tuned or stopped by it.",
 }
 
@@ -177,23 +229,24 @@ def _ablation(found: Evaluation) -> Section:
         key = row.layers
         called, how = "{" + ", ".join(key) + "}", "retrained" if row.how == "retrained" else "here"
         for split in splits:
-            figures = [
-                _figure(row.on(split)[quantity], measure, quantity) for quantity, measure in paper.ABLATION_COLUMNS
-            ]
+            figures = [_figure(row.on(split)[quantity], measure, quantity) for quantity, measure in _ABLATION_COLUMNS]
             rows.append((called, split, how, *figures))
             if row.how == "noise" and key in paper.ABLATION:
                 told = paper.ABLATION[key][SPLITS.index(split)]
-                rows.append(("", "", "the paper", *(_paper_figure(value) for value in told)))
+                blank = [""] * len(SCORES)
+                rows.append(("", "", "the paper", *(_paper_figure(value) for value in told), *blank))
     for split in splits:
         for said, floors in _floors(found, split):
-            figures = [
-                _figure(floors[quantity][ALL], measure, quantity) for quantity, measure in paper.ABLATION_COLUMNS
-            ]
+            figures = [_figure(floors[quantity][ALL], measure, quantity) for quantity, measure in _ABLATION_COLUMNS]
             rows.append((said, split, "", *figures))
-    header = ("layers", "", "", *(f"{q} {MEASURES[m]} [{_unit(m, q)}]" for q, m in paper.ABLATION_COLUMNS))
+    header = ("layers", "", "", *(f"{q} {(MEASURES | SCORES)[m]} [{_unit(m, q)}]" for q, m in _ABLATION_COLUMNS))
     draws = found.config.draws
-    text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them."
+    text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them. {COUNTED}"
+    text += " ".join(f"{split}: {leakage_line(found.splits[split].leakage)}" for split in splits)
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
+
+
+_ABLATION_COLUMNS = (*paper.ABLATION_COLUMNS, *(("E", score) for score in SCORES))
 
 
 def _floors(found: Evaluation, split: str) -> Iterator[tuple[str, ErrorsByClass]]:
@@ -213,22 +266,30 @@ def _compared(
     splits = found.ordered_splits
     rows = []
     for what, by_split in ((what, table[what]) for what in (OURS, GRASS_ONLY, PER_CLASS, EXPECTED) if what in table):
-        cells = [_figure(by_split[split], measure, quantity) for split in splits for measure in MEASURES]
+        cells = [_figure(by_split[split], measure, quantity) for split in splits for measure in (*MEASURES, *SCORES)]
         rows.append((what, "here", *cells))
         if what in told:
-            figures = [value for split in splits for value in told[what][SPLITS.index(split)]]
-            rows.append(("", "the paper", *(_paper_figure(value) for value in figures)))
+            blank = [""] * len(SCORES)
+            figures = [
+                cell for split in splits for cell in (*map(_paper_figure, told[what][SPLITS.index(split)]), *blank)
+            ]
+            rows.append(("", "the paper", *figures))
     for floors in zip(*(_floors(found, split) for split in splits), strict=True):
-        cells = [_figure(floor[quantity][ALL], measure, quantity) for _, floor in floors for measure in MEASURES]
+        cells = [
+            _figure(floor[quantity][ALL], measure, quantity) for _, floor in floors for measure in (*MEASURES, *SCORES)
+        ]
         rows.append((floors[0][0], "", *cells))
     repeats = found.repeatability[quantity]
     if repeats is not None:
-        rows.append(("repeats to, driven again", "", *([f"{repeats.std:.{_DIGITS[quantity]}f}", ""] * len(splits))))
+        rows.append(
+            ("repeats to, driven again", "", *([f"{repeats.std:.{_DIGITS[quantity]}f}", "", "", "", ""] * len(splits)))
+        )
     header = (
         "",
         "",
-        *(f"{split}, {called} [{_unit(m, quantity)}]" for split in splits for m, called in MEASURES.items()),
+        *(f"{split}, {called} [{_unit(m, quantity)}]" for split in splits for m, called in (MEASURES | SCORES).items()),
     )
+    text += " " + COUNTED + " ".join(f"{split}: {leakage_line(found.splits[split].leakage)}" for split in splits)
     return Section(title, text, header=header, rows=rows, figures_from=2)
 
 

@@ -2,15 +2,25 @@
 
 T̂ = d / v̂ and Ê = ŵ d / v̂ follow from what the network says (equation 5); T* and E* are measured. A percentage needs a label that is
 well above nothing: where the robot gives back or hardly takes power the MAPE leaves a sample out, and says so; the RMSE counts it.
+
+A model that states how wrong it may be (`tcpipe.cost.prediction_errors`) is scored by that, too (Gneiting and Raftery, *Strictly proper
+scoring rules, prediction, and estimation*, JASA 102, 2007): by the share of labels that its 90 % intervals hold, and, its prediction m
+taken as normal with its standard deviation s, z = (label - m) / s, by ::
+
+    NLL  = ln(s) + z²/2 + ln(2 pi)/2                                 (their section 4.1, of the negative sign)
+    CRPS = s (z (2 Phi(z) - 1) + 2 phi(z) - 1/sqrt(pi))              (their equation 5 in closed form; in the label's unit)
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
+
+from tcpipe.tables.findings import ABSENT
 
 Array = NDArray[np.float64]
 
@@ -38,15 +48,44 @@ class Errors:
     mape_percent: float | None
     mape_count: int
     """Samples whose label is large enough for a percentage."""
+    held_percent: float | None = field(default=None, metadata=ABSENT)
+    """Of the labels, by 90 % intervals; None, as the next two, where no deviation is stated."""
+    nll: float | None = field(default=None, metadata=ABSENT)
+    """Mean negative log-likelihood, of labels in their unit."""
+    crps: float | None = field(default=None, metadata=ABSENT)
+    """Mean continuous ranked probability score, in the label's unit."""
 
 
-def errors(predicted: Array, measured: Array, least: float = 0.0) -> Errors:
-    """Return the errors of predictions, both of shape (N,)."""
+@dataclass(frozen=True, slots=True)
+class Spread:
+    """What is stated of predictions' errors, shape (N,) each: standard deviation, and the ends of 90 % intervals."""
+
+    std: Array
+    low: Array
+    high: Array
+
+    def take(self, rows: NDArray[np.bool_]) -> Spread:
+        """Return some of them."""
+        return Spread(self.std[rows], self.low[rows], self.high[rows])
+
+
+def errors(predicted: Array, measured: Array, least: float = 0.0, spread: Spread | None = None) -> Errors:
+    """Return the errors of predictions, both of shape (N,), and their scores where a spread is stated."""
     difference = np.asarray(predicted, np.float64) - measured
     large = measured >= least
     rmse = float(np.sqrt(np.mean(difference**2))) if len(difference) else None
     mape = 100.0 * float(np.mean(np.abs(difference[large]) / measured[large])) if large.any() else None
-    return Errors(len(difference), rmse, mape, int(large.sum()))
+    scores = (None, None, None) if spread is None or not len(difference) else _scores(-difference, measured, spread)
+    return Errors(len(difference), rmse, mape, int(large.sum()), *scores)
+
+
+def _scores(off: Array, measured: Array, spread: Spread) -> tuple[float, float, float]:
+    z = off / spread.std
+    density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
+    crps = spread.std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
+    nll = np.log(spread.std) + z**2 / 2.0 + np.log(2.0 * np.pi) / 2.0
+    held = (measured >= spread.low) & (measured <= spread.high)
+    return 100.0 * float(held.mean()), float(nll.mean()), float(crps.mean())
 
 
 def combined(parts: Iterable[Errors]) -> Errors:
@@ -56,14 +95,29 @@ def combined(parts: Iterable[Errors]) -> Errors:
     squares = sum(part.count * part.rmse**2 for part in found if part.rmse is not None)
     shares = sum(part.mape_count * part.mape_percent for part in found if part.mape_percent is not None)
     rmse = float(np.sqrt(squares / count)) if count else None
-    return Errors(count, rmse, shares / mape_count if mape_count else None, mape_count)
+    return Errors(count, rmse, shares / mape_count if mape_count else None, mape_count, *_weighted_scores(found, count))
+
+
+_SCORES = tuple(of.name for of in fields(Errors))[4:]
+
+
+def _weighted_scores(found: list[Errors], count: int) -> list[float | None]:
+    """Return the scores of all parts together, each None where a part has none."""
+    of_parts = [[getattr(part, name) for part in found] for name in _SCORES]
+    return [
+        None
+        if not found or None in values
+        else sum(part.count * value for part, value in zip(found, values, strict=True)) / count
+        for values in of_parts
+    ]
 
 
 def mean_of_draws(draws: Iterable[Errors]) -> Errors:
     """Return the mean errors of the same samples under several draws of noise."""
     found = list(draws)
     rmse, mape = _mean(draw.rmse for draw in found), _mean(draw.mape_percent for draw in found)
-    return Errors(found[0].count, rmse, mape, found[0].mape_count)
+    scores = (_mean(getattr(draw, name) for draw in found) for name in _SCORES)
+    return Errors(found[0].count, rmse, mape, found[0].mape_count, *scores)
 
 
 def _mean(values: Iterable[float | None]) -> float | None:
@@ -72,7 +126,11 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 
 def errors_by_class(
-    predicted: Costs, measured: Costs, class_ids: NDArray[np.int64], names: Mapping[int, str]
+    predicted: Costs,
+    measured: Costs,
+    class_ids: NDArray[np.int64],
+    names: Mapping[int, str],
+    spreads: Mapping[str, Spread] | None = None,
 ) -> dict[str, dict[str, Errors]]:
     """Return the errors of each quantity by class name, and of `ALL`: the classes combined.
 
@@ -84,12 +142,17 @@ def errors_by_class(
         Terrain class of each sample, shape (N,).
     names
         Of the ids that occur.
+    spreads
+        What is stated of the predictions' errors, by quantity.
 
     """
     found = {}
     for quantity in predicted:
+        spread = (spreads or {}).get(quantity)
         by_class = {
-            name: errors(predicted[quantity][here], measured[quantity][here], LEAST[quantity])
+            name: errors(
+                predicted[quantity][here], measured[quantity][here], LEAST[quantity], spread and spread.take(here)
+            )
             for class_id, name in names.items()
             if (here := class_ids == class_id).any()
         }

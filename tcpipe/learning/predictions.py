@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.cost.prediction_errors import centring_of, errors_of
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.beside import beside_of
 from tcpipe.errors import ModelError
-from tcpipe.learning.metrics import Array, costs
+from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, Spread, costs
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
 from tcpipe.learning.training import class_table
@@ -77,7 +78,9 @@ def measured(split: Split, names: Mapping[int, str]) -> Measured:
 def predicted_costs(
     model: Model, split: Split, *, noise: Sequence[str] = (), seed: Sequence[int] = (0,)
 ) -> dict[str, Array]:
-    """Return what a model says of w, v, T, E of every sample, shape (N,) each; of E alone where it predicts nothing else.
+    """Return what a model says of w, v, T, E of every sample, centred, shape (N,) each; of E alone where it predicts nothing else.
+
+    A model centres class by class (`tcpipe.cost.prediction_errors`), or as one where it is not shown the classes.
 
     Parameters
     ----------
@@ -100,7 +103,29 @@ def predicted_costs(
         parts.append(model.predict(patches, beside.take(slice(first, first + len(patches)))))
         first += len(patches)
     said = np.concatenate(parts).astype(np.float64)
-    return {"E": said[:, 0]} if said.shape[1] == 1 else costs(said[:, 0], said[:, 1], model.chord_m)
+    if said.shape[1] == 1:
+        return {"E": said[:, 0]}
+    shown = "terrain" in model.channels and "terrain" not in noise
+    class_id = beside.class_id if shown else np.zeros(len(said), np.int64)
+    power, velocity = centring_of(model.residuals).apply(said[:, 0], said[:, 1], class_id)
+    return costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), model.chord_m)
+
+
+_CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
+
+
+def spreads_of(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.int64]) -> dict[str, Spread]:
+    """Return what a model states of the errors of its costs, by quantity; nothing if it has too few held-out samples."""
+    stated = errors_of(model.residuals)
+    if stated is None:
+        return {}
+    scale = {"w": 1.0, "v": 1.0, "T": model.chord_m, "E": model.chord_m}  # of a metre's errors
+    found = {}
+    for quantity, costs_of in said.items():
+        errors, d = stated[_CALLED[quantity]], scale[quantity]
+        low, high = errors.of_pieces(costs_of / d, class_ids)
+        found[quantity] = Spread(d * errors.spread(costs_of / d, class_ids), d * low, d * high)
+    return found
 
 
 def _patches(split: Split) -> Iterator[NDArray[np.float32]]:

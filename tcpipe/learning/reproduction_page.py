@@ -127,7 +127,8 @@ def _seeds(runs: Sequence[Evaluation]) -> list[Section]:
         for quantity in QUANTITIES:
             found = [run.splits[split].errors[quantity][ALL] for run in runs]
             figures = (
-                f"{error.rmse:.3f} {UNITS[quantity]}, {error.mape_percent or float('nan'):.2f} %" for error in found
+                f"{error.rmse:.3f} {UNITS[quantity]}, {error.mape_percent or float('nan'):.2f} % ({error.mape_count})"
+                for error in found
             )
             rows.append((split, quantity, *figures))
     header = ("", "", *(f"seed {number}" for number in range(len(runs))))

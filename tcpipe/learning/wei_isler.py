@@ -12,9 +12,9 @@ from tcpipe.dataset import Dataset
 from tcpipe.errors import DatasetError
 from tcpipe.learning.baselines import beside
 from tcpipe.learning.evaluation_facts import Compared
-from tcpipe.learning.metrics import ALL, Array, Errors, errors_by_class
+from tcpipe.learning.metrics import ALL, Array, Errors, Spread, errors_by_class
 from tcpipe.learning.models import Model
-from tcpipe.learning.predictions import Measured, predicted_costs
+from tcpipe.learning.predictions import Measured, predicted_costs, spreads_of
 from tcpipe.learning.training import Variant
 
 logger = logging.getLogger("tcpipe")
@@ -51,7 +51,7 @@ def energy_table(
     for split, part in sets.items():
         rows = np.flatnonzero(np.isin(part.class_ids, list(networks)) | (not networks))
         same, mine = part.take(rows), {"E": said[split]["E"][rows]}
-        found.errors.setdefault(OURS, {})[split] = _error(mine, same)
+        found.errors.setdefault(OURS, {})[split] = _error(mine, same, spreads_of(ours, mine, same.class_ids))
         if not networks or not len(rows):
             continue
         theirs = {PER_CLASS: _by_own_network(networks, same)}
@@ -84,5 +84,5 @@ def _by_own_network(networks: Mapping[int, Model], found: Measured) -> Array:
     return energy
 
 
-def _error(energy: Mapping[str, Array], found: Measured) -> Errors:
-    return errors_by_class(energy, found.costs, found.class_ids, found.names)["E"][ALL]
+def _error(energy: Mapping[str, Array], found: Measured, spreads: Mapping[str, Spread] | None = None) -> Errors:
+    return errors_by_class(energy, found.costs, found.class_ids, found.names, spreads)["E"][ALL]

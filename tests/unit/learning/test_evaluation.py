@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 
 import numpy as np
+import pyproj
 import pytest
 from made_models import CARD, made_model
 from synthetic_store import STANDING_WATT, small_store
@@ -70,6 +71,39 @@ def test_a_model_of_what_is_above_standing_is_held_against_that(model, dataset, 
     assert found.errors["E"]["all"].rmse == pytest.approx(np.sqrt(np.mean((told - energy) ** 2)), rel=1e-4)
     assert found.label_floor["E"]["all"].rmse == pytest.approx(1.2)
     assert "above what the robot draws" in (tmp_path / "evaluation" / "evaluation.html").read_text()
+
+
+def test_how_near_training_it_is_and_what_blocks_say(evaluated, model, dataset):
+    place, values = evaluated
+    data = open_dataset(dataset)
+    middles = [
+        np.mean([[split.column(f"{end}_{axis}_deg") for axis in ("lon", "lat")] for end in ("start", "end")], axis=0).T
+        for split in (data["test"], data["train"])
+    ]
+    metres = [pyproj.Transformer.from_crs(4326, 32633, always_xy=True).transform(*some.T) for some in middles]
+    apart = np.hypot(*(a[:, None] - b[None, :] for a, b in zip(*metres, strict=True))).min(axis=1)
+    found = values.splits["test"].leakage
+    assert found.near_percent == pytest.approx(100.0 * np.mean(apart <= found.within_m))
+    audit = next(part for part in data.card.split.audit if part.split == "test")
+    assert found.sharing_percent == pytest.approx(100.0 * audit.overlapping_samples / audit.samples)
+    page = (place / "evaluation.html").read_text()
+    assert page.count("Audit (test held out by block)") >= 4
+    residuals = load_model(model).residuals
+    assert values.blocks["w"]["all"].count == len(residuals["power_watt"])
+    assert values.blocks["w"]["all"].rmse == pytest.approx(
+        np.sqrt(np.mean((residuals["power_watt"] - residuals["power_predicted_watt"]) ** 2)), rel=0.02
+    )
+    assert "held-out blocks of train" in page
+
+
+def test_it_says_of_how_many_labels_a_percentage_is_and_how_well_it_knows_itself(evaluated):
+    place, values = evaluated
+    energy = values.splits["unseen"].errors["E"]["all"]
+    page = (place / "evaluation.html").read_text()
+    assert f"{energy.mape_percent:.2f} ({energy.mape_count})" in page
+    assert f"{energy.crps:.2f}" in page
+    for told in ("E, held by 90 % [%]", "E, NLL [nat]", "E, CRPS [J]"):
+        assert told in page
 
 
 def test_what_is_ablated_is_noise_and_nothing_else(model, dataset):

@@ -5,8 +5,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.integrate import quad
+from scipy.stats import norm
 
-from tcpipe.learning.metrics import ALL, LEAST, combined, costs, errors, errors_by_class, label_floor, mean_of_draws
+from tcpipe.learning.metrics import (
+    ALL,
+    LEAST,
+    Spread,
+    combined,
+    costs,
+    errors,
+    errors_by_class,
+    label_floor,
+    mean_of_draws,
+)
 
 _VALUES = st.floats(20.0, 500.0)
 
@@ -81,3 +93,33 @@ def test_the_labels_floor_is_what_a_perfect_prediction_would_show():
     seen = errors(truth, labels, LEAST["w"])
     assert told.rmse == pytest.approx(seen.rmse, rel=0.01)
     assert told.mape_percent == pytest.approx(seen.mape_percent, rel=0.01)
+
+
+def _spread(predicted, std):
+    return Spread(std, predicted - 1.645 * std, predicted + 1.645 * std)
+
+
+def test_scores_are_those_of_their_definitions():
+    """CRPS is the integral of the squared difference of the predicted and the measured distribution, NLL that of the density."""
+    predicted, measured, std = np.array([100.0, 60.0]), np.array([104.0, 40.0]), np.array([5.0, 8.0])
+    found = errors(predicted, measured, 0.0, _spread(predicted, std))
+    crps = []
+    for m, y, s in zip(predicted, measured, std, strict=True):
+        below = quad(lambda x, m=m, s=s: norm.cdf(x, m, s) ** 2, m - 60.0, y)[0]
+        crps.append(below + quad(lambda x, m=m, s=s: (norm.cdf(x, m, s) - 1.0) ** 2, y, m + 60.0)[0])
+    assert found.crps == pytest.approx(np.mean(crps), rel=1e-6)
+    assert found.nll == pytest.approx(-np.mean(norm.logpdf(measured, predicted, std)))
+    assert found.held_percent == 50.0
+
+
+def test_scores_of_classes_are_those_of_all_samples_and_absent_where_nothing_is_stated():
+    rng = np.random.default_rng(0)
+    measured, ids = rng.uniform(100.0, 200.0, 90), rng.choice([4, 5], 90)
+    predicted = measured + rng.normal(0.0, 9.0, 90)
+    spread = _spread(predicted, rng.uniform(6.0, 12.0, 90))
+    by_class = errors_by_class({"E": predicted}, {"E": measured}, ids, {4: "grass", 5: "mud"}, {"E": spread})["E"]
+    pooled = errors(predicted, measured, LEAST["E"], spread)
+    for score in ("held_percent", "nll", "crps"):
+        assert getattr(by_class[ALL], score) == pytest.approx(getattr(pooled, score))
+    assert errors(predicted, measured).nll is None
+    assert combined([pooled, errors(predicted, measured)]).crps is None
