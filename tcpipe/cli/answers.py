@@ -31,6 +31,7 @@ def answers() -> dict[str, type]:
     from tcpipe.pipeline.table_proposal import InspectedTables
     from tcpipe.pipeline.verify import Verified
     from tcpipe.planning.cost_map import CostMapCard, CostMapResult
+    from tcpipe.planning.drive_files import Drives
     from tcpipe.planning.path_files import PathResult, TableTotals
     from tcpipe.planning.plan_files import PlanFile, PlanResult
     from tcpipe.simulation import SimulatedSite
@@ -48,6 +49,7 @@ def answers() -> dict[str, type]:
         "cost-map.answer": CostMapResult,
         "diff.answer": Difference,
         "evaluate.answer": Evaluation,
+        "evaluate-drives.answer": Drives,
         "explain.answer": Explained,
         "export.answer": Exported,
         "ingest-log.answer": LogLine,

@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, SEALED, SEED, json_option, quiet_option
+from tcpipe.cli.options import (
+    OUTPUT_DIRECTORY,
+    SEALED,
+    SEED,
+    json_option,
+    map_option,
+    quiet_option,
+    store_option,
+)
 
 
 @click.command(short_help="Measure a model, beside the paper's tables")
@@ -24,6 +32,12 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, SEALED, SEED, json_option, quie
 )  # fmt: skip
 @click.option("--retrain", is_flag=True, help="Train a network for each input set of the ablation, too (six more).")
 @click.option("--seed", default=0, show_default=True, type=SEED, help="Of the noise.")
+@click.option(
+    "--drive", "drives", multiple=True, metavar="LOG",
+    help="Measure MODEL on a whole drive instead: an ingested log, by its path or its run's name; may be repeated.",
+)  # fmt: skip
+@map_option
+@store_option
 @json_option
 @quiet_option
 def evaluate(
@@ -35,6 +49,9 @@ def evaluate(
     baselines: bool,
     retrain: bool,
     seed: int,
+    drives: tuple[str, ...],
+    map_name: str | None,
+    store: str,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -43,7 +60,13 @@ def evaluate(
     RMSE and MAPE of power, velocity, time and energy by terrain class; the ablation of the input layers; the baselines of Wei and
     Isler and the expected time; what the labels' own noise allows; each beside the paper's own figures. Networks that it trains are
     kept in OUT and used again.
+
+    With --drive: time and energy of whole drives, measured against predicted on the store's map, with intervals and a picture, in
+    drives.json and drives.html of OUT; DATASET, that MODEL was trained on, tells whether a drive was held back.
     """
+    if drives:
+        _on_drives(model, dataset, out, drives, map_name=map_name, store=store, as_json=as_json, quiet=quiet)
+        return
     from tcpipe.cli.output import print_json, progress, say_lines
     from tcpipe.learning.evaluation_facts import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
@@ -51,6 +74,34 @@ def evaluate(
     config = EvaluateConfig(draws=draws, baselines=baselines, retrain=retrain, seed=seed)
     with progress("evaluate", 1, quiet=quiet):
         result = run_evaluation(model, dataset, out, config=config)
+    if as_json:
+        print_json(result.values)
+    else:
+        say_lines(result)
+
+
+def _on_drives(
+    model: str,
+    dataset: str,
+    out: str,
+    drives: tuple[str, ...],
+    *,
+    map_name: str | None,
+    store: str,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    from tcpipe.cli.output import print_json, progress, say_lines
+    from tcpipe.dataset import open_dataset
+    from tcpipe.learning.models import load_model
+    from tcpipe.learning.predictions import check_origin
+    from tcpipe.planning.drive_files import evaluate_drives
+    from tcpipe.planning.inputs import chosen_map
+
+    with progress("evaluate", 1, quiet=quiet):
+        asked, data = load_model(model), open_dataset(dataset)
+        check_origin(asked.card, data, model)
+        result = evaluate_drives(asked, data, chosen_map(store, map_name), drives, store=store, out=out)
     if as_json:
         print_json(result.values)
     else:

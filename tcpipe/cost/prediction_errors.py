@@ -109,7 +109,7 @@ class Errors:
             variance / float(spread.sum()) ** 2, 1.0
         )  # errors of a single metre are no normal ones, sums nearly
         ends = (np.array([self.low, self.high]) * like_one + np.array([-_Z, _Z]) * (1.0 - like_one)) / _Z
-        width = _Z * np.sqrt(variance + common**2)
+        width = _Z * float(np.sqrt(variance + common**2))
         return middle + width * float(ends[0]), middle + width * float(ends[1])
 
     def _variance(self, spread: Floats) -> float:

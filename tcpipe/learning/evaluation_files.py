@@ -74,7 +74,7 @@ def run_evaluation(
     """
     place = Path(out)
     clear(place)
-    ours = {JSON, CSV, PAGE, NETWORKS}
+    ours = {JSON, CSV, PAGE, NETWORKS, "drives.json", "drives.html"}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):

@@ -6,44 +6,27 @@ from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tcpipe.cost.prediction_errors import centring_of
 from tcpipe.dataset import Dataset, Split
 from tcpipe.learning.evaluation_facts import ErrorsByClass, Leakage
-from tcpipe.learning.metrics import Array, costs, errors_by_class
+from tcpipe.learning.metrics import costs, errors_by_class
 from tcpipe.learning.models import Model
-
-_WITHIN = 1.05
-"""Of a chord: consecutive samples are one apart."""
-
-_M_A_DEG = 111_195.0
-"""Of a great circle: to half a per cent, which a metre and a twentieth does not mind."""
+from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
 
 _UNKNOWN = {0: "unknown"}
 
 
 def leakage_of(data: Dataset, held: Split) -> Leakage | None:
     """Return how near the samples of a split are to those of train; None where either has no samples with a place."""
-    places = np.concatenate([_middles_deg(held), _middles_deg(data["train"])])
-    apart_m = _M_A_DEG * (places - places[:1]) * [np.cos(np.radians(np.nanmean(places[:, 1]))), 1.0]
-    ours, theirs = apart_m[: len(held)], apart_m[len(held) :]
-    ours, theirs = (some[np.isfinite(some).all(axis=1)] for some in (ours, theirs))
-    if not len(ours) or not len(theirs):
+    ours, theirs = (middles_deg({name: part.column(name) for name in PLACES}) for part in (held, data["train"]))
+    within_m = CLOSE * data.card.recipe.segment.chord_m
+    near = are_near(ours, theirs, within_m=within_m)
+    if not len(near) or not len(theirs):
         return None
-    within_m = _WITHIN * data.card.recipe.segment.chord_m
-    near = np.isfinite(cKDTree(theirs).query(ours, distance_upper_bound=within_m)[0])
     audit = next((part for part in data.card.split.audit if part.split == held.name and part.samples), None)
     sharing = None if audit is None else 100.0 * audit.overlapping_samples / audit.samples
     return Leakage(data.card.split.holdout, within_m, 100.0 * float(near.mean()), sharing)
-
-
-def _middles_deg(split: Split) -> Array:
-    """Return lon, lat [deg] of the middles of chords, shape (N, 2)."""
-    ends = [
-        [split.column(f"{end}_{axis}_deg").astype(np.float64) for axis in ("lon", "lat")] for end in ("start", "end")
-    ]
-    return np.asarray(np.mean(ends, axis=0).T)
 
 
 def by_blocks(model: Model, names: Mapping[int, str]) -> ErrorsByClass | None:

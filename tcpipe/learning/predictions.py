@@ -15,7 +15,7 @@ from tcpipe.errors import ModelError
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS, Array, Spread, costs
 from tcpipe.learning.model_card import ModelCard
 from tcpipe.learning.models import Model
-from tcpipe.learning.training import class_table
+from tcpipe.learning.training import class_table, dataset_checksum
 from tcpipe.terrain.classes import ClassTable
 
 _TOGETHER = 1024
@@ -131,6 +131,15 @@ def spreads_of(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.in
 def _patches(split: Split) -> Iterator[NDArray[np.float32]]:
     for first in range(0, len(split), _TOGETHER):
         yield split.batch(np.arange(first, min(first + _TOGETHER, len(split))))[0].copy()
+
+
+def check_origin(card: ModelCard, data: Dataset, name: str) -> None:
+    """Raise an error if a model was trained on another dataset, which does not tell what it has seen."""
+    if dataset_checksum(data.card) != card.dataset.sha256:
+        raise ModelError(
+            f"{name}: was trained on another dataset ({card.dataset.name}, {card.dataset.sha256[:12]}) than {data.path}; "
+            "wanted that one, which tells whether a drive was held back"
+        )
 
 
 def check_fit(card: ModelCard, data: Dataset, name: str) -> None:

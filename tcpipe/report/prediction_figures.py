@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -56,4 +56,27 @@ def predictions_by_patch(measured: Array, predicted: Array, classes: Sequence[st
                 fontsize=8,
             )
         values.set_xlim(0.5, len(number) + 0.5)
+    return out[0]
+
+
+def sums_along(distance_m: Array, panels: Mapping[str, Array]) -> str:
+    """Draw what a drive took so far over the distance driven, measured and predicted, with its interval.
+
+    Parameters
+    ----------
+    distance_m
+        Shape (N,).
+    panels
+        By label with unit: measured, predicted, and the ends of the interval, shape (4, N).
+
+    """
+    with figure_svg(8.2, 2.4 * len(panels)) as (figure, out):
+        axes_of = np.atleast_1d(figure.subplots(len(panels), 1, sharex=True))
+        for axes, (label, (measured, predicted, low, high)) in zip(axes_of, panels.items(), strict=True):
+            axes.fill_between(distance_m, low, high, color=PREDICTED, alpha=0.2, lw=0)
+            axes.plot(distance_m, measured, color=MEASURED, lw=1.1, label="measured")
+            axes.plot(distance_m, predicted, color=PREDICTED, lw=1.1, label="predicted")
+            axes.set_ylabel(label)
+        axes_of[0].legend(loc="upper left", ncols=2, frameon=False)
+        axes_of[-1].set_xlabel("distance driven in segments [m]")
     return out[0]

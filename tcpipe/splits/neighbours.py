@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,33 @@ Ints = NDArray[np.int64]
 
 _CHUNK = 16_384
 """Footprints looked at together."""
+
+CLOSE = 1.05
+"""Chords between the middles of what is told to be met in training: consecutive samples are one apart."""
+
+PLACES = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
+"""Columns of a chord's ends."""
+
+_M_A_DEG = 111_195.0  # of a great circle: to half a per cent
+
+
+def middles_deg(ends: Mapping[str, NDArray[np.generic]]) -> Floats:
+    """Return lon, lat [deg] of the middles of chords, shape (N, 2), by the columns `PLACES`."""
+    x0, y0, x1, y1 = (ends[name].astype(np.float64) for name in PLACES)
+    return np.column_stack([(x0 + x1) / 2.0, (y0 + y1) / 2.0])
+
+
+def are_near(ours_deg: Floats, theirs_deg: Floats, *, within_m: float) -> NDArray[np.bool_]:
+    """Return which of ``ours``, lon, lat [deg], shape (N, 2), are at most so far from one of ``theirs``; NaN is near nothing."""
+    scale = _M_A_DEG * np.array([np.cos(np.radians(np.nanmean(ours_deg[:, 1]))) if len(ours_deg) else 1.0, 1.0])
+    known, others = np.isfinite(ours_deg).all(axis=1), theirs_deg[np.isfinite(theirs_deg).all(axis=1)]
+    found = np.zeros(len(ours_deg), np.bool_)
+    if known.any() and len(others):
+        origin = others[0]
+        tree = cKDTree((others - origin) * scale)
+        apart_m, _ = tree.query((ours_deg[known] - origin) * scale, distance_upper_bound=within_m)
+        found[known] = np.isfinite(apart_m)
+    return found
 
 
 def near_pairs(ours_xy_m: Floats, theirs_xy_m: Floats, *, within_m: float) -> Iterator[tuple[Ints, Ints]]:

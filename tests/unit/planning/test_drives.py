@@ -1,0 +1,82 @@
+"""Whole drives against a model: what they took by hand, what cannot be compared, and what was trained on."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from physics_model import PhysicsModel
+from synthetic_store import box, region_file, small_store
+
+from tcpipe.dataset import open_dataset
+from tcpipe.errors import ModelError, UsageError
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.planning.drive_files import evaluate_drives
+from tcpipe.planning.drives import drive_cost, drive_in
+from tcpipe.planning.inputs import chosen_map
+from tcpipe.recipe import Recipe
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A store of two drives; the dataset's region holds the northern one alone."""
+    here = tmp_path_factory.mktemp("drives")
+    store = small_store(here)
+    region = region_file(here / "region.geojson", box(-18, 0, 18, 18))
+    build_dataset(here / "dataset", store=store.root, split=region, recipe=Recipe())
+    return store, open_dataset(here / "dataset"), chosen_map(store.root, None)
+
+
+def test_a_drive_that_was_held_back_is_summed_where_the_model_knows_the_ground(made):
+    store, data, source = made
+    run = drive_in(store, "/logs/south.mcap")
+    found = drive_cost(PhysicsModel(), source, run, data, log="south.mcap")
+    assert found.held_back
+    assert found.samples_in_training == 0
+    segments = run.segments()
+    assert found.segments_m == pytest.approx(segments.num_rows)
+    assert found.driven_m == pytest.approx(segments.num_rows + 2.5)
+    assert found.compared_m <= found.segments_m <= found.compared_m + sum(found.rest_m.values()) + 1e-6
+    count = round(found.compared_m)
+    assert found.duration_s.measured == pytest.approx(1.2 * count)
+    assert 0.0 < found.energy_joule.measured < segments.column("energy_joule").to_numpy().sum() + 1e-6
+    for of in (found.duration_s, found.energy_joule):
+        assert of.low <= of.predicted <= of.high  # its held-out velocities are exact
+    assert found.energy_joule.low < found.energy_joule.high
+    assert len(found.along.distance_m) == len(found.along.energy_joule) == 60
+    assert found.along.energy_joule[-1] == found.energy_joule
+    assert (np.diff([of.measured for of in found.along.energy_joule]) > 0.0).all()
+
+
+def test_ground_that_was_not_met_is_named_and_left_out(made):
+    store, data, source = made
+    flat = replace(PhysicsModel(), seen=PhysicsModel().seen | {"slope_rad": (-1e-6, 1e-6)})
+    found = drive_cost(flat, source, drive_in(store, "south"), data, log="south")
+    known = drive_cost(PhysicsModel(), source, drive_in(store, "south"), data, log="south")
+    assert found.rest_m["slope_not_seen"] > 0.0
+    assert found.compared_m < known.compared_m
+
+
+def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
+    store, data, source = made
+    said = evaluate_drives(PhysicsModel(), data, source, ["north", "south"], store=store.root, out=tmp_path / "out")
+    north, south = said.values.drives
+    assert not north.held_back
+    assert north.near_training_percent > 60.0
+    assert south.near_training_percent < 20.0
+    assert "of its samples trained the model: it is not held back" in str(said)
+    assert said.values.energy_joule.measured == south.energy_joule.measured
+    page = (tmp_path / "out" / "drives.html").read_text()
+    assert page.count("<svg") == 2
+    assert "J measured" in page
+    assert json.loads((tmp_path / "out" / "drives.json").read_text())["drives"][1]["run_id"] == "south"
+
+
+def test_what_cannot_be_compared_is_told(made):
+    store, data, source = made
+    with pytest.raises(
+        UsageError, match=r"elsewhere.mcap: no run of this log in .*; wanted its path or its run's name"
+    ):
+        drive_in(store, "elsewhere.mcap")
+    with pytest.raises(ModelError, match="is of robot husky, model physics of jackal"):
+        drive_cost(PhysicsModel(robot="jackal"), source, drive_in(store, "south"), data, log="south")
