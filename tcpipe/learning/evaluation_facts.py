@@ -72,7 +72,7 @@ class Leakage:
     """Samples whose footprint shares ground with one of train, by the dataset's own audit."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class SplitErrors:
     """Tables I and II of one split, and what its labels' deviations, or the simulator, allow."""
 
@@ -81,11 +81,11 @@ class SplitErrors:
     """Samples by the name of their class."""
     class_order: tuple[str, ...]
     errors: ErrorsByClass
-    leakage: Leakage | None = None
-    """How much of it was met in training; None where nothing trains, or places are not known."""
     label_floor: ErrorsByClass
     simulation_floor: ErrorsByClass | None = field(default=None, metadata=ABSENT)
     """Of what can be predicted at best where the samples were simulated."""
+    leakage: Leakage | None = field(default=None, metadata=ABSENT)
+    """How much of it was met in training; None where nothing trains, or places are not known."""
 
     @property
     def floors(self) -> dict[str, ErrorsByClass]:

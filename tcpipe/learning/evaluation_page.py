@@ -141,9 +141,7 @@ def _baselines(found: Evaluation) -> Section:
                 if (row.split, row.quantity) == (split, quantity):
                     figures = (_figure(row.errors, measure, quantity) for measure in MEASURES)
                     blank = [""] * len(SCORES)
-                    rows.append(
-                        ("", "", row.baseline, *figures, *blank, str(row.rmse_ratio), str(row.mape_ratio))
-                    )
+                    rows.append(("", "", row.baseline, *figures, *blank, str(row.rmse_ratio), str(row.mape_ratio)))
     header = ("", "", "", "RMSE", "MAPE [%]", "held by 90 % [%]", "NLL", "CRPS", "ratio of RMSE", "ratio of MAPE")
     text = (
         "Fitted on the samples that the model was fitted on, measured on the same as it. Ratios are the model's error over the "

@@ -34,6 +34,7 @@ TEXTS = {
     "shard",
     "min_age_s",
     "keep",
+    "drives",
 }
 """Parameters of commands that are text and no path."""
 

@@ -13,17 +13,24 @@ def _nav2(share):
     return np.rint(100.0 * share)
 
 
+def _nav2_since_2025(share):
+    """As it does in whole arrays: half is rounded up, and the thresholds themselves are free and lethal."""
+    return np.where(share >= 1.0, LETHAL, np.where(share <= 0.0, 0, np.floor(100.0 * share + 0.5)))
+
+
 def _ros1(share):
     """As ROS 1's image_loader does, and those made after it: 1 to 99."""
     return np.rint(1.0 + 98.0 * share)
 
 
-@pytest.mark.parametrize(("reader", "tolerance"), [(_nav2, 0), (_ros1, 1)])
+@pytest.mark.parametrize(("reader", "tolerance"), [(_nav2, 0), (_nav2_since_2025, 0), (_ros1, 1)])
 def test_costs_are_read_as_written_and_only_lethal_is_lethal(tmp_path, reader, tolerance):
     cost = np.append(np.arange(HIGHEST + 1), [LETHAL, LETHAL]).astype(np.uint8).reshape(2, 51)
     grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 2.0, 2, 51)
     write_nav2_map(tmp_path / "map.yaml", cost, grid, origin_m=(499_900.0, 5_199_000.0), meaning="a cost")
     about = YAML(typ="safe").load((tmp_path / "map.yaml").read_text())
+    needed = {"image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"}  # loadMapYaml throws without
+    assert needed <= about.keys()
     assert (about["mode"], about["negate"], about["resolution"]) == ("scale", 0, 2.0)
     assert about["origin"] == [100.0, 1_000.0 - 4.0, 0.0]
     head, pixels = (tmp_path / about["image"]).read_bytes().split(b"\n255\n", 1)
