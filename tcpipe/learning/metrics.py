@@ -79,11 +79,16 @@ def errors(predicted: Array, measured: Array, least: float = 0.0, spread: Spread
     return Errors(len(difference), rmse, mape, int(large.sum()), *scores)
 
 
+_LEAST_STD = 1e-9
+"""Of a spread: labels that are all equal have none."""
+
+
 def _scores(off: Array, measured: Array, spread: Spread) -> tuple[float, float, float]:
-    z = off / spread.std
+    std = np.maximum(spread.std, _LEAST_STD)
+    z = off / std
     density = np.exp(-(z**2) / 2.0) / np.sqrt(2.0 * np.pi)
-    crps = spread.std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
-    nll = np.log(spread.std) + z**2 / 2.0 + np.log(2.0 * np.pi) / 2.0
+    crps = std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
+    nll = np.log(std) + z**2 / 2.0 + np.log(2.0 * np.pi) / 2.0
     held = (measured >= spread.low) & (measured <= spread.high)
     return 100.0 * float(held.mean()), float(nll.mean()), float(crps.mean())
 
