@@ -1,5 +1,6 @@
 """A store of the paper's size without logs: its simulated map, and runs whose segments meander over it."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from tcpipe.pipeline.maps import add_map
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.scenarios import scenario
 from tcpipe.simulation.site_files import write_rasters
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -40,9 +41,10 @@ def store_of(directory: Path, samples: int) -> Store:
         (directory / "rasters").mkdir(parents=True, exist_ok=True)
         add_map("site", store=maps, **write_rasters(directory / "rasters", spec.world, spec.rasters))
     store = Store(directory / f"store-{samples}")
-    if not store.root.exists():
-        (store.root / "maps").mkdir(parents=True)
-        store.map_path("site").symlink_to((maps / "maps" / "site.zarr").resolve())
+    if not Path(store.root).exists():
+        open_store(store.root, create=True)
+        with store.new_map("site") as path:
+            shutil.copytree(Store(maps).map_path("site"), path)
         for number in range(-(-samples // RUN_ROWS)):
             _add_run(store, number, min(RUN_ROWS, samples - number * RUN_ROWS))
     return store

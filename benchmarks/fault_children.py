@@ -26,8 +26,8 @@ LONGEST_S, LATEST_S = 180.0, 5.0
 """A call that takes longer hangs; one that is asked to end ends as fast."""
 
 WHOLE = (
-    "dataset*", "site", "model", "costs", "tcpipe-store/maps/*.zarr", "tcpipe-store/runs/*/streams",
-    "tcpipe-store/runs/*/[0-9a-f]*",
+    "dataset*", "site", "model", "costs", "tcpipe-store/maps/*/*", "tcpipe-store/runs/*/streams/*",
+    "tcpipe-store/runs/*/[0-9a-f]*/[0-9a-f]*",
 )  # fmt: skip
 """Directories that appear and change as one."""
 

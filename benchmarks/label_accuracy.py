@@ -20,10 +20,11 @@ import pyproj
 
 from tcpipe import ingest
 from tcpipe.formats.recipe_toml import load_recipe
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.simulation import Truth, read_truth, simulate, true_cost
-from tcpipe.store import RunDirectory, Store
+from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers
 
 LABELS = {"energy_joule": "J", "power_watt": "W", "velocity_mps": "m/s", "duration_s": "s"}

@@ -21,14 +21,15 @@ import pyarrow.parquet as pq
 
 from tcpipe.formats.json_files import digest, to_json
 from tcpipe.formats.logs.writing import write_mcap
-from tcpipe.formats.record_files import Sighting, record_name
+from tcpipe.formats.record_files import RunName, Sighting, record_name
 from tcpipe.formats.seals import file_checksum, sealed
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
-from tcpipe.store import RunDirectory, Store
+from tcpipe.store import Store, open_store
 
 T = TypeVar("T")
 
@@ -39,7 +40,7 @@ SEAL = re.compile(r'(?m)^  "document_sha256": "([0-9a-f]{64})"(,?)\n')
 def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
     """Return a folder of so many logs and a store that has them all."""
     logs, store = directory / f"logs-{count}", Store(directory / f"store-{count}")
-    if store.root.exists():
+    if Path(store.root).exists():
         return logs, store
     sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
     from wheel_drives import wheel_drive
@@ -51,6 +52,7 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
     logs.mkdir(parents=True)
     for number in range(count):
         (logs / f"drive_{number:05d}.mcap").write_bytes(b"%08d" % number)
+    open_store(store.root, create=True)
     for number, source in enumerate(find_sources([logs], as_one=False, staging=Path()).sources):
         _copy(run, store, source, number)
     return logs, store
@@ -59,23 +61,25 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
 def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> None:
     sha256 = hashlib.sha256(str(number).encode()).hexdigest()
     run_id = f"{source.stem}-{sha256[:8]}"
-    place = store.runs_path / run_id / run.recipe_id
+    there = run.file("segments.parquet").parent
+    place = Path(store.root) / "runs" / run_id / run.recipe_id / there.name
     place.mkdir(parents=True)
     for name in ("track", "rejections"):
-        os.link(run.path / f"{name}.parquet", place / f"{name}.parquet")
+        os.link(there / f"{name}.parquet", place / f"{name}.parquet")
     segments = run.table("segments")
     for name in ("start_ns", "end_ns"):
         at, column = segments.schema.get_field_index(name), pc.add(segments.column(name), number * DAY_NS)
         segments = segments.set_column(at, segments.schema.field(name), column)
     pq.write_table(segments, place / "segments.parquet")
-    new, old = file_checksum(place / "segments.parquet"), run.manifest.checksums["segments.parquet"]
+    new, old = file_checksum(place / "segments.parquet"), run.checksum("segments.parquet")
     log = run.facts.log.source
     names = {run.run_id: run_id, log.sha256: sha256, log.paths[0]: source.origins[0], old.sha256: new.sha256}
     names |= {f'"size_bytes": {old.size_bytes}': f'"size_bytes": {new.size_bytes}'}
-    for document in (Path(run.recipe_id, "manifest.json"), Path("run.json")):
-        (place.parent / document).write_text(_renamed((run.path.parent / document).read_text(), names))
+    for document in (Path(run.recipe_id, "manifest-1.json"), Path("run-1.json")):
+        (place.parents[1] / document).write_text(_renamed((there.parents[1] / document).read_text(), names))
+    store.remember(f"runs/{sha256}", RunName(sha256, run_id))
     sighting = Sighting(source.origins, source.files, sha256)
-    record = store.records_path / source.lineage / f"{record_name(digest(sighting))}.json"
+    record = Path(store.root) / "records" / source.lineage / f"{record_name(digest(sighting))}.json"
     record.parent.mkdir(parents=True)
     record.write_text(to_json(sealed(sighting)))
 

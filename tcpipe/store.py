@@ -1,65 +1,84 @@
-"""The store: where runs and maps live, by content, each file whole or absent.
+"""The store: where runs and maps live, by content, in a directory or a bucket with one layout and one protocol (ADR 84).
 
 ::
 
     <root>/
-      records/logs/<path>/<fact>.json          logs seen: sizes, times, sha256
-      records/<kind>/<fact>.json               what else is remembered: failed, damaged, accepted, superseded
-      maps/<name>.zarr
-      runs/<run_id>/run.json                   source, robot, tags, topics, damage
-      runs/<run_id>/streams/<role>.parquet     L1, and checksums.json
-      runs/<run_id>/<recipe_id>/               manifest.json, track.parquet, segments.parquet, rejections.parquet
-      index/                                   runs.parquet, logs.parquet: what the documents say, made again at will
+      store.json                                    that this is a store, and of which layout
+      records/<kind>/<fact>.json                    what is remembered: logs seen, failed, damaged, accepted, superseded, names of runs
+      maps/<name>-<n>.json                          a map: its files and their checksums
+      maps/<name>/<digest>/                         <name>.zarr, and a picture of it
+      runs/<run_id>/run-<n>.json                    source, robot, topics, damage; files and checksums of the streams
+      runs/<run_id>/tags-<n>.json                   tags that were changed since
+      runs/<run_id>/streams/<digest>/<role>.parquet
+      runs/<run_id>/<recipe_id>/manifest-<n>.json   what became of it; files and checksums of the tables
+      runs/<run_id>/<recipe_id>/<digest>/           track.parquet, segments.parquet, rejections.parquet
+      index/                                        runs.parquet, logs.parquet: what the documents say, made again at will
 
-A recipe directory appears by one rename, manifest inside: if it is there, it is complete.
+Of numbered documents the highest holds. A ``<digest>`` names the content of what lies in it.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import re
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
-from functools import lru_cache
-from pathlib import Path
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, atomic_directory, clear, exclusive
+from tcpipe.formats.bucket import open_place
 from tcpipe.formats.index_files import (
     RunFacts,
     SeenLog,
     as_stored,
     facts_of,
-    file_state,
     known_log,
     read_logs,
     read_runs,
+    state_of,
     write_logs,
     write_runs,
 )
-from tcpipe.formats.json_files import digest, plain, typed
-from tcpipe.formats.parquet import highest, lowest, read_table, write_table
-from tcpipe.formats.places import local_output
-from tcpipe.formats.record_files import Sighting, Superseded, put_record, read_record, read_records, record_name
-from tcpipe.formats.run_documents import Manifest, ManifestHead, RunJson, StreamInfo
-from tcpipe.formats.seals import (
-    file_checksums,
-    prove_files,
-    read_checksums,
-    read_sealed,
-    read_sealed_as,
-    write_checksums,
-    write_sealed,
+from tcpipe.formats.json_files import digest, plain, to_json, typed
+from tcpipe.formats.numbered import (
+    digest_of,
+    name_of,
+    numbers,
+    put_next,
+    read_as_at,
+    read_sealed_at,
+    stem_and_number,
 )
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.parquet import read_table
+from tcpipe.formats.place import DirectoryPlace, Entry, Place
+from tcpipe.formats.places import local_output
+from tcpipe.formats.record_files import (
+    RunName,
+    Sighting,
+    Superseded,
+    put_record,
+    read_record,
+    read_records,
+    record_name,
+)
+from tcpipe.formats.run_documents import (
+    Manifest,
+    ManifestHead,
+    MapDocument,
+    RunJson,
+    StreamInfo,
+    Tags,
+)
+from tcpipe.formats.seals import Checksum, file_checksums, sealed
+from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
+from tcpipe.formats.stored_runs import Ingestions, RunDirectory, below, local_file, put_tables, told_of, with_span
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
-    LABELLED_SEGMENTS,
     READ_VERSIONS,
     GatedTrack,
     LabelledSegments,
@@ -74,11 +93,11 @@ T = TypeVar("T")
 logger = logging.getLogger("tcpipe")
 
 RUN_FILES = ("track.parquet", "segments.parquet", "rejections.parquet")
-RUN, MANIFEST = "run.json", "manifest.json"
 
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
-_SIGNS = ("runs/*/run.json", "maps/*.zarr", "records/logs/*/*.json", "records/failed/*.json")
-"""Of these a store has at least one."""
+_STREAMS = "streams"
+
+_BUCKETS = ("s3://", "gs://", "az://")
 
 _NAME_HEX = 8
 """So many digits of its log's sha256 stand in a run's name, more where two recordings of one name share them."""
@@ -87,90 +106,75 @@ _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
 @dataclass(frozen=True, slots=True)
-class RunDirectory:
-    """One finished ingestion: a run under one recipe."""
+class Store:
+    """A store in a directory, or below a URL."""
 
-    run_id: str
-    recipe_id: str
-    path: Path
-    facts: RunFacts
-    """What the index has of it: enough to choose by."""
+    root: Path | str
 
     @property
-    def manifest(self) -> Manifest:
-        """The whole manifest; `StoreError` if it is not as it was written."""
-        return _manifest(self.path / MANIFEST, self.facts.state)
+    def place(self) -> Place:
+        """Where its files lie."""
+        return open_place(self.root)
 
-    def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
-        """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
-        self.prove(f"{name}.parquet")
-        columns = None if columns is None else list(columns)
-        return read_table(self.path / f"{name}.parquet", columns).replace_schema_metadata(None)
-
-    def prove(self, *names: str) -> None:
-        """Compare files with what the manifest has of them; `StoreError` names the first that is not as it was written."""
-        prove_files(self.path, self.manifest.checksums, names)
-
-    def segments(self) -> pa.Table:
-        """Read the labelled segments (schema LABELLED_SEGMENTS; columns that an earlier data model lacks are null)."""
-        return LABELLED_SEGMENTS.completed(self.table("segments"))
-
-    def track(self) -> GatedTrack:
-        """Read the gated track as a checked level."""
-        return GatedTrack(self.table("track"), self.manifest.info)
-
-    def rejections(self) -> pa.Table:
-        """Read the measurements that the filter refused (schema REJECTIONS)."""
-        return self.table("rejections")
-
-
-@dataclass(frozen=True, slots=True)
-class Ingestions:
-    """What a store, or one of its runs, holds of finished ingestions."""
-
-    finished: tuple[RunDirectory, ...]
-    """Those of this data-model version, by run and recipe."""
-    outdated: Mapping[str, ManifestHead]
-    """By run, of those that are finished in other data-model versions only: the last."""
-    damaged: Mapping[Path, str]
-    """By directory of an ingestion: what is not as it was written."""
-    superseded: Mapping[str, str] = field(default_factory=dict)
-    """Runs whose log was completed or repaired, which are in none of the others, and the run that took their place."""
-    rows: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
-    """Of the index, by run and recipe: of all that are finished, those of superseded runs too."""
-    stale: bool = False
-    """Whether the index has to be written again."""
-
-
-@dataclass(frozen=True, slots=True)
-class Store:
-    """A store on the local file system."""
-
-    root: Path
+    @property
+    def runs_place(self) -> Place:
+        """Where its runs lie."""
+        return self.place.below("runs")
 
     def clear(self) -> None:
-        """Put in order what killed commands left anywhere in the store."""
-        for directory in (self.root, self.root / "maps", self.runs_path, self.records_path):
-            clear(directory)
-        for run_id in self.run_ids():
-            clear(self.runs_path / run_id)
+        """Remove the temporaries of killed commands."""
+        if isinstance(place := self.place, DirectoryPlace):
+            place.clear()
 
-    @property
-    def runs_path(self) -> Path:
-        """Directory of the runs."""
-        return self.root / "runs"
+    def maps(self) -> list[str]:
+        """Return the names of the maps, sorted."""
+        return sorted(numbers(self.place.files("maps")))
 
-    def map_path(self, name: str) -> Path:
-        """Return where a map lives; `StoreError` if the name cannot be one."""
+    def map_number(self, name: str) -> int:
+        """Return the number of a map's last document, 0 where there is none; `StoreError` if the name cannot be one."""
         if not _MAP_NAME.fullmatch(name):
             raise StoreError(
                 f"map name {name!r}: wanted letters, digits, '_', '-', '.', beginning with a letter or digit"
             )
-        return self.root / "maps" / f"{name}.zarr"
+        return numbers(self.place.files("maps")).get(name, 0)
 
-    def maps(self) -> list[str]:
-        """Return the names of the maps, sorted."""
-        return sorted(path.stem for path in self.root.glob("maps/*.zarr") if not path.name.startswith(TEMPORARY_PREFIX))
+    def map_document(self, name: str) -> MapDocument:
+        """Return where a map lies, and its files; `StoreError` where there is none, or its document is not as it was written."""
+        return read_as_at(self.place.below("maps"), name_of(name, self.map_number(name)), MapDocument)
+
+    def map_path(self, name: str) -> Path:
+        """Return where a map lies on this machine; from a bucket its files are copied to the cache first."""
+        return self._map_file(name, self.map_document(name).zarr)
+
+    def map_picture(self, name: str) -> Path:
+        """Return where the quick look of a map lies on this machine."""
+        return self._map_file(name, self.map_document(name).picture)
+
+    def _map_file(self, name: str, wanted: str) -> Path:
+        return self.place.below("maps").tree(self.map_document(name).checksums) / wanted
+
+    @contextmanager
+    def new_map(self, name: str, *, after: int = 0) -> Iterator[Path]:
+        """Yield where a map is to be written, and beside it a picture ``.png``; in the end it is this store's, under ``after`` + 1.
+
+        Raises
+        ------
+        StoreError
+            It cannot be written, or another process has added a map of that name meanwhile, which stays.
+        """
+        maps = self.place.below("maps")
+        with maps.workshop() as directory:
+            with told_of(maps.where(name), directory):
+                yield directory / f"{name}.zarr"
+            checksums = file_checksums(directory)
+            prefix = f"{name}/{digest_of(checksums)}"
+            if free := self.map_number(name) == after:
+                maps.put_files(prefix, directory)
+        told = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", below(prefix, checksums)
+        data = to_json(sealed(MapDocument(*told))).encode()
+        same = free and after > 0 and maps.read(name_of(name, after)) == data
+        if not same and not (free and maps.put_new(name_of(name, after + 1), data)):
+            raise StoreError(f"map {name}: another process has written it meanwhile, and it stays; look at it first")
 
     def runs(self) -> list[RunDirectory]:
         """Return every finished ingestion of this data-model version, by run and recipe, that is not superseded."""
@@ -181,49 +185,89 @@ class Store:
         return list(self.ingestions(run_id).finished)
 
     def ingestions(self, run_id: str | None = None) -> Ingestions:
-        """Return what there is of all runs, or of one.
+        """Return what there is of all runs, or of one, by one listing.
 
         A manifest is read and proved, unless the index has what it says and its file is as it was then.
         """
         superseded = self.superseded() if run_id is None else {}
-        known = read_runs(self.index_path) if run_id is None else {}
-        finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[Path, str]()
+        known = read_runs(self.index_place) if run_id is None else {}
+        finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[tuple[str, str], str]()
         rows = dict[tuple[str, str], RunFacts]()
-        for name in [run_id] if run_id is not None else self.run_ids():
-            for path in self._recipes(name):
+        for name, files in self._files(run_id).items():
+            for recipe, number in _manifests(files).items():
                 try:
-                    found = _ingestion(path, known.get((name, path.name)))
+                    found = self._ingestion(name, recipe, number, files, known.get((name, recipe)))
                 except StoreError as error:
-                    damaged.update({} if name in superseded else {path: error.problems[0]})
+                    damaged.update({} if name in superseded else {(name, recipe): error.problems[0]})
                     continue
                 if isinstance(found, ManifestHead):
                     others.update({} if name in superseded else {name: found})
                     continue
-                rows[name, path.name] = replace(found.facts, superseded_by=superseded.get(name))
+                rows[name, recipe] = replace(found.facts, superseded_by=superseded.get(name))
                 if name not in superseded:
                     finished.append(found)
         current = {run.run_id for run in finished}
         outdated = {name: head for name, head in others.items() if name not in current}
         return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=_differ(rows, known))
 
-    def _recipes(self, run_id: str) -> list[Path]:
-        """Return the directories of a run's ingestions, by recipe."""
-        directory = self.runs_path / run_id
-        with suppress(OSError), os.scandir(directory) as entries:
-            here = [entry.name for entry in entries if entry.is_dir()]
-            names = (name for name in here if name != "streams" and not name.startswith(TEMPORARY_PREFIX))
-            return [directory / name for name in sorted(names)]
-        return []
+    def _files(self, run_id: str | None) -> dict[str, dict[str, Entry]]:
+        """Return the files of each run by name: one listing."""
+        found: dict[str, dict[str, Entry]] = {}
+        for entry in self.runs_place.entries(run_id or ""):
+            name, _, rest = entry.name.partition("/")
+            found.setdefault(name, {})[rest] = entry
+        return found
+
+    def _ingestion(
+        self, run_id: str, recipe_id: str, number: int, files: Mapping[str, Entry], row: RunFacts | None
+    ) -> RunDirectory | ManifestHead:
+        """Return an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone.
+
+        ``row`` is what the index has of it.
+        """
+        place, name = self.runs_place.below(f"{run_id}/{recipe_id}"), name_of("manifest", number)
+        state, where = state_of(files[f"{recipe_id}/{name}"]), place.where(name)
+        if row is None or row.state != state:
+            document = read_sealed_at(place, name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
+            if document.get("data_model_version") not in READ_VERSIONS:
+                return typed(document, ManifestHead, where)
+            manifest = typed(document, Manifest, where)
+            if (manifest.run_id, manifest.recipe_id) != (run_id, recipe_id):
+                raise StoreError(
+                    f"{where}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {run_id}/{recipe_id}"
+                )
+            row = with_span(facts_of(manifest, state), place, manifest)
+        for file, wanted in row.sizes.items():
+            found = files.get(f"{recipe_id}/{file}")
+            if found is None or found.size_bytes != wanted:
+                how = "is gone" if found is None else f"has {found.size_bytes} bytes, wanted {wanted}"
+                raise StoreError(f"{place.where(file)}: {how}; ingest the log again")
+        tables = (name.removeprefix(f"runs/{run_id}/") for name in (row.segments_file, row.track_file))
+        files_state = " ".join(state_of(files[name]) for name in tables)
+        return RunDirectory(run_id, recipe_id, place, self._with_log(row, files), files_state)
+
+    def _with_log(self, row: RunFacts, files: Mapping[str, Entry]) -> RunFacts:
+        """Return what the index has of an ingestion with what is known of its log and tags now; None of a log that cannot be believed."""
+        last = {name_of(stem, number) for stem, number in numbers(files).items() if stem in ("run", "tags")}
+        state = " ".join(state_of(files[name]) for name in sorted(last))
+        if row.log is not None and row.log.state == state:
+            return row
+        try:
+            known = self.run_json(row.run_id)
+        except StoreError:
+            known = None
+        tags = known.tags if known and len(last) > 1 else row.tags
+        return replace(row, log=known_log(known, state) if known else None, tags=tags)
 
     @property
-    def index_path(self) -> Path:
-        """Directory of the index."""
-        return self.root / "index"
+    def index_place(self) -> Place:
+        """Where the index lies."""
+        return self.place.below("index")
 
     def keep_index(self, found: Ingestions) -> None:
         """Write down what was found of all runs, where that is not what the index had."""
         if found.stale:
-            write_runs(self.index_path, found.rows.values())
+            write_runs(self.index_place, found.rows.values())
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.
@@ -232,23 +276,22 @@ class Store:
         """
         damaged, proved = dict[str, str](), dict[tuple[str, str], RunFacts]()
         for run in runs:
-            names = ("segments.parquet", "track.parquet")
             try:
-                now = " ".join(file_state((run.path / name).stat()) for name in names)
-                if now != run.facts.proved:
-                    run.prove(*names)
-                    proved[run.run_id, run.recipe_id] = replace(run.facts, proved=now)
-            except (OSError, StoreError) as error:
-                damaged[run.run_id] = error.problems[0] if isinstance(error, StoreError) else f"{run.path}: {error}"
+                if run.files_state != run.facts.proved:
+                    run.prove("segments.parquet", "track.parquet")
+                    proved[run.run_id, run.recipe_id] = replace(run.facts, proved=run.files_state)
+            except StoreError as error:
+                damaged[run.run_id] = error.problems[0]
         if proved:
-            write_runs(self.index_path, {**read_runs(self.index_path), **proved}.values())
+            write_runs(self.index_place, {**read_runs(self.index_place), **proved}.values())
         return damaged
 
     def seen_logs(self) -> dict[str, list[Sighting]]:
         """Return what is remembered of all logs, by lineage; a record that the index has is not read, while its file is as it was."""
-        known, rows = read_logs(self.index_path), dict[tuple[str, str], SeenLog]()
-        for lineage, name, state in _record_files(self.records_path, "logs"):
-            row = known.get((lineage, name))
+        known, rows = read_logs(self.index_place), dict[tuple[str, str], SeenLog]()
+        for entry in self.place.below("records").entries("logs"):
+            lineage, _, name = entry.name.removesuffix(".json").rpartition("/")
+            row, state = known.get((lineage, name)), state_of(entry)
             if row is None or row.state != state:
                 sighting = self.recall(f"{lineage}/{name}", Sighting)
                 if sighting is None:
@@ -256,7 +299,7 @@ class Store:
                 row = SeenLog(lineage, name, state, sighting)
             rows[lineage, name] = row
         if _differ(rows, known):
-            write_logs(self.index_path, rows.values())
+            write_logs(self.index_place, rows.values())
         seen: dict[str, list[Sighting]] = {}
         for row in rows.values():
             seen.setdefault(row.lineage, []).append(row.sighting)
@@ -276,39 +319,29 @@ class Store:
 
     def run_ids(self) -> list[str]:
         """Return the names of all runs, finished or not."""
-        with suppress(OSError), os.scandir(self.runs_path) as entries:
-            return sorted(
-                entry.name for entry in entries if entry.is_dir() and not entry.name.startswith(TEMPORARY_PREFIX)
-            )
-        return []
+        return self.runs_place.folders()
 
-    @contextmanager
-    def claimed_run(self, stem: str, sha256: str) -> Iterator[str]:
-        """Yield the run that a recording is, by its content: the one that is here, whatever it was called, or a new one.
+    def claim_run(self, stem: str, sha256: str) -> str:
+        """Return the run that a recording is, by its content: the one that was named for it first, or a new one."""
+        if (run_id := self.run_of_content(sha256)) is None:
+            run_id = self._free_name(stem, sha256)
+            if not self.remember(f"runs/{sha256}", RunName(sha256, run_id)):
+                run_id = self.run_of_content(sha256) or run_id
+        return run_id
 
-        A new one of which nothing is written is forgotten on failure.
-        """
-        self.runs_path.mkdir(parents=True, exist_ok=True)
-        with exclusive(self.runs_path):
-            run_id = next(self._runs_of(sha256), None) or self._free_name(stem, sha256)
-            (self.runs_path / run_id).mkdir(exist_ok=True)
-        try:
-            yield run_id
-        except BaseException:
-            with suppress(OSError):
-                (self.runs_path / run_id).rmdir()
-            raise
-
-    def _runs_of(self, sha256: str) -> Iterator[str]:
-        for path in sorted(self.runs_path.glob(f"*-{sha256[:_NAME_HEX]}*")):
-            known, end = self.known_run(path.name), f"-{sha256[:_NAME_HEX]}"
-            if path.name.endswith(end) if known is None else known.source.sha256 == sha256:
-                yield path.name
+    def run_of_content(self, sha256: str) -> str | None:
+        """Return the run that was named for a recording; None where there was none."""
+        found = self.recall(f"runs/{sha256}", RunName)
+        return None if found is None else found.run_id
 
     def _free_name(self, stem: str, sha256: str) -> str:
         """Return a new run's name: as much of its hash as tells it from another recording of the same name."""
         names = [f"{stem}-{sha256[:length]}" for length in range(_NAME_HEX, len(sha256), 4)]
-        return next((name for name in names if not (self.runs_path / name).exists()), f"{stem}-{sha256}")
+        for name in names:
+            known = self.known_run(name) if self.runs_place.files(name) else None
+            if known is None or known.source.sha256 == sha256:
+                return name
+        return f"{stem}-{sha256}"
 
     def run_ids_by_hash(self) -> dict[str, list[str]]:
         """Return the names of all runs by what of their log's sha256 stands in them."""
@@ -325,24 +358,38 @@ class Store:
                 return run_id
         return None
 
-    def tag_run(self, run_id: str, tags: Mapping[str, str]) -> None:
-        """Set the tags of a run, under every recipe."""
-        for path in (
-            *(run.path / "manifest.json" for run in self.recipes_of(run_id)),
-            self.runs_path / run_id / "run.json",  # the last: who finds the tags here finds them everywhere
-        ):
-            if path.exists():
-                write_sealed(path, {**read_sealed(path), "tags": dict(tags)})
+    def tag_run(self, run_id: str, given: Mapping[str, str]) -> bool:
+        """Add tags to those of a run, under every recipe; return whether that changed any."""
+        while True:
+            number = self._last(run_id, "tags")
+            known = self.known_run(run_id)
+            before = known.tags if known is not None else self._tags(run_id, number) or {}
+            tags = Tags({**before, **given})
+            if tags.tags == before:
+                return False
+            data = to_json(sealed(tags)).encode()
+            if self.runs_place.put_new(f"{run_id}/{name_of('tags', number + 1)}", data):
+                return True
+
+    def _last(self, run_id: str, stem: str) -> int:
+        return numbers(self.runs_place.files(run_id)).get(stem, 0)
+
+    def _tags(self, run_id: str, number: int) -> Mapping[str, str] | None:
+        """Return the tags in a document; None for number 0."""
+        return read_as_at(self.runs_place, f"{run_id}/{name_of('tags', number)}", Tags).tags if number else None
 
     def run_json(self, run_id: str) -> RunJson | None:
         """Return what is known of a run's log, or None; `StoreError` if it is not as it was written, or another run's."""
-        path = self.runs_path / run_id / "run.json"
-        if not path.exists():
+        last = numbers(self.runs_place.files(run_id))
+        if not last.get("run"):
             return None
-        found = read_sealed_as(path, RunJson)
+        name = f"{run_id}/{name_of('run', last['run'])}"
+        found = read_as_at(self.runs_place, name, RunJson)
         if not is_named_after(run_id, found.source.sha256):
-            raise StoreError(f"{path}: is of another run: its log's sha256 begins with {found.source.sha256[:8]}")
-        return found
+            where = self.runs_place.where(name)
+            raise StoreError(f"{where}: is of another run: its log's sha256 begins with {found.source.sha256[:8]}")
+        tags = self._tags(run_id, last.get("tags", 0))
+        return found if tags is None else replace(found, tags=tags)
 
     def known_run(self, run_id: str) -> RunJson | None:
         """Return `run_json`; None also where it is not as it was written, which is said: the run is to be made again."""
@@ -353,55 +400,52 @@ class Store:
             return None
 
     def write_run_json(self, run_id: str, values: RunJson) -> None:
-        """Write what is known of a run's log."""
-        write_sealed(self.runs_path / run_id / "run.json", values)
-
-    @property
-    def records_path(self) -> Path:
-        """Directory of what is remembered."""
-        return self.root / "records"
+        """Write what is known of a run's log; where that is known already nothing is written."""
+        place = self.runs_place.below(run_id)
+        known = self.known_run(run_id)
+        if known is None or not _alike(known, values) or values.streams != known.streams:
+            last = self._last(run_id, "run")
+            put_next(place, "run", values, after=last, settled=lambda found: _alike(found, values))
+        self.tag_run(run_id, values.tags)
 
     def remember(self, name: str, fact: object) -> bool:
         """Remember a fact under ``<kind>/<name>`` for good; return whether it was new."""
-        return put_record(self.records_path, name, fact)
+        return put_record(self.place.below("records"), name, fact)
 
     def recall(self, name: str, cls: type[T]) -> T | None:
         """Return what is remembered under ``<kind>/<name>``, None where nothing is."""
-        return read_record(self.records_path, name, cls)
+        return read_record(self.place.below("records"), name, cls)
 
     def records(self, kind: str, cls: type[T]) -> list[T]:
         """Return everything of a kind that is remembered, by name."""
-        return list(read_records(self.records_path, kind, cls))
+        return list(read_records(self.place.below("records"), kind, cls))
 
     def sightings(self, lineage: str) -> list[Sighting]:
         """Return what is remembered of a log."""
         return self.records(lineage, Sighting)
 
-    def write_streams(self, run_id: str, streams: Streams, *, key: str) -> None:
-        """Write L1 whole or not at all; ``key`` names the read settings they were made with."""
-        with atomic_directory(self.runs_path / run_id / "streams") as directory:
-            for role, table in streams.tables.items():
-                read_with = key, streams.robot, streams.gnss_crs, streams.power_averaged
-                told = StreamInfo(*read_with, findings=streams.findings, sensor=streams.sensors[role])
-                write_table(with_metadata(table, plain(told)), directory / f"{role}.parquet")
-            write_checksums(directory)
+    def write_streams(self, run_id: str, streams: Streams, *, key: str) -> Mapping[str, Checksum]:
+        """Put L1 into the store, and return the files; ``key`` names the read settings they were made with."""
+        told: dict[str, pa.Table] = {}
+        for role, table in streams.tables.items():
+            read_with = key, streams.robot, streams.gnss_crs, streams.power_averaged
+            info = StreamInfo(*read_with, findings=streams.findings, sensor=streams.sensors[role])
+            told[role] = with_metadata(table, plain(info))
+        return put_tables(self.runs_place.below(run_id), told, folder=f"{_STREAMS}/")
 
     def read_streams(self, run_id: str, *, key: str) -> Streams | None:
         """Return L1 if it is there, whole, of this data model and made with these read settings; else None."""
-        directory = self.runs_path / run_id / "streams"
-        try:
-            listed = read_checksums(directory)
-            prove_files(directory, listed, {*listed, *(path.name for path in directory.glob("*.parquet"))})
-        except StoreError:
+        known = self.known_run(run_id)
+        if known is None or known.streams_key != key:
             return None
         tables, of = dict[str, pa.Table](), dict[str, StreamInfo]()
         try:
-            for path in sorted(directory.glob("*.parquet")):
+            for role, path in self.stream_files(run_id, known).items():
                 table = read_table(path)
-                of[path.stem] = told = typed(metadata_of(table), StreamInfo, path)
+                of[role] = told = typed(metadata_of(table), StreamInfo, path)
                 if told.key != key or told.data_model_version not in READ_VERSIONS:
                     return None
-                tables[path.stem] = table.replace_schema_metadata(None)
+                tables[role] = table.replace_schema_metadata(None)
             if not tables:
                 return None
             sensors = {role: each.sensor for role, each in of.items()}
@@ -409,68 +453,33 @@ class Store:
         except (TableError, StoreError):
             return None
 
-    def write_run(self, manifest: Manifest, *, track: Track, gated: GatedTrack, labelled: LabelledSegments) -> Path:
-        """Write one ingestion, its checksums added to the manifest; the directory appears by one rename."""
-        path = self.runs_path / manifest.run_id / manifest.recipe_id
+    def stream_files(self, run_id: str, known: RunJson) -> dict[str, Path]:
+        """Return the files of L1 on this machine by role, proved; `StoreError` if one is not as it was written."""
+        place = self.runs_place.below(run_id)
+        return {PurePosixPath(name).stem: local_file(place, name, of) for name, of in sorted(known.streams.items())}
+
+    def write_run(
+        self,
+        manifest: Manifest,
+        *,
+        track: Track,
+        gated: GatedTrack,
+        labelled: LabelledSegments,
+        settled: Callable[[Manifest], bool] = lambda _: False,
+    ) -> RunDirectory:
+        """Write one ingestion, its checksums added to the manifest; return it, or the one of others that is ``settled``."""
+        place = self.runs_place.below(f"{manifest.run_id}/{manifest.recipe_id}")
         told = {
             "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": plain(manifest.info.datum), "robot": manifest.robot,
         }  # fmt: skip
         tables = {"track": gated.table, "segments": labelled.table, "rejections": track.rejections}
-        with atomic_directory(path) as directory:
-            for name, table in tables.items():
-                write_table(with_metadata(table, told), directory / f"{name}.parquet")
-            write_sealed(directory / "manifest.json", replace(manifest, checksums=file_checksums(directory)))
-        return path
-
-
-def _ingestion(path: Path, row: RunFacts | None = None) -> RunDirectory | ManifestHead:
-    """Return an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone.
-
-    ``row`` is what the index has of it.
-    """
-    name = path / MANIFEST
-    with os.scandir(path) as entries:
-        here = {entry.name: entry.stat() for entry in entries if entry.name in (MANIFEST, *RUN_FILES)}
-    state = file_state(here[MANIFEST]) if MANIFEST in here else ""
-    if row is None or row.state != state:
-        document = read_sealed(name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
-        if document.get("data_model_version") not in READ_VERSIONS:
-            return typed(document, ManifestHead, name)
-        manifest = typed(document, Manifest, name)
-        if (manifest.run_id, manifest.recipe_id) != (path.parent.name, path.name):
-            raise StoreError(
-                f"{name}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {path.parent.name}/{path.name}"
-            )
-        row = _with_span(facts_of(manifest, state), path / "segments.parquet")
-    gone = [file for file in RUN_FILES if file not in here]
-    if gone:
-        raise StoreError(f"{path / gone[0]}: is gone; ingest the log again")
-    return RunDirectory(path.parent.name, path.name, path, _with_log(row, path.parent / RUN))
-
-
-@lru_cache(maxsize=64)
-def _manifest(path: Path, state: str) -> Manifest:  # noqa: ARG001  a file of another state is read again
-    return read_sealed_as(path, Manifest)
-
-
-def _with_span(row: RunFacts, segments: Path) -> RunFacts:
-    """Return a row with when its segments begin and end, from the statistics of their file; without where it has none."""
-    with suppress(StoreError):
-        if row.segments:
-            return replace(row, start_ns=lowest(segments, "start_ns"), end_ns=highest(segments, "end_ns"))
-    return row
-
-
-def _with_log(row: RunFacts, path: Path) -> RunFacts:
-    """Return what the index has of an ingestion with what its run.json says now; None of one that cannot be believed."""
-    try:
-        state = file_state(path.stat())
-        if row.log is not None and row.log.state == state:
-            return row
-        known = known_log(read_sealed_as(path, RunJson), state)
-    except (OSError, StoreError):
-        known = None
-    return replace(row, log=known if known and is_named_after(row.run_id, known.source.sha256) else None)
+        whole = next((run for run in self.recipes_of(manifest.run_id) if run.recipe_id == manifest.recipe_id), None)
+        if whole is not None and settled(whole.manifest):
+            return whole
+        checksums = put_tables(place, {name: with_metadata(table, told) for name, table in tables.items()})
+        after = numbers(place.files()).get("manifest", 0)
+        put_next(place, "manifest", replace(manifest, checksums=checksums), after=after, settled=settled)
+        return next(run for run in self.recipes_of(manifest.run_id) if run.recipe_id == manifest.recipe_id)
 
 
 def _differ(rows: Mapping[tuple[str, str], object], known: Mapping[tuple[str, str], object]) -> bool:
@@ -478,14 +487,20 @@ def _differ(rows: Mapping[tuple[str, str], object], known: Mapping[tuple[str, st
     return rows != known and {key: as_stored(row) for key, row in rows.items()} != known
 
 
-def _record_files(root: Path, kind: str) -> Iterator[tuple[str, str, str]]:
-    """Yield the directory, name and state of every record that lies in a directory of a kind."""
-    with suppress(OSError), os.scandir(root / kind) as directories:
-        for directory in sorted((entry for entry in directories if entry.is_dir()), key=lambda entry: entry.name):
-            with os.scandir(directory.path) as entries:
-                for entry in sorted(entries, key=lambda entry: entry.name):
-                    if entry.name.endswith(".json") and not entry.name.startswith(TEMPORARY_PREFIX):
-                        yield f"{kind}/{directory.name}", entry.name.removesuffix(".json"), file_state(entry.stat())
+def _alike(one: RunJson, other: RunJson) -> bool:
+    """Tell whether two documents say the same of a log; what was computed may differ in the last bit on another processor, tags later."""
+    bare = RunJson(one.source).findings
+    return replace(one, streams={}, findings=bare, tags={}) == replace(other, streams={}, findings=bare, tags={})
+
+
+def _manifests(names: Iterable[str]) -> dict[str, int]:
+    """Return the number of the last manifest of each recipe among the names of a run's files."""
+    found: dict[str, int] = {}
+    for recipe, _, name in (name.partition("/") for name in names):
+        numbered = stem_and_number(name)
+        if numbered and numbered[0] == "manifest":
+            found[recipe] = max(numbered[1], found.get(recipe, 0))
+    return dict(sorted(found.items()))
 
 
 def add_by_hash(runs: dict[str, list[str]], run_id: str) -> None:
@@ -499,12 +514,20 @@ def is_named_after(run_id: str, sha256: str) -> bool:
     return name is None or sha256.startswith(name[1])
 
 
-def is_store(path: Path) -> bool:
-    """Tell whether a directory is a store: it holds runs, maps or records."""
-    return any(next(path.glob(pattern), None) for pattern in _SIGNS)
+def is_store(path: Path | str) -> bool:
+    """Tell whether a place is a store; `UsageError` if it is one of an earlier layout."""
+    place = open_place(path)
+    if place.size(MARK) is not None:
+        return True
+    if is_outdated(place):
+        raise UsageError(
+            f"{place.where()}: is a store of an earlier data model, or of which not all was copied (it has no {MARK}); "
+            f"'tcpipe migrate {place.where()}' brings it to data model {DATA_MODEL_VERSION}"
+        )
+    return False
 
 
-def run_at(path: Path) -> tuple[Store, list[RunDirectory]] | None:
+def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     """Return the store and the finished ingestions of a run's directory, or the one of a recipe's; None for any other path.
 
     Raises
@@ -512,39 +535,62 @@ def run_at(path: Path) -> tuple[Store, list[RunDirectory]] | None:
     StoreError
         It is a run's, but holds no finished ingestion of this data-model version.
     """
-    real = path.resolve()
-    for run_path in (real, real.parent):
-        if run_path.parent.name == "runs" and (run_path / "run.json").is_file():
-            store = Store(run_path.parent.parent)
-            found = store.ingestions(run_path.name)
-            runs = [run for run in found.finished if real in (run_path, run.path)]
-            if damaged := [line for path, line in found.damaged.items() if real in (run_path, path)]:
-                raise StoreError(*damaged)
-            if not runs:
-                raise StoreError(
-                    f"{path}: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again"
-                )
-            return store, runs
-    return None
+    inside = inside_store(path)
+    if inside is None:
+        return None
+    store, run_id, recipe_id = inside
+    found = store.ingestions(run_id)
+    runs = [run for run in found.finished if recipe_id in (None, run.recipe_id)]
+    if damaged := [line for (_, recipe), line in found.damaged.items() if recipe_id in (None, recipe)]:
+        raise StoreError(*damaged)
+    if not runs:
+        raise StoreError(
+            f"{path}: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again"
+        )
+    return store, runs
+
+
+def inside_store(path: Path | str) -> tuple[Store, str, str | None] | None:
+    """Return of ``STORE/runs/<run_id>[/<recipe_id>]`` the store, the run and the recipe; None for any other path."""
+    text = str(path).rstrip("/") if is_url(path) else str(Path(path).resolve())
+    found = re.fullmatch(r"(.+)/runs/([^/]+)(?:/([^/]+))?", text)
+    if found is None or not is_store(found[1]):
+        return None
+    store = Store(found[1] if is_url(path) else Path(found[1]))
+    return (store, found[2], found[3]) if store.runs_place.files(found[2]) else None
 
 
 def open_store(root: str | Path, *, create: bool = False) -> Store:
-    """Return the store at ``root``; `StoreError` if it is no directory, is missing (unless ``create``) or cannot be written."""
-    path = local_output(root)
+    """Return the store at a path or URL.
+
+    Raises
+    ------
+    UsageError
+        It is missing (unless ``create``), a file, or of an earlier layout.
+    StoreError
+        It cannot be reached or written, or is of a data model that this version does not know.
+    """
+    root = str(root).rstrip("/") if is_url(root) else local_output(root)
+    if isinstance(root, str) and not root.startswith(_BUCKETS):
+        raise UsageError(f"{root}: no store can lie there; wanted a directory, s3://, gs:// or az://")
+    store = Store(root)
+    if isinstance(root, Path):
+        _refuse_file(root, create=create)
+    else:
+        store.place.check()
+    found = is_store(root)
+    if not found and not create and not isinstance(root, Path):
+        raise UsageError(f"{root}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
+    if found and (version := layout_of(store.place)) not in READ_VERSIONS:
+        raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
+    if create:
+        mark_store(store.place, found=found)
+        store.clear()
+    return store
+
+
+def _refuse_file(path: Path, *, create: bool) -> None:
     if path.exists() and not path.is_dir():
         raise UsageError(f"{path}: is a file, wanted a directory for the store")
     if not path.exists() and not create:
         raise UsageError(f"{path}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
-    if create:
-        try:
-            path.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryFile(dir=path, prefix=TEMPORARY_PREFIX):
-                pass
-        except OSError as error:
-            raise StoreError(
-                f"{path}: the store cannot be written ({error.strerror}); name another with --store"
-            ) from None
-    store = Store(path)
-    if create:
-        store.clear()
-    return store

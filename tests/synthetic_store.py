@@ -12,7 +12,7 @@ from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, PowerSign, RunFacts
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -143,13 +143,18 @@ def add_world(store, directory: Path, *, name="site", layers=("ortho", "terrain"
     directory.mkdir(parents=True, exist_ok=True)
     rasters = WORLD.write(directory, pitch_m=0.1)
     optional = {layer: rasters[layer] for layer in layers}
-    build_map(store.map_path(name), name=name, height=rasters["height"], **optional)
+    put_map(store, name, height=rasters["height"], **optional)
+
+
+def put_map(store, name, **how):
+    """Put a map into the store, over one that is there, without a quick look."""
+    with store.new_map(name, after=store.map_number(name)) as path:
+        build_map(path, name=name, **how)
 
 
 def small_store(directory: Path) -> Store:
     """Two runs of 8 lanes each, 448 segments, on the 40 m world."""
-    store = Store(directory / "store")
-    store.root.mkdir(parents=True)
+    store = open_store(directory / "store", create=True)
     add_world(store, directory / "rasters")
     for run_id, first in (("north", 1.0), ("south", -15.5)):
         start, end = lanes(first + 2.0 * np.arange(8), -14.0, 14.0)

@@ -150,7 +150,7 @@ def ingest(
             on_result=on_result,
         )
     if as_json:
-        made = summary.store if summary.store.is_dir() else None
+        made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
     else:
         _print_sum(summary)

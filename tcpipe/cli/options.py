@@ -21,11 +21,12 @@ class Place(click.ParamType[str]):
         self._check = check
         self.written = written
         """Whether the command writes there."""
-        self._urls = urls
+        self.urls = urls
+        """Whether it may be a URL."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:  # noqa: ARG002  click's signature
         """Return the text as it was given."""
-        if not (self._urls and "://" in value):
+        if not (self.urls and "://" in value):
             self._check(value)
         return value
 
@@ -62,9 +63,9 @@ OUTPUT_FILE = Place(places.output_file, written=True)
 INPUT_FILE = Place(places.input_file)
 INPUT_DIRECTORY = Place(places.input_directory)
 SEALED = Place(places.input_directory, urls=True)
-"""A dataset or a model, here or in a bucket."""
+"""A dataset, a model, a store or a run, here or in a bucket."""
 PUBLISHED = Place(places.output_directory, written=True, urls=True)
-"""Where a dataset or a model is written, here or in a bucket."""
+"""Where a dataset, a model or a store is written, here or in a bucket."""
 LOG = Place(places.input_path, urls=True)
 """A log, here or in object storage."""
 ONE_OF_SEVERAL = Place(str)
@@ -76,8 +77,8 @@ store_option = click.option(
     envvar="TCPIPE_STORE",
     default="tcpipe-store",
     show_default=True,
-    type=OUTPUT_DIRECTORY,
-    metavar="DIR",
+    type=PUBLISHED,
+    metavar="DIR|URL",
     help="Where runs and maps are kept (or TCPIPE_STORE).",
 )
 """``--store``, or TCPIPE_STORE, or ./tcpipe-store."""

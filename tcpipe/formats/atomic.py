@@ -17,7 +17,6 @@ import time
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe.errors import StoreError
@@ -62,52 +61,20 @@ def atomic_file(path: Path) -> Iterator[Path]:
         _sync_directory(place.parent)
 
 
-@dataclass(frozen=True, slots=True)
-class PlaceState:
-    """What lies at a place: enough to tell whether another process has put something else there."""
-
-    inode_and_time: tuple[int, int] | None
-
-
-def place_state(path: Path) -> PlaceState:
-    """Return what lies at ``path`` now."""
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return PlaceState(None)
-    return PlaceState((found.st_ino, found.st_mtime_ns))
-
-
 @contextmanager
-def atomic_directory(path: Path, *, instead_of: PlaceState | None = None) -> Iterator[Path]:
+def atomic_directory(path: Path) -> Iterator[Path]:
     """Yield a temporary directory; on success it takes the place of ``path`` (an old one goes), on failure it is removed.
-
-    With ``instead_of`` it takes the place of that alone: what another process has put there since stays.
 
     Raises
     ------
     StoreError
-        The place cannot be written, or holds something else by now.
+        The place cannot be written.
     """
     with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
         temporary = holder / place.name
         temporary.mkdir()
         yield temporary
-        for directory, _, files in os.walk(temporary):
-            for name in files:
-                with (Path(directory) / name).open("rb") as stream:
-                    os.fsync(stream.fileno())
-        with exclusive(place.parent):
-            if instead_of not in {None, place_state(place)}:
-                raise StoreError(f"{path}: another process has written it meanwhile, and it stays; look at it first")
-            _take_place(temporary, place)
-        _sync_directory(place.parent)
-
-
-def remove_directory(path: Path) -> None:
-    """Remove a directory whole or not at all: it goes from its place in one step; `StoreError` where it cannot."""
-    with _told(path), _holder_beside(path) as holder:
-        path.rename(holder / path.name)
+        _put_synced(temporary, place)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -159,13 +126,17 @@ def working_directory(staging: Path) -> Iterator[Path]:
 def put_directory(directory: Path, path: Path) -> None:
     """Put a directory, from a `working_directory` of the same file system, to its place by one rename; what is there goes."""
     with _told(path), _parents_of(path) as place:
-        for above, _, files in os.walk(directory):
-            for name in files:
-                with (Path(above) / name).open("rb") as stream:
-                    os.fsync(stream.fileno())
-        with exclusive(place.parent):
-            _take_place(directory, place, before="old")
-        _sync_directory(place.parent)
+        _put_synced(directory, place, before="old")
+
+
+def _put_synced(directory: Path, place: Path, before: str = _BEFORE) -> None:
+    for above, _, files in os.walk(directory):
+        for name in files:
+            with (Path(above) / name).open("rb") as stream:
+                os.fsync(stream.fileno())
+    with exclusive(place.parent):
+        _take_place(directory, place, before)
+    _sync_directory(place.parent)
 
 
 def _write_synced(descriptor: int, data: bytes) -> None:
@@ -324,7 +295,7 @@ def _claimed(holder: Path, act: Callable[[], object]) -> bool:
     return False
 
 
-def _take_place(temporary: Path, place: Path, before: str = _BEFORE) -> None:
+def _take_place(temporary: Path, place: Path, before: str) -> None:
     """Rename ``temporary`` to ``place``; if something is there they change places, in one step where the system can."""
     if not place.exists():
         try:

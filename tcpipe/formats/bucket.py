@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import os
+import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
@@ -20,11 +21,15 @@ from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.seals import Checksum
 
 if TYPE_CHECKING:
+    from obstore import ListResult, ObjectMeta
     from obstore.store import ObjectStore
 
 _PIECE_BYTES = 1 << 24
-_UPLOADS = 8
+_AT_ONCE = 8
 """Files that are on their way at once."""
+
+_TREES: dict[str, tempfile.TemporaryDirectory[str]] = {}
+"""They go when this process ends."""
 
 _SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
 
@@ -98,12 +103,18 @@ class BucketPlace:
 
     def folders(self, prefix: str = "") -> list[str]:
         """Return the first parts of names of more parts below ``prefix/``."""
+        return sorted(name.rpartition("/")[2] for name in self._in(prefix)["common_prefixes"])
+
+    def files(self, prefix: str = "") -> list[str]:
+        """Return the names of one part below ``prefix/``."""
+        return sorted(meta["path"].rpartition("/")[2] for meta in self._in(prefix)["objects"])
+
+    def _in(self, prefix: str) -> ListResult[Sequence[ObjectMeta]]:
         import obstore  # noqa: PLC0415
 
         store, key = self._store(prefix)
         with told(self.where(prefix), StoreError):
-            found = obstore.list_with_delimiter(store, prefix=key or None)["common_prefixes"]
-        return sorted(name.rpartition("/")[2] for name in found)
+            return obstore.list_with_delimiter(store, prefix=key or None)
 
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write an object."""
@@ -142,8 +153,18 @@ class BucketPlace:
                 obstore.put(store, key, path)
 
         files = sorted(path for path in directory.rglob("*") if path.is_file())
-        with ThreadPoolExecutor(_UPLOADS) as pool:
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
             list(pool.map(upload, files))
+
+    def checksum(self, name: str) -> Checksum | None:
+        """Return size and sha256 of an object."""
+        if self.size(name) is None:
+            return None
+        size, digest = 0, hashlib.sha256()
+        for piece in self.pieces(name):
+            size += len(piece)
+            digest.update(piece)
+        return Checksum(size, digest.hexdigest())
 
     def delete(self, name: str) -> None:
         """Remove an object."""
@@ -168,6 +189,26 @@ class BucketPlace:
                 )
 
         return cached(checksum.sha256, fetch)
+
+    def tree(self, checksums: Mapping[str, Checksum]) -> Path:
+        """Return a temporary directory of links into the cache: what goes from the cache while it is used stays here."""
+        key = f"{self.url} {sorted((name, of.sha256) for name, of in checksums.items())}"
+        if key not in _TREES:
+            made = tempfile.TemporaryDirectory(prefix="tcpipe-")
+
+            def link(name: str) -> None:
+                path = Path(made.name, name)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                copy = self.local(name, checksums[name])
+                try:
+                    path.hardlink_to(copy)
+                except OSError:  # another file system
+                    shutil.copyfile(copy, path)
+
+            with ThreadPoolExecutor(_AT_ONCE) as pool:
+                list(pool.map(link, checksums))
+            _TREES[key] = made
+        return Path(_TREES[key].name)
 
     def pieces(self, name: str) -> Iterator[bytes]:
         """Yield an object piece by piece; `StoreError` where there is none."""

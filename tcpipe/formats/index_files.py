@@ -8,18 +8,18 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass, field, fields
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import is_text, plain, recast, typed
-from tcpipe.formats.parquet import read_table, write_table
+from tcpipe.formats.parquet import parquet_of, write_table
+from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
 from tcpipe.tables.findings import EnergyBudget
@@ -31,7 +31,7 @@ logger = logging.getLogger("tcpipe")
 RUNS, LOGS = "runs.parquet", "logs.parquet"
 
 _ABOUT = b"tcpipe_index"
-_VERSION = b"1"
+_VERSION = b"2"
 """Of these tables: those of another are made again."""
 
 
@@ -46,7 +46,7 @@ class KnownSensor:
 
 @dataclass(frozen=True, slots=True)
 class KnownLog:
-    """What a run's run.json says of its log, and the state of that file."""
+    """What is known of a run's log, and the state of the documents that say so."""
 
     state: str
     source: LogOrigin
@@ -62,7 +62,7 @@ class RunFacts:
     run_id: str
     recipe_id: str
     state: str
-    """Of the manifest's file."""
+    """Of the manifest."""
     data_model_version: str
     tcpipe_version: str
     ingest_key: str
@@ -84,12 +84,14 @@ class RunFacts:
     proved: str = ""
     """The state of segments and track when their bytes were compared with the manifest; "" if they never were."""
     log: KnownLog | None = None
-    """None where run.json is gone or not as it was written."""
+    """None where the document of the log is gone or not as it was written."""
     superseded_by: str | None = None
     """The run that took the place of this one."""
     segments_file: str = ""
     """Where the segments lie in the store."""
     track_file: str = ""
+    sizes: Mapping[str, int] = field(default_factory=dict)
+    """How large the files of the manifest are [byte], by their name beside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +104,17 @@ class SeenLog:
     sighting: Sighting
 
 
-def file_state(found: os.stat_result) -> str:
-    """Return what tells a file from one that was written since: size, time of writing, inode."""
-    return f"{found.st_size}-{found.st_mtime_ns}-{found.st_ino}"
+def state_of(entry: Entry) -> str:
+    """Return what tells a file from one that was written since: name, size, time of writing."""
+    return f"{PurePosixPath(entry.name).name}-{entry.size_bytes}-{entry.modified_ns}"
 
 
 def facts_of(manifest: Manifest, state: str) -> RunFacts:
     """Return what the index holds of a manifest."""
     label, place = manifest.info.findings.facts.label, f"runs/{manifest.run_id}/{manifest.recipe_id}"
+    named = {PurePosixPath(name).name: name for name in manifest.checksums}
+    if gone := [name for name in ("segments.parquet", "track.parquet", "rejections.parquet") if name not in named]:
+        raise StoreError(f"{place}: its manifest lists no {gone[0]}; ingest the log again")
     return RunFacts(
         run_id=manifest.run_id,
         recipe_id=manifest.recipe_id,
@@ -127,14 +132,15 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
         warnings=manifest.warnings,
         damage=manifest.damage,
         energy_budget=None if label is None else label.energy_budget,
-        segments_sha256=manifest.checksums["segments.parquet"].sha256 if manifest.checksums else "",
-        segments_file=f"{place}/segments.parquet",
-        track_file=f"{place}/track.parquet",
+        segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,
+        segments_file=f"{place}/{named['segments.parquet']}",
+        track_file=f"{place}/{named['track.parquet']}",
+        sizes={name: of.size_bytes for name, of in manifest.checksums.items()},
     )
 
 
 def known_log(known: RunJson, state: str) -> KnownLog:
-    """Return what the index holds of a run.json."""
+    """Return what the index holds of what is known of a log."""
     sensors = {role: recast(sensor, KnownSensor) for role, sensor in known.sensors.items()}
     return KnownLog(state, known.source, known.tags, sensors)
 
@@ -165,7 +171,7 @@ _RUN_SCHEMA = pa.schema({
         "state": _TEXT, "source": pa.struct({"paths": _TEXTS, "sha256": _TEXT, "size_bytes": pa.int64()}), "tags": pa.map_(_TEXT, _TEXT),
         "sensors": pa.map_(_TEXT, pa.struct({"topic": _TEXT, "type_name": _TEXT, "frame_id": _TEXT})),
     }),
-    "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT,
+    "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT, "sizes": pa.map_(_TEXT, pa.int64()),
 })  # fmt: skip
 _LOG_SCHEMA = pa.schema({
     "lineage": _TEXT, "name": _TEXT, "state": _TEXT,
@@ -173,45 +179,47 @@ _LOG_SCHEMA = pa.schema({
 })  # fmt: skip
 
 
-def read_runs(directory: Path) -> dict[tuple[str, str], RunFacts]:
+def read_runs(place: Place) -> dict[tuple[str, str], RunFacts]:
     """Return the rows of ``runs.parquet``, by run and recipe; none where there is no such index, or it cannot be read."""
-    return {(row.run_id, row.recipe_id): row for row in _rows(directory / RUNS, RunFacts)}
+    return {(row.run_id, row.recipe_id): row for row in _rows(place, RUNS, RunFacts)}
 
 
-def read_logs(directory: Path) -> dict[tuple[str, str], SeenLog]:
+def read_logs(place: Place) -> dict[tuple[str, str], SeenLog]:
     """Return the rows of ``logs.parquet``, by lineage and record; none where there is no such index, or it cannot be read."""
-    return {(row.lineage, row.name): row for row in _rows(directory / LOGS, SeenLog)}
+    return {(row.lineage, row.name): row for row in _rows(place, LOGS, SeenLog)}
 
 
-def write_runs(directory: Path, rows: Iterable[RunFacts]) -> None:
+def write_runs(place: Place, rows: Iterable[RunFacts]) -> None:
     """Write ``runs.parquet``, unless that cannot be: the next call does without."""
-    _write(directory / RUNS, list(rows), _RUN_SCHEMA)
+    _write(place, RUNS, list(rows), _RUN_SCHEMA)
 
 
-def write_logs(directory: Path, rows: Iterable[SeenLog]) -> None:
+def write_logs(place: Place, rows: Iterable[SeenLog]) -> None:
     """Write ``logs.parquet``, unless that cannot be."""
-    _write(directory / LOGS, list(rows), _LOG_SCHEMA)
+    _write(place, LOGS, list(rows), _LOG_SCHEMA)
 
 
-def _rows(path: Path, cls: type[T]) -> list[T]:
-    if not path.is_file():
-        return []
+def _rows(place: Place, name: str, cls: type[T]) -> list[T]:
     try:
-        table = read_table(path)
+        data = place.read(name)
+        if data is None:
+            return []
+        table = parquet_of(data, place.where(name))
         if (table.schema.metadata or {}).get(_ABOUT) != _VERSION:
             return []
-        return typed(table.to_pylist(maps_as_pydicts="strict"), list[cls], path)  # type: ignore[valid-type]
+        return typed(table.to_pylist(maps_as_pydicts="strict"), list[cls], place.where(name))  # type: ignore[valid-type]
     except (StoreError, ValueError, pa.ArrowException):
-        logger.info("%s: the index of the store is not readable; it is made again", path)
+        logger.info("%s: the index of the store is not readable; it is made again", place.where(name))
         return []
 
 
-def _write(path: Path, rows: Sequence[object], schema: pa.Schema) -> None:
+def _write(place: Place, name: str, rows: Sequence[object], schema: pa.Schema) -> None:
     values = [plain(as_stored(row)) for row in rows]
     columns = [_column([row[field.name] for row in values], field.type) for field in schema]
     table = pa.table(columns, schema=schema.with_metadata({_ABOUT: _VERSION}))
-    with suppress(StoreError):
-        write_table(table, path)
+    with suppress(StoreError), place.workshop() as directory:
+        write_table(table, directory / name)
+        place.put(name, (directory / name).read_bytes())
 
 
 def _column(values: list[object], of: pa.DataType) -> pa.Array:

@@ -101,7 +101,7 @@ def read_document(path: Path) -> bytes:
     return data
 
 
-def parse_json(data: bytes, path: Path) -> dict[str, Json]:
+def parse_json(data: bytes, path: Path | str) -> dict[str, Json]:
     """Return the object in the bytes of a file; `StoreError` if it holds none."""
     try:
         found = json.loads(data.decode("utf-8"))
@@ -119,7 +119,7 @@ def read_as(path: Path, cls: type[T]) -> T:
     return typed(read_json(path), cls, path)
 
 
-def typed(value: object, cls: type[T], path: Path) -> T:
+def typed(value: object, cls: type[T], path: Path | str) -> T:
     """Return a JSON object as a dataclass: a key that it lacks is its default, one that the dataclass lacks is left aside.
 
     Raises

@@ -65,6 +65,14 @@ def _with_a_member(of: pa.DataType) -> pa.DataType:
     return pa.list_(_with_a_member(of.value_type)) if pa.types.is_list(of) else of
 
 
+def parquet_of(data: bytes, where: str) -> pa.Table:
+    """Return the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
+    try:
+        return pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
+    except (OSError, pa.ArrowException) as error:
+        raise StoreError(f"{where}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
+
+
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Read a Parquet file with its schema metadata; `StoreError` names a file that cannot be read."""
     try:

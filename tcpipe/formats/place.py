@@ -12,7 +12,7 @@ Nothing appears before it is whole, and on disk before it is synced.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -34,6 +34,9 @@ class Entry:
 
 class Place(Protocol):
     """A directory or a prefix of a bucket; every method raises `StoreError`, in one line, where it cannot be read or written."""
+
+    def __hash__(self) -> int:
+        """Return a hash: places of one name are one."""
 
     def where(self, name: str = "") -> str:
         """Return how a user would name a file here: a path or a URL."""
@@ -59,6 +62,9 @@ class Place(Protocol):
     def folders(self, prefix: str = "") -> list[str]:
         """Return the first parts of all names of more parts below ``prefix/``, sorted: the folders that lie there."""
 
+    def files(self, prefix: str = "") -> list[str]:
+        """Return the names of one part below ``prefix/``, sorted: the files that lie there, not those in its folders."""
+
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write a file, in the place of what is there; without ``lasting`` it is not synced, and may be half there after a kill."""
 
@@ -71,11 +77,17 @@ class Place(Protocol):
     def put_files(self, prefix: str, directory: Path) -> None:
         """Put the files of a directory in a `workshop` below ``prefix/``, which is named after their content; the directory is used up."""
 
+    def checksum(self, name: str) -> Checksum | None:
+        """Return size and sha256 of a file, every byte read where it lies; None where there is none."""
+
     def delete(self, name: str) -> None:
         """Remove a file; where there is none nothing happens."""
 
     def local(self, name: str, checksum: Checksum) -> Path:
         """Return a file of this machine with the content of ``name``: itself, or a copy in the cache by content."""
+
+    def tree(self, checksums: Mapping[str, Checksum]) -> Path:
+        """Return a directory of this machine in which these files lie under their names, as long as this process lives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,9 +136,16 @@ class DirectoryPlace:
 
     def folders(self, prefix: str = "") -> list[str]:
         """Return the names of the directories in ``prefix``."""
+        return [entry.name for entry in self._in(prefix) if entry.is_dir()]
+
+    def files(self, prefix: str = "") -> list[str]:
+        """Return the names of the files in ``prefix``."""
+        return [entry.name for entry in self._in(prefix) if not entry.is_dir()]
+
+    def _in(self, prefix: str) -> list[os.DirEntry[str]]:
         with _told(self.where(prefix), "read"), suppress(FileNotFoundError, NotADirectoryError):
-            found = (entry.name for entry in os.scandir(self._path(prefix)) if entry.is_dir())
-            return sorted(name for name in found if not name.startswith(TEMPORARY_PREFIX))
+            found = sorted(os.scandir(self._path(prefix)), key=lambda entry: entry.name)
+            return [entry for entry in found if not entry.name.startswith(TEMPORARY_PREFIX)]
         return []
 
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
@@ -150,6 +169,12 @@ class DirectoryPlace:
         """Put the directory there by one rename."""
         put_directory(directory, self._path(prefix))
 
+    def checksum(self, name: str) -> Checksum | None:
+        """Return size and sha256 of a file."""
+        path = self._path(name)
+        with _told(self.where(name), "read"):
+            return file_checksum(path) if path.is_file() else None
+
     def delete(self, name: str) -> None:
         """Remove a file, and the directories above it that it leaves empty."""
         path = self._path(name)
@@ -157,7 +182,7 @@ class DirectoryPlace:
             path.unlink()
         with suppress(OSError):
             for parent in path.parents:
-                if parent == self.root:
+                if parent == (self.staging or self.root):
                     break
                 parent.rmdir()
 
@@ -165,6 +190,11 @@ class DirectoryPlace:
         """Return the file itself."""
         del checksum
         return self._path(name)
+
+    def tree(self, checksums: Mapping[str, Checksum]) -> Path:
+        """Return the directory itself."""
+        del checksums
+        return self.root
 
     def clear(self) -> None:
         """Remove what killed writers left as temporaries."""
@@ -179,11 +209,6 @@ class DirectoryPlace:
         staging = self.staging or self.root
         staging.mkdir(parents=True, exist_ok=True)
         return staging
-
-
-def checksums_of(directory: Path) -> dict[str, Checksum]:
-    """Return size and sha256 of every file below a directory of this machine, by its name in it."""
-    return {entry.name: file_checksum(directory / entry.name) for entry in DirectoryPlace(directory).entries()}
 
 
 def _walked(directory: Path, prefix: str) -> Iterator[Entry]:

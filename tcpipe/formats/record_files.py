@@ -9,13 +9,12 @@ import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
-from pathlib import Path
 from typing import TypeVar
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, put_file
-from tcpipe.formats.json_files import to_json
-from tcpipe.formats.seals import read_sealed_as, sealed, write_sealed
+from tcpipe.formats.json_files import to_json, typed
+from tcpipe.formats.place import Place
+from tcpipe.formats.seals import proved, sealed
 
 T = TypeVar("T")
 
@@ -92,13 +91,21 @@ class DatasetMade:
     """Runs and their recipes."""
 
 
+@dataclass(frozen=True, slots=True)
+class RunName:
+    """What the run of a content is called; the first that names it is right."""
+
+    sha256: str
+    run_id: str
+
+
 def record_name(digest: str) -> str:
     """Return the name of the record of a fact whose digest (hex) this is."""
     return digest[:_NAME_DIGITS]
 
 
-def put_record(root: Path, name: str, value: object) -> bool:
-    """Write a record, a dataclass, below ``root`` unless it is there already, whole; return whether this call did.
+def put_record(place: Place, name: str, value: object) -> bool:
+    """Write a record, a dataclass, unless it is there already, whole; return whether this call did.
 
     Raises
     ------
@@ -106,34 +113,33 @@ def put_record(root: Path, name: str, value: object) -> bool:
         It cannot be written.
 
     """
-    path = root / f"{name}.json"
-    clear(root)
-    if read_record(root, name, type(value)) is not None:
+    if read_record(place, name, type(value)) is not None:
         return False
-    if put_file(path, to_json(sealed(value)).encode(), staging=root):
+    data = to_json(sealed(value)).encode()
+    if place.put_new(f"{name}.json", data):
         return True
-    if read_record(root, name, type(value)) is not None:  # another process was faster
+    if read_record(place, name, type(value)) is not None:  # another process was faster
         return False
-    write_sealed(path, value)
+    place.put(f"{name}.json", data)
     return True
 
 
-def read_record(root: Path, name: str, cls: type[T]) -> T | None:
+def read_record(place: Place, name: str, cls: type[T]) -> T | None:
     """Return a record; None where there is none, and where it is not as it was written, which is said."""
-    path = root / f"{name}.json"
-    return _whole(path, cls) if path.is_file() else None
+    data = place.read(f"{name}.json")
+    return None if data is None else _whole(data, place.where(f"{name}.json"), cls)
 
 
-def read_records(root: Path, kind: str, cls: type[T]) -> Iterator[T]:
-    """Yield the records in a directory below ``root``, by name; those that are not as they were written are named and left out."""
-    for path in sorted((root / kind).glob("*.json")):
-        if not path.name.startswith(TEMPORARY_PREFIX) and (found := _whole(path, cls)) is not None:
+def read_records(place: Place, kind: str, cls: type[T]) -> Iterator[T]:
+    """Yield the records of a kind, by name; those that are not as they were written are named and left out."""
+    for name in place.files(kind):
+        if name.endswith(".json") and (found := read_record(place, f"{kind}/{name.removesuffix('.json')}", cls)):
             yield found
 
 
-def _whole(path: Path, cls: type[T]) -> T | None:
+def _whole(data: bytes, where: str, cls: type[T]) -> T | None:
     try:
-        return read_sealed_as(path, cls)
+        return typed(proved(data, where), cls, where)
     except StoreError as error:
         logger.error("%s; this record is ignored", error)  # noqa: TRY400  one line
         return None

@@ -49,6 +49,34 @@ class RunJson:
     message_definitions: str = ""
     """Hash of the definitions that were given for types which the log does not define; "" without."""
     findings: Findings[RunFacts] = NOTHING_FOUND
+    streams: Mapping[str, Checksum] = field(default_factory=dict)
+    """The tables of what was read, by their name beside this document."""
+    streams_key: str = ""
+    """Names the read settings that they were made with."""
+
+
+@dataclass(frozen=True, slots=True)
+class Tags:
+    """A run's tags, where they were changed since it was ingested."""
+
+    tags: Mapping[str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class MapDocument:
+    """A map: where it lies, and its files; all names begin in the store's folder of maps."""
+
+    data_model_version: str
+    zarr: str
+    picture: str
+    checksums: Mapping[str, Checksum]
+
+
+@dataclass(frozen=True, slots=True)
+class StoreDocument:
+    """That a place is a store, and of which layout."""
+
+    data_model_version: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +117,7 @@ class Manifest:
     robot_requested: str | None = None
     message_definitions: str = ""
     checksums: Mapping[str, Checksum] = field(default_factory=dict)
+    """The tables, by their name beside this document."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -77,12 +77,18 @@ def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lamb
         It cannot be read, or is not as it was written.
 
     """
-    data = read_document(path)
-    found = parse_json(data, path)
+    return proved(read_document(path), path, ours=ours)
+
+
+def proved(
+    data: bytes, where: Path | str, *, ours: Callable[[Mapping[str, Json]], bool] = lambda _: True
+) -> dict[str, Json]:
+    """Return the JSON object in the bytes of a document that lies at ``where``, proved; as `read_sealed`."""
+    found = parse_json(data, where)
     if not ours(found):
         return found
     if not _document_is_whole(data):
-        raise StoreError(f"{broken(path)}{_TELLS.format(path.parent)}")
+        raise StoreError(f"{broken(where)}{_TELLS.format(str(where).rpartition('/')[0])}")
     return found
 
 
@@ -115,7 +121,7 @@ def sealed_page(html: str) -> str:
     return text + _PAGE_SEAL.format(hashlib.sha256(text.encode()).hexdigest())
 
 
-def broken(path: Path) -> str:
+def broken(path: Path | str) -> str:
     """Return the line about a file that is not what its seal or its checksum says."""
     return f"{path}: is not as it was written: its checksum does not agree"
 
@@ -123,11 +129,17 @@ def broken(path: Path) -> str:
 def broken_seal(path: Path) -> str | None:
     """Return in one line why a sealed file (``.json``, ``.html``) or a ``.png`` is not as it was written, None if it is."""
     try:
-        data = path.read_bytes()
+        return broken_seal_in(path.read_bytes(), path)
     except OSError as error:
         return f"{path}: cannot be read ({error.strerror})"
-    whole = {".html": _page_is_whole, ".png": _png_is_whole}.get(path.suffix, _document_is_whole)
-    return None if whole(data) else broken(path)
+
+
+def broken_seal_in(data: bytes | None, where: Path | str) -> str | None:
+    """Return the same of the bytes of a file that lies at ``where``; None: it is not there."""
+    if data is None:
+        return f"{where}: is gone"
+    whole = {".html": _page_is_whole, ".png": _png_is_whole}.get(Path(where).suffix, _document_is_whole)
+    return None if whole(data) else broken(where)
 
 
 def broken_checksums(directory: Path, checksums: Mapping[str, Checksum | None]) -> Iterator[str]:
@@ -142,15 +154,20 @@ def broken_checksums(directory: Path, checksums: Mapping[str, Checksum | None]) 
         except OSError as error:
             yield f"{path}: cannot be read ({error.strerror})"
             continue
-        if wanted is None:
-            yield f"{path}: its sha256 is not on record"
-        elif found != wanted:
-            size = (
-                ""
-                if found.size_bytes == wanted.size_bytes
-                else f" ({found.size_bytes} bytes, wanted {wanted.size_bytes})"
-            )
-            yield f"{path}: its sha256 is {found.sha256[:12]}…, wanted {wanted.sha256[:12]}…{size}"
+        if wrong := wrong_checksum(path, found, wanted):
+            yield wrong
+
+
+def wrong_checksum(where: Path | str, found: Checksum | None, wanted: Checksum | None) -> str | None:
+    """Return in one line how a file differs from what a document has of it (None: nothing), None if it does not."""
+    if found is None:
+        return f"{where}: is gone"
+    if wanted is None:
+        return f"{where}: its sha256 is not on record"
+    if found == wanted:
+        return None
+    size = "" if found.size_bytes == wanted.size_bytes else f" ({found.size_bytes} bytes, wanted {wanted.size_bytes})"
+    return f"{where}: its sha256 is {found.sha256[:12]}…, wanted {wanted.sha256[:12]}…{size}"
 
 
 def file_checksum(path: Path) -> Checksum:

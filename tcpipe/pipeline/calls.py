@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import digest
@@ -81,7 +79,8 @@ def remember_call(store: Store, watch: Stopwatch, call: Call) -> None:
 
 def latest_calls(store: Store) -> list[Call]:
     """Return the latest calls, the last one first."""
-    names = sorted((name.removesuffix(".json") for name in _listed(store.records_path / "calls")), reverse=True)
+    here = store.place.files("records/calls")
+    names = sorted((name.removesuffix(".json") for name in here if name.endswith(".json")), reverse=True)
     found = (store.recall(f"calls/{name}", Call) for name in names[:_LATEST])
     return [call for call in found if call is not None]
 
@@ -100,8 +99,7 @@ def estimate(calls: Sequence[Call], command: str, amount: int, *, jobs: int) -> 
 
 def room_of(store: Store, run_ids: Sequence[str]) -> int:
     """Return what runs take in the store [byte]."""
-    files = (path for run_id in run_ids for path in (store.runs_path / run_id).rglob("*") if path.is_file())
-    return sum(path.stat().st_size for path in files)
+    return sum(entry.size_bytes for run_id in run_ids for entry in store.runs_place.entries(run_id))
 
 
 def in_time(seconds: float) -> str:
@@ -122,14 +120,6 @@ def in_bytes(count: float) -> str:
 
 def _amount(call: Call) -> int:
     return call.done_bytes if call.command == INGEST else call.counts.get("samples", 0)
-
-
-def _listed(directory: Path) -> list[str]:
-    try:
-        with os.scandir(directory) as entries:
-            return [of.name for of in entries if of.name.endswith(".json") and not of.name.startswith(".")]
-    except OSError:
-        return []
 
 
 def _cpu_s() -> float:

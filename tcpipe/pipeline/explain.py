@@ -32,11 +32,11 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.parquet import ROWS_PER_GROUP, read_row_group
 from tcpipe.formats.published import here_by_range
 from tcpipe.formats.recipe_toml import read_key
-from tcpipe.formats.seals import file_checksum
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import Sampled, sample_segments
-from tcpipe.store import RunDirectory, Store, open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, name_of
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import PLACED_SEGMENTS, Streams
@@ -408,7 +408,7 @@ def _reasons(card: DatasetCard, sample: _Sample, run: RunDirectory, source: MapF
         if entry.name == sample.map and entry.inputs != source.facts.inputs:
             yield f"map {source.name} was added anew since, from other files"
     for made_from in card.runs:
-        now = file_checksum(run.path / "segments.parquet").sha256
+        now = run.checksum("segments.parquet").sha256
         if made_from.run_id == run.run_id and made_from.segments_sha256 != now:
             yield f"run {run.run_id} was ingested anew since, with other segments"
 

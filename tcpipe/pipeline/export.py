@@ -20,7 +20,7 @@ from tcpipe.formats.logs.log_file import Log, open_log
 from tcpipe.formats.parquet import parquet_rows, read_schema, storable
 from tcpipe.pipeline.log_sources import definitions_key
 from tcpipe.power.sources import bare_unit
-from tcpipe.store import is_store
+from tcpipe.store import inside_store, is_store
 from tcpipe.tables.levels import metadata_of, with_metadata
 
 INDEX = "export.json"
@@ -185,10 +185,10 @@ def _index(out: Path) -> dict[str, IndexEntry]:
 def _refuse_what_is_ours(out: Path) -> None:
     """Refuse to write between the files of what is counted and sealed."""
     signs = {
-        "dataset": "dataset.json", "run": "run.json", "run's recipe": "manifest.json", "map": "zarr.json",
-        "model": "model.json", "cost map": "cost-map.json",
+        "dataset": "dataset.json", "map": "zarr.json", "model": "model.json", "cost map": "cost-map.json",
     }  # fmt: skip
-    kind = "store" if is_store(out) else next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
+    ours = "store" if is_store(out) else "run" if inside_store(out) else None
+    kind = ours or next((kind for kind, sign in signs.items() if (out / sign).is_file()), None)
     if kind:
         raise UsageError(f"{out}: is a {kind}; give another directory for the topics")
 

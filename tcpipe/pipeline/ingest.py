@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import logging
-import shutil
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -22,6 +21,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.record_files import Call, record_name
 from tcpipe.formats.robot_files import profiles_of
+from tcpipe.formats.store_mark import gone_if_empty
 from tcpipe.pipeline.calls import INGEST, remember_call, room_of, started
 from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
@@ -51,7 +51,7 @@ _NO_LOGS = "no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directori
 class IngestSummary:
     """What became of every log, in the order given; ``exit_code`` is the contract's."""
 
-    store: Path
+    store: Path | str
     results: tuple[IngestResult, ...] = field(default_factory=tuple)
 
     @property
@@ -68,7 +68,7 @@ class SummaryLine:
 
     recipe: str
     """The file that rules, or that it is the defaults."""
-    store: Path | None
+    store: str | None
     """None where no store was made."""
     exit_code: int
     results: tuple[IngestResult, ...]
@@ -136,7 +136,7 @@ def ingest(
     robot = robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with _place_for_stand_ins(logs := list(logs)) as staging, _gone_if_empty(Path(store)):
+    with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store):
         found = find_sources(logs, as_one=as_one, staging=Path(staging), tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
@@ -146,7 +146,7 @@ def ingest(
         mine = found.sources if shard is None else in_shard(found.sources, shard)
         root = opened.root
         if cluster is not None:  # its workers are elsewhere
-            root = root.absolute()
+            root = root.absolute() if isinstance(root, Path) else root
             message_definitions = None if message_definitions is None else message_definitions.absolute()
         common = (root, ruling, robot, dict(tags or {}), force, message_definitions)
         how = (definitions_key(message_definitions), retry_failed, min_age_s)
@@ -191,7 +191,7 @@ def _keep_index(store: Store, known: KnownRuns, results: Iterable[IngestResult])
     """Write the index, with what this call made."""
     if all(result.status in ("unchanged", "waiting") for result in results):
         store.keep_index(known.runs)
-    elif next(store.root.glob("runs/*/*/*"), None):
+    elif store.run_ids():
         store.keep_index(store.ingestions())
         store.seen_logs()
 
@@ -286,21 +286,6 @@ def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[s
     """Return a temporary directory, where a log is named by its URL."""
     remote = any(is_url(log) for log in logs)
     return tempfile.TemporaryDirectory(prefix="tcpipe-") if remote else nullcontext("")
-
-
-@contextmanager
-def _gone_if_empty(store: Path) -> Iterator[None]:
-    """Remove what was made for the store when no run came into it, what is remembered of failures too."""
-    made = [path for path in (store, *store.absolute().parents) if not path.exists()]
-    try:
-        yield
-    finally:
-        if made and not any(store.glob("runs/*")):
-            for own in ("records", "index"):
-                shutil.rmtree(store / own, ignore_errors=True)
-            for path in (store / "runs", *made):
-                with suppress(OSError):
-                    path.rmdir()
 
 
 def _as_path(value: str | Path | None) -> Path | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -17,12 +17,13 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.run_documents import RunJson
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.ingest_documents import manifest_of, run_json_of
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, Status, result_of, told, too_young
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.outlines import known_as, remember_outline
 from tcpipe.pipeline.run_stages import run_stages
-from tcpipe.store import RunDirectory, Store
+from tcpipe.store import Store
 from tcpipe.tables.levels import Streams
 
 logger = logging.getLogger("tcpipe")
@@ -49,16 +50,18 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         opened = None if source.sha256 else _opened(task, stack)
         sha256 = known_as(store, opened) if opened else str(source.sha256)
         hashed.append(sha256)
-        run_id = stack.enter_context(store.claimed_run(source.stem, sha256))
-        same_as = _twin(store.known_run(run_id), source)
-        before = None if task.force or store.known_run(run_id) is None else made_before(store, run_id, task, sha256)
-        if before is not None:
-            return before
+        named = store.run_of_content(sha256)
+        before = store.known_run(named) if named else None
+        if named and before and not task.force and (made := made_before(store, named, task, sha256)):
+            return made
         log = opened or _opened(task, stack)
         logger.info("%s: reading", source.name)
-        streams, damage, remarks = _streams(store, run_id, log, task)
-        known = run_json_of(task, log, streams, sha256)
-        known = replace(known, damage=damage, remarks=remarks, tags=_tags(store, run_id, task))
+        same_as = _twin(before, source)
+        streams, known = _read(store, named, before, log, task, sha256=sha256)
+        known = replace(known, tags={**_tags(store, named, before), **task.tags})
+        run_id = named or store.claim_run(source.stem, sha256)
+        if not known.streams:
+            known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
         run = _fuse_and_label(store, run_id, streams, known, task)
         remember_outline(store, run_id, sha256, log)
@@ -70,9 +73,8 @@ def made_before(store: Store, run_id: str, task: IngestTask, sha256: str) -> Ing
     finished = next((run.facts for run in store.recipes_of(run_id) if task.is_made_by(run.facts)), None)
     if finished is None:
         return None
-    return result_of(
-        task.source, _retagged(store, run_id, task), finished, sha256, same_as=_twin(finished.log, task.source)
-    )
+    status: Status = "done" if store.tag_run(run_id, task.tags) else "unchanged"
+    return result_of(task.source, status, finished, sha256, same_as=_twin(finished.log, task.source))
 
 
 def as_indexed(task: IngestTask, made: Sequence[RunFacts], sha256: str) -> IngestResult | None:
@@ -94,24 +96,8 @@ def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
 def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> RunDirectory:
     track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id, name=task.source.name)
     manifest = manifest_of(task, known, streams, track, labelled)
-    path = store.write_run(manifest, track=track, gated=gated, labelled=labelled)
-    return next(run for run in store.recipes_of(run_id) if run.path == path)
-
-
-def _tags(store: Store, run_id: str, task: IngestTask) -> dict[str, str]:
-    """Return the run's tags: those it has, and those given."""
-    known = store.known_run(run_id)
-    before = known.tags if known else next((run.facts.tags for run in store.recipes_of(run_id)), {})
-    return {**before, **task.tags}
-
-
-def _retagged(store: Store, run_id: str, task: IngestTask) -> Status:
-    """Set the tags of a run that is there already; "done" where that changed something."""
-    known, tags = store.known_run(run_id), _tags(store, run_id, task)
-    if tags == (known.tags if known else {}):
-        return "unchanged"
-    store.tag_run(run_id, tags)
-    return "done"
+    settled = (lambda _: False) if task.force else task.is_made_by
+    return store.write_run(manifest, track=track, gated=gated, labelled=labelled, settled=settled)
 
 
 def _twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
@@ -119,20 +105,30 @@ def _twin(known: RunJson | KnownLog | None, source: LogSource) -> str | None:
     return None if known is None or known.source.paths == source.origins else " + ".join(known.source.paths)
 
 
-def _streams(
-    store: Store, run_id: str, log: AnyLog, task: IngestTask
-) -> tuple[Streams, tuple[str, ...], tuple[str, ...]]:
-    """Return L1, from the store when it was made with the same read settings, the log's damage, and remarks on it."""
+def _tags(store: Store, run_id: str | None, known: RunJson | None) -> Mapping[str, str]:
+    """Return the tags that a run has."""
+    if known is not None or run_id is None:
+        return known.tags if known else {}
+    return next((run.facts.tags for run in store.recipes_of(run_id)), {})
+
+
+def _read(
+    store: Store, run_id: str | None, before: RunJson | None, log: AnyLog, task: IngestTask, *, sha256: str
+) -> tuple[Streams, RunJson]:
+    """Return L1 and what is known of its log; from the store what was made with the same read settings."""
     from tcpipe.stages.read import read_run  # noqa: PLC0415
 
     key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
-    known = store.known_run(run_id)
-    same = known is not None and known.message_definitions == task.definitions
-    cached = store.read_streams(run_id, key=key) if same and not task.force else None
-    if cached is not None and known is not None:
-        return cached, known.damage, known.remarks
+    if run_id and before and before.message_definitions == task.definitions and not task.force:
+        cached = store.read_streams(run_id, key=key)
+        if cached is not None:
+            known = run_json_of(task, log, cached, sha256)
+            return cached, replace(
+                known, damage=before.damage, remarks=before.remarks, streams=before.streams, streams_key=key
+            )
     streams = read_run(log, task.recipe.read_of(log.topics), robot=task.robot, known=profiles_of(task.recipe))
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
-    store.write_streams(run_id, streams, key=key)
-    return streams, tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.remarks)
+    damage = tuple(str(damage) for damage in log.damage if damage.is_loss)
+    known = run_json_of(task, log, streams, sha256)
+    return streams, replace(known, damage=damage, remarks=tuple(log.remarks), streams_key=key)

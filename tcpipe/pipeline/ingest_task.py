@@ -13,6 +13,7 @@ from tcpipe import __version__
 from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
+from tcpipe.formats.run_documents import Manifest
 from tcpipe.pipeline.known_trouble import failure_name
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transience import is_transient
@@ -29,7 +30,7 @@ class IngestTask:
     """One run to make: the log and how."""
 
     source: LogSource
-    store: Path
+    store: Path | str
     recipe: Recipe
     robot: str | None
     tags: Mapping[str, str]
@@ -41,7 +42,7 @@ class IngestTask:
     retry_failed: bool = False
     min_age_s: float = 0.0
 
-    def is_made_by(self, made: RunFacts) -> bool:
+    def is_made_by(self, made: RunFacts | Manifest) -> bool:
         """Tell whether an ingestion of this content is as it would be made now."""
         same_robot = made.robot_requested == self.robot or (self.robot is not None and made.robot == self.robot)
         same_version = made.tcpipe_version == __version__ and made.message_definitions == self.definitions

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from tcpipe.errors import TcpipeError, UsageError
+from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.logs.joined import opened
 from tcpipe.formats.logs.log_file import logs_below
@@ -17,11 +18,12 @@ from tcpipe.formats.logs.table_folders import table_files, table_folders
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published import has_card, here_by_range
 from tcpipe.formats.run_documents import Counts, LogOrigin
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import remote_logs
 from tcpipe.pipeline.table_proposal import InspectedTables, proposed
 from tcpipe.recipe import Recipe
-from tcpipe.store import RunDirectory, Store, is_store, run_at
+from tcpipe.store import Store, is_store, run_at
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
@@ -126,17 +128,17 @@ def inspect(
     """
     ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):
+        with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
+            if stored := _in_store(str(path)):
+                return stored
         return _at_url(str(path).rstrip("/"), ask)
     path = Path(path)
     if not path.exists():
         raise UsageError(f"{path}: there is no such file or directory")
     if (path / "dataset.json").is_file():
         return _dataset(path, str(path))
-    if is_store(path):
-        return _store(Store(path))
-    found = run_at(path)
-    if found:
-        return _run(path, *found)
+    if stored := _in_store(path):
+        return stored
     if path.suffix == ".zarr":
         from tcpipe.formats.maps.map_files import open_map  # noqa: PLC0415  it takes longer to load than a log to inspect
         from tcpipe.pipeline.inspected import InspectedMap  # noqa: PLC0415
@@ -160,6 +162,13 @@ def _dataset(directory: Path, name: str) -> InspectedDataset:
     from tcpipe.pipeline.inspected import InspectedDataset  # noqa: PLC0415
 
     return recast(read_current_card(directory), InspectedDataset, kind="dataset", path=name)
+
+
+def _in_store(path: Path | str) -> InspectedStore | InspectedRun | None:
+    if is_store(path):
+        return _store(Store(path))
+    found = run_at(path)
+    return _run(path, *found) if found else None
 
 
 def _logs_or_tables(
@@ -197,7 +206,7 @@ def _one_of(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> Insp
         return InspectedLog(path=str(path), problems=error.problems)
 
 
-def _run(path: Path, store: Store, runs: list[RunDirectory]) -> InspectedRun:
+def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedRun:
     run_id = runs[0].run_id
     known = store.run_json(run_id)
     return InspectedRun(
@@ -223,7 +232,7 @@ def _run(path: Path, store: Store, runs: list[RunDirectory]) -> InspectedRun:
 def _store(store: Store) -> InspectedStore:
     found = store.ingestions()
     runs, outdated = found.finished, {run_id: str(head.data_model_version) for run_id, head in found.outdated.items()}
-    seen = {*outdated, *found.superseded, *(run.run_id for run in runs), *(path.parent.name for path in found.damaged)}
+    seen = {*outdated, *found.superseded, *(run.run_id for run in runs), *(run_id for run_id, _ in found.damaged)}
     return InspectedStore(
         path=str(store.root),
         maps=tuple(store.maps()),
@@ -237,7 +246,7 @@ def _store(store: Store) -> InspectedStore:
             for run in runs
         ),
         outdated=outdated,
-        damaged_runs={str(path): line for path, line in found.damaged.items()},
+        damaged_runs={store.runs_place.where("/".join(run)): line for run, line in found.damaged.items()},
         superseded=dict(found.superseded),
         unfinished=tuple(sorted(set(store.run_ids()) - seen)),
     )

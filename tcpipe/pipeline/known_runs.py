@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.record_files import Sighting, Superseded
+from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.log_sources import LogSource
-from tcpipe.store import Ingestions, Store
+from tcpipe.store import Store
 
 
 @dataclass(frozen=True, slots=True)

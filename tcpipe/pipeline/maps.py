@@ -10,19 +10,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
-from tcpipe.formats.atomic import place_state
 from tcpipe.formats.maps.building import MoreLayers, OrthoBands, build_map
 from tcpipe.formats.maps.geotiff import raster_files
 from tcpipe.formats.maps.map_facts import MapInputs, MapSummary
-from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.maps.text import map_lines
 from tcpipe.formats.seals import file_checksum, seal_of
-from tcpipe.report.overview import quick_look, shows_map, write_quick_look
+from tcpipe.formats.store_mark import gone_if_empty
+from tcpipe.report.overview import quick_look, write_quick_look
 from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import SAMPLES
 from tcpipe.terrain.classes import ClassScheme
@@ -70,7 +67,7 @@ def add_map(
     store: str | Path = "tcpipe-store",
     force: bool = False,
 ) -> AddedMap:
-    """Put rasters on one common grid and add them to the store as ``maps/<name>.zarr``, with a quick look ``maps/<name>.png``.
+    """Put rasters on one common grid and add them to the store as a Zarr group, with a quick look beside it.
 
     A second call with the same files and options does nothing.
 
@@ -105,41 +102,38 @@ def add_map(
     _refuse_layers(layers, categorical, ortho=bool(ortho), ortho_bands=ortho_bands)
     tables = {f"{name} {_CLASSES}": table for name, table in categorical.items() if table}
     files = _found({role: value for role, value in {**given, **layers, **tables}.items() if value})
-    opened = open_store(store, create=True)
-    path = opened.map_path(name)
-    kinds = MapInputs({}, crs, tuple(sorted(categorical)), None if ortho_bands == "grey" else ortho_bands)
-    inputs = replace(kinds, files=_checksums(files))
-    more = MoreLayers(
-        {name: files[name] for name in layers},
-        {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
-        ortho_bands,
-    )
-    before = place_state(path)
-    if path.exists() and not force:
-        return _unchanged(name, path, inputs)
-    picture = path.with_suffix(".png")
-    looks: list[tuple[NDArray[np.uint8], str]] = []
-    try:
-        build_map(
-            path,
-            name=name,
-            height=files["height"],
-            ortho=files.get("ortho", ()),
-            terrain=files.get("terrain", ()),
-            more=more,
-            classes=files["classes"][0] if "classes" in files else None,
-            agreed=_agreed(opened, name),
-            crs=crs,
-            inputs=inputs,
-            instead_of=before,
-            look=lambda finished, half: looks.append((quick_look(finished), seal_of(half))),
+    with gone_if_empty(store):
+        opened = open_store(store, create=True)
+        before = opened.map_number(name)
+        kinds = MapInputs({}, crs, tuple(sorted(categorical)), None if ortho_bands == "grey" else ortho_bands)
+        inputs = replace(kinds, files=_checksums(files))
+        more = MoreLayers(
+            {name: files[name] for name in layers},
+            {name: files[f"{name} {_CLASSES}"][0] if table else None for name, table in categorical.items()},
+            ortho_bands,
         )
-        write_quick_look(picture, *looks[0])
-        return AddedMap(path, "done", open_map(path).summary(), picture)
-    except StoreError:
-        if force or place_state(path) == before:
-            raise
-        return _unchanged(name, path, inputs)  # another process was faster
+        if before and not force:
+            return _unchanged(opened, name, inputs)
+        try:
+            with opened.new_map(name, after=before) as path:
+                build_map(
+                    path,
+                    name=name,
+                    height=files["height"],
+                    ortho=files.get("ortho", ()),
+                    terrain=files.get("terrain", ()),
+                    more=more,
+                    classes=files["classes"][0] if "classes" in files else None,
+                    agreed=_agreed(opened, name),
+                    crs=crs,
+                    inputs=inputs,
+                )
+                write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
+        except StoreError:
+            if force or opened.map_number(name) == before:
+                raise
+            return _unchanged(opened, name, inputs)  # another process was faster
+        return _added(opened, name, "done")
 
 
 def _refuse_layers(
@@ -159,12 +153,15 @@ def _refuse_layers(
         raise UsageError(*problems)
 
 
-def _unchanged(name: str, path: Path, inputs: MapInputs) -> AddedMap:
-    """Return the map that is there, its quick look drawn if there is none of it; `MapError` if it is made from something else."""
-    found, picture = _same(name, path, inputs), path.with_suffix(".png")
-    if not shows_map(picture, path):
-        write_quick_look(picture, quick_look(found), seal_of(path))
-    return AddedMap(path, "unchanged", found.summary(), picture)
+def _unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
+    """Return the map that is there; `MapError` if it is made from something else."""
+    _refuse_other(store, name, inputs)
+    return _added(store, name, "unchanged")
+
+
+def _added(store: Store, name: str, status: Literal["done", "unchanged"]) -> AddedMap:
+    path = store.map_path(name)
+    return AddedMap(path, status, open_map(path).summary(), store.map_picture(name))
 
 
 def _found(given: Mapping[str, Files]) -> dict[str, list[Path]]:
@@ -218,11 +215,11 @@ def _checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]
     return checksums
 
 
-def _same(name: str, path: Path, inputs: MapInputs) -> MapFile:
-    """Return the map that is there if it is made from the same; else `MapError` says what differs."""
+def _refuse_other(store: Store, name: str, inputs: MapInputs) -> None:
+    """Raise `MapError` that says what differs, unless the map that is there is made from the same."""
     try:
-        found = open_map(path)
-    except MapError as error:
+        found = open_map(store.map_path(name))
+    except (MapError, StoreError) as error:
         raise MapError(*error.problems, f"map {name}: add it anew with --force") from None
     before = found.facts.inputs
     roles = dict.fromkeys([*_ROLES, *before.files, *inputs.files])
@@ -237,7 +234,6 @@ def _same(name: str, path: Path, inputs: MapInputs) -> MapFile:
             f"map {name}: is in the store already, made from something else: {'; '.join(changes)}; "
             "replace it with --force, or choose another name"
         )
-    return found
 
 
 def _change(role: str, before: Mapping[str, str], now: Mapping[str, str]) -> str:
@@ -260,7 +256,7 @@ def _agreed(opened: Store, name: str) -> ClassScheme | None:
             continue
         try:
             found = open_map(opened.map_path(other))
-        except MapError:
+        except (MapError, StoreError):
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue
         if "terrain" in found.layers or found.facts.classes_from == "file":

@@ -1,7 +1,8 @@
-"""What a store no longer needs: replaced recipes, superseded runs, what killed calls left; never what a dataset refers to."""
+"""What a store no longer needs: replaced recipes and generations, superseded runs, what killed calls left; nothing of a dataset."""
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,15 +10,21 @@ from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, UsageError, plain_lines
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, is_abandoned, remove_directory
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, is_abandoned
 from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.numbered import numbers, read_sealed_at, stem_and_number
+from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
 from tcpipe.formats.record_files import DatasetMade
+from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.calls import in_bytes
 from tcpipe.pipeline.verify_store import strangers_in
 from tcpipe.recipe import Recipe
-from tcpipe.store import Ingestions, Store, open_store
+from tcpipe.store import Store, open_store
+
+_CONTENT = re.compile(r"(?:^|/)[0-9a-f]{16}/")
+"""In the name of a file: a directory that is named after its content."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,7 +32,7 @@ class Leftover:
     """Something that could go: what it is, where it lies, its size; and why it stays, if it does."""
 
     what: str
-    path: Path
+    path: str
     size_bytes: int
     stays: str | None = None
 
@@ -39,7 +46,7 @@ class Leftover:
 class Pruned:
     """What went, or would go, and what stays."""
 
-    store: Path
+    store: str
     dry_run: bool
     removed: tuple[Leftover, ...]
     kept: tuple[Leftover, ...]
@@ -92,25 +99,29 @@ def prune(
         raise UsageError(f"{opened.root}: no run or recipe is called {min(unknown)}; nothing is removed")
     referred = _referred(opened)
     removed, kept = list[Leftover](), list[Leftover]()
-    for what, path, parts in (*_old_recipes(opened, found, ingest_key(ruling)), *_superseded(opened, found)):
-        why = _why_it_stays(path, parts, referred, keep)
-        (removed if why is None else kept).append(Leftover(what, path, _size(path), why))
+    for what, place, parts in (*_old_recipes(opened, found, ingest_key(ruling)), *_superseded(opened, found)):
+        why = _why_it_stays(place, parts, referred, keep)
+        (removed if why is None else kept).append(Leftover(what, place.where(), _size(place), why))
         if why is None and not dry_run:
-            remove_directory(path)
+            _remove(place)
     for path in _temporaries(opened, min_age_s):
-        removed.append(Leftover("left by a killed call", path, _size(path)))
+        removed.append(Leftover("left by a killed call", str(path), _size(DirectoryPlace(path))))
         if not dry_run:
             clear(path.parent)
+    for place, entries in _replaced(opened, min_age_s):
+        removed += [Leftover("no document names it", place.where(of.name), of.size_bytes) for of in entries]
+        for entry in entries if not dry_run else ():
+            place.delete(entry.name)
     if removed and not dry_run:
         opened.keep_index(opened.ingestions())
-    return Pruned(opened.root, dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
+    return Pruned(str(opened.root), dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
 
 
 Parts = Sequence[tuple[str, str]]
 """Ingestions: runs and their recipes."""
 
 
-def _old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[str, Path, Parts]]:
+def _old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[str, Place, Parts]]:
     """Yield the ingestions that are older than one of the same run under the ruling recipe."""
     by_run: dict[str, list[RunFacts]] = {}
     for row in found.rows.values():
@@ -119,24 +130,26 @@ def _old_recipes(store: Store, found: Ingestions, key: str) -> Iterator[tuple[st
         ruling = [row for row in rows if row.ingest_key == key and row.tcpipe_version == __version__]
         for row in rows if ruling and run_id not in found.superseded else ():
             if row.ingest_key != key and _written_ns(row) < max(map(_written_ns, ruling)):
-                yield "old recipe", store.runs_path / run_id / row.recipe_id, [(run_id, row.recipe_id)]
+                yield "old recipe", store.runs_place.below(f"{run_id}/{row.recipe_id}"), [(run_id, row.recipe_id)]
 
 
-def _superseded(store: Store, found: Ingestions) -> Iterator[tuple[str, Path, Parts]]:
+def _superseded(store: Store, found: Ingestions) -> Iterator[tuple[str, Place, Parts]]:
     """Yield the runs whose place another has taken that is there."""
     there = {run.run_id for run in found.finished}
     for run_id, by in found.superseded.items():
-        if by in there and (store.runs_path / run_id).is_dir():
-            yield "superseded run", store.runs_path / run_id, [key for key in found.rows if key[0] == run_id]
+        if by in there and store.runs_place.folders(run_id):
+            yield "superseded run", store.runs_place.below(run_id), [key for key in found.rows if key[0] == run_id]
 
 
-def _why_it_stays(path: Path, parts: Parts, referred: Mapping[tuple[str, str], str], keep: Sequence[str]) -> str | None:
+def _why_it_stays(
+    place: Place, parts: Parts, referred: Mapping[tuple[str, str], str], keep: Sequence[str]
+) -> str | None:
     if any(name in keep for part in parts for name in part):
         return "--keep names it"
     out = next((referred[part] for part in parts if part in referred), None)
     if out is not None:
         return f"dataset {out} refers to it"
-    strange = next(strangers_in(path), None)
+    strange = next(strangers_in(place), None)
     return None if strange is None else f"{strange} is no file of this store"
 
 
@@ -159,18 +172,57 @@ def _is_replaced(made: DatasetMade) -> bool:
 
 
 def _temporaries(store: Store, min_age_s: float) -> Iterator[Path]:
-    """Yield what killed calls left, if it is old enough."""
-    places = (store.root, store.root / "maps", store.runs_path, store.records_path, store.index_path)
-    for place in (*places, *(store.runs_path / run_id for run_id in store.run_ids())):
-        for path in sorted(place.glob(f"{TEMPORARY_PREFIX}*")):
-            if time.time() - path.stat().st_mtime >= min_age_s and is_abandoned(path):
-                yield path
+    """Yield what killed calls left on disk, if it is old enough."""
+    place = store.place
+    for path in sorted(place.root.glob(f"{TEMPORARY_PREFIX}*")) if isinstance(place, DirectoryPlace) else ():
+        if time.time() - path.stat().st_mtime >= min_age_s and is_abandoned(path):
+            yield path
+
+
+def _replaced(store: Store, min_age_s: float) -> Iterator[tuple[Place, list[Entry]]]:
+    """Yield, by run and for the maps, documents of earlier numbers and files that none of the last documents names, if they are old enough.
+
+    Files of one directory go together: its content is put there together.
+    """
+    before_ns = time.time_ns() - int(min_age_s * 1e9)
+    for place in (store.place.below("maps"), *(store.runs_place.below(run_id) for run_id in store.run_ids())):
+        entries = place.entries()
+        last, documents = numbers(entry.name for entry in entries), set[str]()
+        named = set[str]()
+        for entry in entries:
+            if (of := stem_and_number(entry.name)) is not None:
+                documents.add(entry.name)
+                if of[1] == last[of[0]]:
+                    named |= {entry.name, *_named_by(place, entry.name)}
+        young = {_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
+        content = (entry for entry in entries if entry.name in documents or _CONTENT.search(entry.name))
+        yield place, [of for of in content if of.name not in named and _folder(of.name) not in young]
+
+
+def _named_by(place: Place, name: str) -> Iterator[str]:
+    """Yield the files that a document names; `StoreError` where it is not as it was written: then nothing can be told to be left over."""
+    found, folder = read_sealed_at(place, name), name.rpartition("/")[0]
+    for key in ("checksums", "streams"):
+        listed = found.get(key)
+        yield from (f"{folder}/{file}" if folder else file for file in (listed if isinstance(listed, Mapping) else ()))
+
+
+def _folder(name: str) -> str:
+    """Return the directory of content in which a file lies; a document is one for itself."""
+    found = _CONTENT.search(name)
+    return name[: found.end()] if found else name
+
+
+def _remove(place: Place) -> None:
+    """Remove a run or an ingestion: its documents first, so that no reader looks for the rest."""
+    for entry in sorted(place.entries(), key=lambda entry: stem_and_number(entry.name) is None):
+        place.delete(entry.name)
 
 
 def _written_ns(row: RunFacts) -> int:
     """Return when an ingestion's manifest was written [ns since 1970]."""
-    return int(row.state.split("-")[1]) if row.state else 0
+    return int(row.state.rpartition("-")[2]) if row.state else 0
 
 
-def _size(path: Path) -> int:
-    return sum(file.stat().st_size for file in path.rglob("*") if file.is_file())
+def _size(place: Place) -> int:
+    return sum(entry.size_bytes for entry in place.entries())

@@ -9,7 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.store import RunDirectory
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.tables.columns import floats, integers
 
 _SAME_TIME_NS = 1_000_000_000

@@ -6,16 +6,17 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.dataset_files import read_current_card
 from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.published import here
 from tcpipe.formats.seals import sealed_page
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.physics import physics_in_words
 from tcpipe.report.run_report import run_report
-from tcpipe.store import RunDirectory, Store, is_store, run_at
+from tcpipe.store import Store, inside_store, is_store, run_at
 
 _PAGE = "report.html"
 
@@ -41,22 +42,24 @@ def report(path: Path | str) -> list[Page]:
         When the path is none of these.
 
     """
-    if is_url(path):
+    stored = is_store(path) or inside_store(path) is not None
+    if is_url(path) and not stored:
         (page,) = report(here(path))
         if page.changed:
             open_place(path).put(_PAGE, Path(page.path).read_bytes())
         return [replace(page, path=f"{str(path).rstrip('/')}/{_PAGE}")]
-    path = Path(path)
-    if (path / "dataset.json").is_file():
+    if not is_url(path) and (Path(path) / "dataset.json").is_file():
+        path = Path(path)
         fits = read_current_card(path).physics
         said = tuple(physics_in_words(robot, fit) for robot, fit in fits.items())
-        return [_write(path, dataset_report(path), said)]
+        return [_write(DirectoryPlace(path), dataset_report(path), said)]
     store = Store(path)
     found = (store, store.runs()) if is_store(path) else run_at(path)
     if found is None or not found[1]:
-        what = "is no dataset, run or store with runs" if path.exists() else "there is no such directory"
+        there = is_url(path) or Path(path).exists()
+        what = "is no dataset, run or store with runs" if there else "there is no such directory"
         raise UsageError(f"{path}: {what}; give a dataset, a run of a store, or a store")
-    return [_write(run.path, run_report(found[0], run), _physics_of(run)) for run in found[1]]
+    return [_write(run.place, run_report(found[0], run), _physics_of(run)) for run in found[1]]
 
 
 def _physics_of(run: RunDirectory) -> tuple[str, ...]:
@@ -65,10 +68,9 @@ def _physics_of(run: RunDirectory) -> tuple[str, ...]:
     return () if fit is None else (physics_in_words(run.manifest.robot, fit),)
 
 
-def _write(directory: Path, html: str, physics: tuple[str, ...]) -> Page:
-    clear(directory)
-    path, html = directory / _PAGE, sealed_page(html)
-    changed = not path.is_file() or path.read_bytes() != html.encode()
+def _write(place: Place, html: str, physics: tuple[str, ...]) -> Page:
+    data = sealed_page(html).encode()
+    changed = place.read(_PAGE) != data
     if changed:
-        write_text(path, html)
-    return Page(str(path), changed, physics)
+        place.put(_PAGE, data)
+    return Page(place.where(_PAGE), changed, physics)

@@ -14,6 +14,7 @@ from typing import Literal, get_args
 from tcpipe import __version__
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
 from tcpipe.formats.record_files import Call
@@ -122,7 +123,7 @@ def status(
     ruling = (
         recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(Path(recipe) if recipe else None, Path.cwd()))
     )
-    opened = Store(local_output(store)) if create else open_store(store)
+    opened = Store(store if is_url(store) else local_output(store)) if create else open_store(store)
     calls = latest_calls(opened)
     given = [str(log) for log in logs] or list(dict.fromkeys(log for call in calls for log in call.logs))
     if not given:
@@ -179,7 +180,7 @@ def _standing_of(made: RunFacts, task: IngestTask, store: Store) -> tuple[State,
 def _why_pending(task: IngestTask, known: KnownRuns) -> str:
     """Return why a log that was seen before is to be ingested; "" of a new one."""
     sha256 = task.source.sha256
-    if sha256 and any(path.parent.name.endswith(f"-{sha256[:8]}") for path in known.runs.damaged):
+    if sha256 and any(run_id.endswith(f"-{sha256[:8]}") for run_id, _ in known.runs.damaged):
         return "its run is not as it was written"
     return "its content is another than before" if task.source.lineage in known.seen and not sha256 else ""
 

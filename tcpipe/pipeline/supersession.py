@@ -11,14 +11,13 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import digest
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.record_files import Superseded
+from tcpipe.formats.record_files import RunName, Superseded, record_name
 from tcpipe.pipeline.log_sources import LogSource, is_there
 from tcpipe.store import Store
 
 logger = logging.getLogger("tcpipe")
-
-_BEFORE = "sources.json"
 
 _CONTAINED = 0.9
 """Where so large a share of an older run's measurements is in the newer one, it is the same recording, and loses nothing."""
@@ -54,29 +53,23 @@ def superseded_by(
 
 
 def remember_earlier(store: Store) -> None:
-    """Write down where the runs of a store came from that was made before that was remembered; what it had instead goes."""
-    outdated = store.root / _BEFORE
-    if outdated.is_file():
-        with suppress(OSError):
-            outdated.unlink()
-        logger.info("%s: is of an earlier version and goes; logs are hashed again", outdated)
-    if not (store.records_path / "logs").is_dir():
+    """Write down which run a recording is, and where it lay, in a store that was made before that was remembered, or lost its records."""
+    if "runs" not in store.place.folders("records"):
         for run_id in store.run_ids():
             with suppress(StoreError):  # told where it matters
                 if (known := store.run_json(run_id)) is not None:
                     origin = known.source
                     log = LogSource(tuple(map(Path, origin.paths)), (), urls=origin.paths)
-                    store.remember(f"{log.lineage}/{run_id[-8:]}", log.sighting(origin.sha256))
-        (store.records_path / "logs").mkdir(
-            parents=True, exist_ok=True
-        )  # what a killed first ingest leaves is of no earlier version
+                    sighting = log.sighting(origin.sha256)
+                    store.remember(f"{log.lineage}/{record_name(digest(sighting))}", sighting)
+                    store.remember(f"runs/{origin.sha256}", RunName(origin.sha256, run_id))
 
 
 def _elsewhere(store: Store, run_id: str, source: LogSource) -> str:
     """Return where else a run's recording lies, "" where it is gone."""
     known = store.run_json(run_id)
-    for directory in sorted((store.records_path / "logs").glob("*")):
-        lineage = f"logs/{directory.name}"
+    for folder in store.place.folders("records/logs"):
+        lineage = f"logs/{folder}"
         for sighting in store.sightings(lineage) if lineage != source.lineage else ():
             if known and sighting.sha256 == known.source.sha256 and sighting.size_and_time and is_there(sighting):
                 return " + ".join(sighting.log)
@@ -86,15 +79,22 @@ def _elsewhere(store: Store, run_id: str, source: LogSource) -> str:
 def _share_of(store: Store, older: str, newer: str) -> float:
     """Return the share of a run's measurements that another has too."""
     shared = every = 0
-    for path in sorted((store.runs_path / older / "streams").glob("*.parquet")):
-        other = store.runs_path / newer / "streams" / path.name
+    mine_of, theirs_of = _stream_files(store, older), _stream_files(store, newer)
+    for role, path in mine_of.items():
         try:
-            mine, theirs = read_table(path), read_table(other) if other.is_file() else None
+            mine, theirs = read_table(path), read_table(theirs_of[role]) if role in theirs_of else None
         except StoreError:
             continue
         every += mine.num_rows
         shared += 0 if theirs is None else _in_both(mine, theirs)
     return shared / every if every else 0.0
+
+
+def _stream_files(store: Store, run_id: str) -> Mapping[str, Path]:
+    with suppress(StoreError):
+        known = store.run_json(run_id)
+        return store.stream_files(run_id, known) if known else {}
+    return {}
 
 
 def _in_both(mine: pa.Table, theirs: pa.Table) -> int:

@@ -14,7 +14,7 @@ from tcpipe.formats.published import here, others_beside
 from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
-from tcpipe.store import Store, is_store
+from tcpipe.store import Store, inside_store, is_store
 
 Finding = tuple[str, int] | str
 """What was read and how much of it, or a problem."""
@@ -51,7 +51,7 @@ class Verified:
 
 
 def verify(path: Path | str) -> Verified:
-    """Re-read a dataset, a run, a store, a map, a model or a cost map; a dataset, a model or a cost map also at a URL.
+    """Re-read a dataset, a run, a store, a map, a model or a cost map; all but a map also at a URL.
 
     Raises
     ------
@@ -59,17 +59,17 @@ def verify(path: Path | str) -> Verified:
         When the path is none of these.
 
     """
-    if is_url(path):
+    stored = _stored(str(path)) if is_url(path) else None
+    if is_url(path) and stored is None:
         try:
             found = verify(here(path))
         except StoreError as error:  # of what is fetched, the first that is not what its card says
             return Verified(str(path), "dataset, model or cost map", {}, error.problems)
         strangers = (f"{name}: is no file of this {found.kind}" for name in others_beside(str(path)))
         return replace(found, path=str(path), problems=(*found.problems, *strangers))
-    path = Path(path)
-    if not path.exists():
+    if stored is None and not Path(path).exists():
         raise UsageError(f"{path}: there is no such directory; give a {_KNOWN}")
-    kind, findings = _what(path)
+    kind, findings = stored or _what(Path(path))
     read: dict[str, int] = {}
     problems: list[str] = []
     try:
@@ -80,10 +80,20 @@ def verify(path: Path | str) -> Verified:
                 read[finding[0]] = read.get(finding[0], 0) + finding[1]
     except TcpipeError as error:
         problems += error.problems
-    if kind != "store":
+    if kind not in ("store", "run"):
         again = "the next command that writes it removes it"
-        problems += [f"{left}: was left behind by a command that was killed; {again}" for left in left_beside(path)]
+        problems += [
+            f"{left}: was left behind by a command that was killed; {again}" for left in left_beside(Path(path))
+        ]
     return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)))
+
+
+def _stored(path: str) -> tuple[str, Iterator[Finding]] | None:
+    if inside := inside_store(path):
+        return "run", verify_run(*inside)
+    if is_store(path):
+        return "store", verify_store(Store(path))
+    return None
 
 
 def _what(path: Path) -> tuple[str, Iterator[Finding]]:
@@ -93,10 +103,8 @@ def _what(path: Path) -> tuple[str, Iterator[Finding]]:
     place = path.resolve()
     if place.suffix == ".zarr" and not (place.parent / CARD).is_file():
         return "map", verify_map(path)
-    if place.parent.name == "runs" and (place / "run.json").is_file():
-        return "run", verify_run(Store(place.parent.parent), place.name)
-    if place.parent.parent.name == "runs" and (place / "manifest.json").is_file():
-        return "run", verify_run(Store(place.parents[2]), place.parent.name, place.name)
+    if inside := inside_store(path):
+        return "run", verify_run(*inside)
     if is_store(path):
         return "store", verify_store(Store(path))
     for card, kind in _SEALED_CARDS.items():

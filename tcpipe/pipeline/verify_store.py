@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from pathlib import Path
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -12,12 +14,17 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TcpipeError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, is_abandoned
+from tcpipe.formats.index_files import facts_of, state_of
 from tcpipe.formats.json_files import typed
 from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.numbered import name_of, numbers, read_as_at, read_sealed_at, stem_and_number
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
-from tcpipe.formats.run_documents import Manifest
-from tcpipe.formats.seals import CHECKSUMS, broken_checksums, broken_seal, read_checksums, read_sealed
+from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
+from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_seal_in, read_checksums, wrong_checksum
+from tcpipe.formats.store_mark import MARK
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
@@ -28,53 +35,115 @@ Finding = tuple[str, int] | str
 
 _TABLES = {"track": GATED_TRACK, "segments": LABELLED_SEGMENTS, "rejections": REJECTIONS}
 _COUNTS = {"track": "track_rows", "segments": "segments", "rejections": "rejections"}
-_RUN, _MANIFEST, _REPORT, _STREAMS = "run.json", "manifest.json", "report.html", "streams"
+_REPORT, _STREAMS = "report.html", "streams"
+_DIGEST = re.compile(r"[0-9a-f]{16}")
+_INDEX = "index"
 
 
 def verify_store(store: Store) -> Iterator[Finding]:
     """Yield what was read of all maps and runs, and a line for everything that is not as it was written."""
-    for path in sorted(store.records_path.rglob("*")):
-        if path.suffix == ".json" and TEMPORARY_PREFIX not in str(path.relative_to(store.root)):
-            yield broken_seal(path) or ("records", 1)
-        elif not path.is_dir() or path.name.startswith(TEMPORARY_PREFIX):
-            yield from _stranger(path)
-    for path in _entries(store.root / "maps"):
-        if path.suffix == ".zarr":
-            yield from _isolated(verify_map(path))
-        elif path.suffix == ".png" and path.with_suffix(".zarr").is_dir():
-            yield from _isolated(_quick_look(path))
-        else:
-            yield from _stranger(path)
-    for path in _entries(store.runs_path):
-        if path.is_dir() and not path.name.startswith(TEMPORARY_PREFIX):
-            yield from verify_run(store, path.name)
-        else:
-            yield from _stranger(path)
+    place = store.place
+    yield broken_seal_in(place.read(MARK), place.where(MARK)) or ("files", 1)
+    for name in place.files():
+        if name != MARK:
+            yield _stranger(place, name)
+    for name in place.folders():
+        if name not in ("records", "maps", "runs", _INDEX):
+            yield _stranger(place, name)
+    for entry in place.entries("records"):
+        yield broken_seal_in(place.read(entry.name), place.where(entry.name)) or ("records", 1)
+    yield from _maps(store)
+    for run_id in store.run_ids():
+        yield from verify_run(store, run_id)
+    if isinstance(place, DirectoryPlace):
+        yield from _left_behind(place.root)
 
 
 def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[Finding]:
     """Yield the same of one run: its log's description, its streams, and what became of it under every recipe, or one."""
-    directory = store.runs_path / run_id
-    yield broken_seal(directory / _RUN) or ("files", 1)
-    recipes = 0
-    for path in _entries(directory):
-        if path.is_dir() and path.name == _STREAMS:
-            yield from _isolated(_streams(path))
-        elif path.is_dir() and not path.name.startswith(TEMPORARY_PREFIX):
-            recipes += 1
-            if recipe in (None, path.name):
-                yield from _isolated(_ingestion(path))
-        elif path.name != _RUN:
-            yield from _stranger(path)
+    place = store.runs_place.below(run_id)
+    names = [entry.name for entry in place.entries()]
+    there, last, folders = _documents(place), numbers(names), place.folders()
+    yield from _seals(place, sorted(there))
+    if "run" not in last:
+        yield f"{place.where(name_of('run', 1))}: is gone"
+    known = None
+    for number in range(1, last.get("run", 0) + 1):
+        with suppress(StoreError):
+            known = read_as_at(place, name_of("run", number), RunJson)
+            there |= set(known.streams)
+    yield from _isolated(_streams(place, known))
+    recipes = [name for name in folders if name != _STREAMS and numbers(place.files(name)).get("manifest")]
+    for name in recipes if recipe is None else [recipe]:
+        yield from _isolated(_ingestion(place.below(name)))
     if not recipes:
-        yield f"{directory}: holds no finished ingestion; ingest its log again"
+        yield f"{place.where()}: holds no finished ingestion; ingest its log again"
+    for name in names:
+        if name not in there and name.partition("/")[0] not in recipes:
+            yield _stranger(place, name)
 
 
-def strangers_in(directory: Path) -> Iterator[Path]:
+def _documents(place: Place) -> set[str]:
+    return {name for name in place.files() if stem_and_number(name) or name == _REPORT}
+
+
+def _seals(place: Place, names: Iterable[str]) -> Iterator[Finding]:
+    for name in names:
+        yield broken_seal_in(place.read(name), place.where(name)) or ("files", 1)
+
+
+def _maps(store: Store) -> Iterator[Finding]:
+    place = store.place.below("maps")
+    known = _documents(place)
+    yield from _seals(place, sorted(known))
+    for name, last in numbers(known).items():
+        for number in range(1, last + 1):
+            with suppress(StoreError):
+                known |= set(read_as_at(place, name_of(name, number), MapDocument).checksums)
+        yield from _isolated(_stored_map(store, name))
+    for entry in place.entries():
+        if entry.name not in known:
+            yield _stranger(place, entry.name)
+
+
+def _stored_map(store: Store, name: str) -> Iterator[Finding]:
+    yield "maps", 1
+    place, document = store.place.below("maps"), store.map_document(name)
+    wrong = list(_wrong(place, document.checksums))
+    yield from wrong
+    yield "files", len(document.checksums)
+    if not wrong:
+        path, picture = store.map_path(name), store.map_picture(name)
+        yield from _tiles(path)
+        if document.picture in document.checksums and not shows_map(picture, path):
+            yield f"{place.where(document.picture)}: does not show the map as it is; add the map again with --force"
+
+
+def _wrong(place: Place, checksums: Mapping[str, Checksum]) -> Iterator[str]:
+    """Yield a line for every file that is not what a document has of it."""
+    for name, wanted in checksums.items():
+        if line := wrong_checksum(place.where(name), place.checksum(name), wanted):
+            yield line
+
+
+def _stranger(place: Place, name: str) -> str:
+    """Return a line about what no document knows."""
+    if any(_DIGEST.fullmatch(part) for part in name.split("/")):
+        return f"{place.where(name)}: was left behind by a command that was killed; 'tcpipe prune' removes it"
+    return f"{place.where(name)}: is no file of this store"
+
+
+def _left_behind(root: Path) -> Iterator[str]:
+    for path in sorted(root.glob(f"{TEMPORARY_PREFIX}*")):
+        if is_abandoned(path):
+            yield f"{path}: was left behind by a command that was killed; the next tcpipe ingest or add-map removes it"
+
+
+def strangers_in(place: Place) -> Iterator[str]:
     """Yield what no call of tcpipe has written into the directory of a run, or of one of its ingestions."""
-    known = {f"{role}.parquet" for role in STREAMS} | {f"{name}.parquet" for name in _TABLES}
-    known |= {_RUN, _MANIFEST, _REPORT, CHECKSUMS}
-    yield from (path for path in sorted(directory.rglob("*")) if not path.is_dir() and path.name not in known)
+    known = {f"{role}.parquet" for role in STREAMS} | {f"{name}.parquet" for name in _TABLES} | {_REPORT}
+    names = ((entry.name, entry.name.rpartition("/")[2]) for entry in place.entries())
+    yield from (place.where(name) for name, last in names if last not in known and not stem_and_number(last))
 
 
 def verify_map(path: Path) -> Iterator[Finding]:
@@ -83,30 +152,15 @@ def verify_map(path: Path) -> Iterator[Finding]:
     checksums = yield from _listed(path)
     if checksums is None:
         return
+    yield from _tiles(path)
+
+
+def _tiles(path: Path) -> Iterator[Finding]:
     source = open_map(path, proved=False)
     for factor in source.factors:
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:
             yield from _layer(path, level, layer, None if factor > 1 else source.facts.covered[layer])
-
-
-def _quick_look(path: Path) -> Iterator[Finding]:
-    yield broken_seal(path) or ("files", 1)
-    map_path = path.with_suffix(".zarr")
-    if broken_seal(map_path / CHECKSUMS) is None and not shows_map(path, map_path):
-        yield f"{path}: does not show {path.stem}.zarr as it is; the add-map that made the map draws it anew"
-
-
-def _entries(directory: Path) -> list[Path]:
-    return sorted(directory.iterdir()) if directory.is_dir() else []
-
-
-def _stranger(path: Path) -> Iterator[str]:
-    """Yield a line about what does not belong here; what another process is writing now does."""
-    if not path.name.startswith(TEMPORARY_PREFIX):
-        yield f"{path}: is no file of this store"
-    elif is_abandoned(path):
-        yield f"{path}: was left behind by a command that was killed; the next tcpipe ingest or add-map removes it"
 
 
 def _isolated(findings: Iterator[Finding]) -> Iterator[Finding]:
@@ -126,32 +180,32 @@ def _listed(directory: Path) -> Any:
         return None
     yield from broken_checksums(directory, checksums)
     yield "files", len(checksums) + 1
-    yield from _unlisted(directory, {*checksums, CHECKSUMS})
+    place = DirectoryPlace(directory)
+    for entry in place.entries():
+        if entry.name not in {*checksums, CHECKSUMS}:
+            yield _stranger(place, entry.name)
     return checksums
 
 
-def _unlisted(directory: Path, known: set[str]) -> Iterator[str]:
-    there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
-    for name in sorted(there - known):
-        yield from _stranger(directory / name)
-
-
-def _streams(directory: Path) -> Iterator[Finding]:
-    checksums = yield from _listed(directory)
-    for name in checksums or ():
-        table = read_table(directory / name).replace_schema_metadata(None)
+def _streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
+    checksums = known.streams if known else {}
+    wrong = list(_wrong(place, checksums))
+    yield from wrong
+    yield "files", len(checksums)
+    for name, of in checksums.items() if not wrong else ():
+        table = read_table(place.local(name, of)).replace_schema_metadata(None)
         try:
-            STREAMS[Path(name).stem].check(table)
+            STREAMS[PurePosixPath(name).stem].check(table)
         except TcpipeError as error:
-            yield from (f"{directory / name}: {problem}" for problem in error.problems)
+            yield from (f"{place.where(name)}: {problem}" for problem in error.problems)
         yield "rows", table.num_rows
 
 
-def _ingestion(directory: Path) -> Iterator[Finding]:
+def _ingestion(place: Place) -> Iterator[Finding]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
-    where = directory / _MANIFEST
-    document = read_sealed(where)
+    last = name_of("manifest", numbers(place.files())["manifest"])
+    document, where = read_sealed_at(place, last), place.where(last)
     if document["data_model_version"] not in READ_VERSIONS:
         yield (
             f"{where}: of data model {document['data_model_version']}, this version knows {DATA_MODEL_VERSION}; "
@@ -159,29 +213,49 @@ def _ingestion(directory: Path) -> Iterator[Finding]:
         )
         return
     manifest, recipe = typed(document, Manifest, where), document["recipe"]
+    run_id, recipe_name = place.where().rsplit("/", 2)[1:]
     of = (ingest_key(recipe), recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
-    if of != (manifest.ingest_key, directory.name):
+    if of != (manifest.ingest_key, recipe_name):
         yield f"{where}: its recipe is not the one that the directory is named after"
-    yield from broken_checksums(directory, manifest.checksums)
-    yield "files", len(manifest.checksums) + 1
-    yield from _unlisted(directory, {*manifest.checksums, _MANIFEST, _REPORT})
-    if (directory / _REPORT).exists():
-        yield broken_seal(directory / _REPORT) or ("files", 1)
+    wrong = list(_wrong(place, manifest.checksums))
+    yield from wrong
+    yield "files", len(manifest.checksums)
+    yield from _others(place, manifest)
+    state = next(state_of(entry) for entry in place.entries() if entry.name == last)
+    run = RunDirectory(run_id, recipe_name, place, facts_of(manifest, state), "")
+    yield from _tables(run, where) if not wrong else ()
+
+
+def _others(place: Place, manifest: Manifest) -> Iterator[Finding]:
+    """Yield what is wrong with the documents beside a manifest, and what no manifest knows."""
+    documents = _documents(place)
+    yield from _seals(place, sorted(documents))
+    known = {*documents, *manifest.checksums}
+    for name in documents:
+        with suppress(StoreError):
+            known |= set(read_as_at(place, name, Manifest).checksums) if name != _REPORT else set()
+    for entry in place.entries():
+        if entry.name not in known:
+            yield _stranger(place, entry.name)
+
+
+def _tables(run: RunDirectory, where: str) -> Iterator[Finding]:
     tables = {}
     for name, schema in _TABLES.items():
-        tables[name] = schema.completed(read_table(directory / f"{name}.parquet").replace_schema_metadata(None))
+        tables[name] = schema.completed(run.table(name))
         try:
             schema.check(tables[name])
         except TcpipeError as error:
-            yield from (f"{directory / name}.parquet: {problem}" for problem in error.problems)
+            yield from (f"{run.where}/{name}.parquet: {problem}" for problem in error.problems)
             return
         yield "rows", tables[name].num_rows
-    yield from (f"{where}: {problem}" for problem in _disagreements(directory, manifest, tables))
-    yield from (f"{directory / 'segments.parquet'}: {problem}" for problem in _wrong_joins(directory, manifest, tables))
+    yield from (f"{where}: {problem}" for problem in _disagreements(run, tables))
+    yield from (f"{run.where}/segments.parquet: {problem}" for problem in _wrong_joins(run, tables))
 
 
-def _disagreements(directory: Path, manifest: Manifest, tables: Mapping[str, pa.Table]) -> Iterator[str]:
+def _disagreements(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[str]:
     """Yield what the manifest says otherwise than its directory and its tables."""
+    manifest = run.manifest
     for name, count in _COUNTS.items():
         said = getattr(manifest.counts, count)
         if said not in (None, tables[name].num_rows):
@@ -189,17 +263,17 @@ def _disagreements(directory: Path, manifest: Manifest, tables: Mapping[str, pa.
     covered_m, kept_m = math.fsum(floats(tables["segments"], "arc_length_m")), manifest.ledger_m.get(KEPT, 0.0)
     if not math.isclose(covered_m, kept_m, rel_tol=1e-9, abs_tol=1e-6):
         yield f"the ledger keeps {kept_m:.3f} m, the segments cover {covered_m:.3f} m"
-    if manifest.run_id != directory.parent.name:
-        yield f"is of run {manifest.run_id}, but lies in {directory.parent.name}"
+    if manifest.run_id != run.run_id:
+        yield f"is of run {manifest.run_id}, but lies in {run.run_id}"
 
 
-def _wrong_joins(directory: Path, manifest: Manifest, tables: Mapping[str, pa.Table]) -> Iterator[str]:
+def _wrong_joins(run: RunDirectory, tables: Mapping[str, pa.Table]) -> Iterator[str]:
     """Yield what is wrong between segments and their run and track."""
-    segments, run_id = tables["segments"], directory.parent.name
+    segments, run_id = tables["segments"], run.run_id
     start_ns, end_ns = (integers(segments, f"{end}_ns") for end in ("start", "end"))
     if segments.column("segment_id").to_pylist() != [f"{run_id}-{stamp}" for stamp in start_ns.tolist()]:
         yield "its segment ids are not the run's id and their start stamps"
-    for column, wanted in (("run_id", run_id), ("robot", manifest.robot)):
+    for column, wanted in (("run_id", run_id), ("robot", run.manifest.robot)):
         others = set(segments.column(column).unique().to_pylist()) - {wanted}
         if others:
             yield f"holds segments of {column} {', '.join(sorted(others))}; wanted {wanted}"

@@ -121,7 +121,7 @@ class FuseConfig:
     """No GNSS standard deviation is taken below this, whatever the receiver says [m]."""
     gnss_default_std_m: Deviation = 0.05
     """Horizontal standard deviation where the receiver gives none (the paper's RTK: 5 cm); vertical is twice as large [m]."""
-    gnss_velocity_std_mps: Deviation = 0.1
+    gnss_velocity_std_mps: Deviation = field(default=0.1, metadata={"json": (0.1,)})
     """Standard deviation of a receiver's own velocity where it gives none (NMEA never does) [m/s]; vertical is twice as large."""
     wheel_std_mps: Deviation = 0.05
     """Standard deviation of wheel velocity where the source gives none [m/s]."""

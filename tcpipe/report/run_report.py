@@ -12,6 +12,7 @@ from pyproj import Transformer
 from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.run_documents import RunJson
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import DROPPED, KEPT, histograms, ledger_bars, over_distance, path_on_map
 from tcpipe.report.overview import map_overview
@@ -19,7 +20,7 @@ from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.physics import physics_sections
 from tcpipe.report.quality import quality_sections
 from tcpipe.report.run_sensors import sensor_sections
-from tcpipe.store import RunDirectory, Store
+from tcpipe.store import Store
 from tcpipe.tables.bits import DropReason, Quality, name_of
 from tcpipe.tables.findings import PhysicsFacts
 

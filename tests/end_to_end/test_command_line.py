@@ -20,9 +20,11 @@ import rasterio
 from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from stored_files import only_run, tables
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.simulation import Faults, SimulatedSite, simulate, tiny
+from tcpipe.store import Store
 
 _SECONDS = (32.0, 17.0, 17.0)
 
@@ -163,7 +165,7 @@ def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: P
         (["ingest", "LOG", "--tag", "=wet"], "wanted KEY=VALUE", 2),
         (["ingest", "LOG", "--robot", "nosuch"], "robot 'nosuch' is not known", 2),
         (["ingest", "LOG", "--recipe", "none.toml"], "there is no such file", 2),
-        (["ingest", "LOG", "--store", "s3://bucket/store"], "is a URL; this version writes on this machine only", 2),
+        (["ingest", "LOG", "--store", "https://x.org/store"], "wanted a directory, s3://, gs:// or az://", 2),
         (["ingest", "LOG", "--store", "LOG"], "is a file, wanted a directory", 2),
         (["ingest", "LOG", "--store", "LOG/below"], "is a file, wanted a directory", 2),
         (["build-dataset", "--store", "nosuch"], "there is no store here", 2),
@@ -245,7 +247,7 @@ def test_nobody_listening_is_no_reason_to_stop(logs: list[Path], tmp_path: Path)
         subprocess.run(
             ["bash", "-c", f"{COMMAND} ingest {logs[1]} --store s{number} {redirection}"], cwd=tmp_path, check=False
         )
-        assert len(list(tmp_path.glob(f"s{number}/runs/*/*/segments.parquet"))) == 1
+        assert len(tables(tmp_path / f"s{number}")) == 1
     full = subprocess.run(
         ["bash", "-c", f"{COMMAND} inspect {logs[1]} --json >/dev/full"], check=False, stderr=-1, text=True
     )
@@ -306,10 +308,11 @@ def test_power_logged_apart_is_one_drive(log: Path, store: Path, tmp_path: Path)
     drive, power = _without_power(log, tmp_path)
     for paths in itertools.permutations((drive, power)):
         _run("ingest", *paths, "--as-one", "--store", "joined", cwd=tmp_path)
-    paths = [next(place.glob("runs/*/*/segments.parquet")) for place in (store, tmp_path / "joined")]
-    tables = [pq.read_table(path).drop_columns(["segment_id", "run_id"]) for path in paths]
-    assert tables[0].num_rows > 0
-    assert tables[0].equals(tables[1])
+    found = [
+        only_run(place).segments().drop_columns(["segment_id", "run_id"]) for place in (store, tmp_path / "joined")
+    ]
+    assert found[0].num_rows > 0
+    assert found[0].equals(found[1])
     assert len(list(tmp_path.glob("joined/runs/*"))) == 1
     shutil.copy(drive, tmp_path / "twin.mcap")
     twice = tcpipe("ingest", drive, tmp_path / "twin.mcap", "--as-one", cwd=tmp_path)
@@ -338,21 +341,21 @@ def test_recipe_and_store_of_the_environment_rule(logs: list[Path], tmp_path: Pa
         (tmp_path / name).write_text(f"[segment]\nchord_m = {chord_m}\n")
     env = {"TCPIPE_RECIPE": str(tmp_path / "other.toml"), "TCPIPE_STORE": str(tmp_path / "elsewhere")}
     assert f"recipe: {tmp_path / 'other.toml'}" in _run("ingest", logs[1], "--quiet", cwd=tmp_path, env=env)
-    (manifest,) = (tmp_path / "elsewhere").glob("runs/*/*/manifest.json")
-    assert json.loads(manifest.read_text())["recipe"]["segment"]["chord_m"] == 1.5
+    assert only_run(tmp_path / "elsewhere").manifest.recipe.segment.chord_m == 1.5
     assert not (tmp_path / "tcpipe-store").exists()
 
 
 def test_tags_are_kept_and_changed_without_doing_the_work_again(log: Path, store: Path, tmp_path: Path) -> None:
     shutil.copytree(store, tmp_path / "tcpipe-store")
-    segments = next(tmp_path.glob("tcpipe-store/runs/*/*/segments.parquet"))
+    (segments,) = tables(tmp_path / "tcpipe-store")
     made = segments.stat().st_mtime_ns
     assert "1 done" in _run("ingest", log, "--tag", "driver=x", cwd=tmp_path)
     assert "nothing to do" in _run("ingest", log, cwd=tmp_path)
     assert segments.stat().st_mtime_ns == made
-    for name in ("run.json", "*/manifest.json"):
-        (path,) = segments.parents[1].glob(name)
-        assert json.loads(path.read_text())["tags"] == {"weather": "dry", "driver": "x"}
+    run = only_run(tmp_path / "tcpipe-store")
+    known = Store(tmp_path / "tcpipe-store").run_json(run.run_id)
+    assert known is not None
+    assert run.manifest.tags == known.tags == {"weather": "dry", "driver": "x"}
 
 
 def test_a_place_without_home_and_with_nothing_writable_but_the_store(logs: list[Path], tmp_path: Path) -> None:
@@ -411,10 +414,10 @@ def test_everything_can_be_inspected_and_a_second_call_of_anything_does_nothing(
     run = next((tmp_path / "tcpipe-store" / "runs").iterdir())
     expected = {
         "tcpipe-store": run.name,
-        "tcpipe-store/maps/site.zarr": "EPSG:32633",
+        str(Store(tmp_path / "tcpipe-store").map_path("site")): "EPSG:32633",
         "dataset": run.name,
         str(run): "weather=dry",
-        str(next(path for path in run.iterdir() if (path / "manifest.json").exists())): "m kept",
+        only_run(tmp_path / "tcpipe-store").where: "m kept",
         "site": "wheel_odometry",
     }
     for path, said in expected.items():
@@ -466,7 +469,7 @@ def test_a_batch_that_is_ended_goes_on_where_it_was(number: signal.Signals, logs
         assert time.monotonic() < end, _processes_of(running.pid)
         time.sleep(0.05)
     _run("ingest", *logs, cwd=tmp_path)
-    assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest.json"))) == len(logs)
+    assert len(tables(tmp_path / "tcpipe-store")) == len(logs)
     assert not list(tmp_path.rglob(".tmp-*"))
 
 
@@ -493,7 +496,7 @@ def test_two_at_once_on_one_store_do_not_harm_each_other(logs: list[Path], tmp_p
     for process in running:
         _, told = process.communicate(timeout=HANGS_S)
         assert process.returncode == 0, told
-    assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest.json"))) == 2
+    assert len(list(tmp_path.glob("tcpipe-store/runs/*/*/manifest-*.json"))) == 2
     assert len(list(tmp_path.glob("tcpipe-store/records/logs/*/*.json"))) == 3
     assert not list(tmp_path.rglob(".tmp-*"))
     assert "nothing to do: 3 of 3" in _run("ingest", *batches[0], *batches[1], cwd=tmp_path)

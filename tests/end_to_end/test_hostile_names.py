@@ -14,6 +14,7 @@ from mcap.writer import Writer
 from tcpipe.errors import MapError
 from tcpipe.formats.maps.class_table import read_class_scheme
 from tcpipe.simulation import simulate
+from tcpipe.store import Store
 
 TERMINAL = "\x1b]0;owned\x07\x1b[31m\u202e\x9b2J"
 HTML = '<script>alert("1")</script>'
@@ -55,7 +56,7 @@ def test_no_command_prints_or_writes_a_name_as_anything_but_text(work):
     harmless(tcpipe("add-map", "site", *layers, "--classes", "classes.csv", cwd=here), 0)
     harmless(tcpipe("build-dataset", cwd=here), 0, 3)
     run = next((here / "tcpipe-store/runs").iterdir())
-    for path in (run, "tcpipe-store", "tcpipe-store/maps/site.zarr", "dataset"):
+    for path in (run, "tcpipe-store", Store(here / "tcpipe-store").map_path("site"), "dataset"):
         harmless(tcpipe("inspect", path, cwd=here), 0, 3)
     json.loads(harmless(tcpipe("inspect", run, "--json", cwd=here), 0, 3))
     for path in (run, "dataset"):

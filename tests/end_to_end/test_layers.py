@@ -16,7 +16,7 @@ from tcpipe.cli import cli
 from tcpipe.errors import DatasetError, TcpipeError
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.verify import verify
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 
 PITCH_M = 0.2
 
@@ -47,8 +47,7 @@ def site(tmp_path_factory):
         grey, profile = raster.read(1), raster.profile
     with rasterio.open(here / "colour.tif", "w", **{**profile, "photometric": "RGB"}) as raster:
         raster.write(np.stack([grey, 255 - grey, np.full_like(grey, 200)]))
-    store = Store(here / "store")
-    store.root.mkdir()
+    store = open_store(here / "store", create=True)
     add_run(store, "north", segments("north", *lanes(1.0 + 2.0 * np.arange(8), -14.0, 14.0), start_ns=10**18))
     return here
 
@@ -126,7 +125,7 @@ def test_all_that_describes_a_dataset_tells_of_them(datasets):
     kinds = {field["name"]: field["dataType"] for field in fields}
     assert (kinds["moisture"], kinds["canopy"]) == ("sc:Float", "sc:Integer")
     assert "canopy" in (datasets / "zarr" / "report.html").read_text()
-    listed = CliRunner().invoke(cli, ["inspect", str(datasets / "store/maps/own.zarr")]).output
+    listed = CliRunner().invoke(cli, ["inspect", str(Store(datasets / "store").map_path("own"))]).output
     assert all(name in listed for name in ("moisture", "canopy", "ortho_red"))
     sample_id = tcpipe.open_dataset(datasets / "zarr")["train"].column("sample_id")[0]
     assert explain(sample_id, dataset=datasets / "zarr", store=datasets / "store").differences == ()

@@ -12,6 +12,7 @@ import pytest
 from installed_command import COMMAND, HANGS_S, plain_lines, tcpipe, told
 from mcap.writer import Writer
 from storage_server import FORBIDDEN, object_store
+from stored_files import only_run
 from wheel_drives import drive_at
 
 from tcpipe.formats.logs.writing import MessageStream, write_mcap, write_rosbag2
@@ -36,7 +37,7 @@ def drive(*, simulated: bool = False) -> list[MessageStream]:
 
 
 def run_json(store: Path) -> dict:
-    (path,) = store.glob("runs/*/run.json")
+    (path,) = store.glob("runs/*/run-1.json")
     return json.loads(path.read_text())
 
 
@@ -89,8 +90,7 @@ def test_what_plays_no_role_is_said_and_kept(tmp_path):
         "it covers little of what /wheel/odom covers (1500 messages over 30.0 s))"
     )
     assert line in " ".join((done.stdout + done.stderr).split())
-    (manifest,) = (tmp_path / "tcpipe-store").glob("runs/*/*/manifest.json")
-    assert line in json.loads(manifest.read_text())["warnings"]
+    assert line in only_run(tmp_path / "tcpipe-store").manifest.warnings
 
 
 def test_the_good_are_done_and_the_bad_are_named(tmp_path):

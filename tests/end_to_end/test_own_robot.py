@@ -4,10 +4,10 @@ import json
 import struct
 
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from mcap.writer import Writer
 from simulated_streams import log_of, streams_of
+from stored_files import manifest
 
 from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.recipe_toml import load_recipe
@@ -65,7 +65,11 @@ def drive(tmp_path_factory):
 
 
 def segments(store, result):
-    return pq.read_table(store / "runs" / result.run_id / result.recipe_id / "segments.parquet")
+    return run_of(store, result).segments()
+
+
+def run_of(store, result):
+    return next(run for run in Store(store).recipes_of(result.run_id) if run.recipe_id == result.recipe_id)
 
 
 def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path):
@@ -80,8 +84,10 @@ def test_its_energy_is_that_of_the_same_drive_in_known_messages(drive, tmp_path)
     np.testing.assert_allclose(floats(other, "energy_joule"), floats(one, "energy_joule"), rtol=1e-12)
     again = ingest([log, battery], store=tmp_path / "store", recipe=recipe, as_one=True).results[0]
     assert again.status == "unchanged"
-    path = tmp_path / "store" / "runs" / ours.run_id / ours.recipe_id / "manifest.json"
-    assert json.loads(path.read_text())["recipe"]["robots"]["scout"]["width_m"] == 0.6
+    assert (
+        json.loads(manifest(run_of(tmp_path / "store", ours)).read_text())["recipe"]["robots"]["scout"]["width_m"]
+        == 0.6
+    )
     with pytest.raises(DatasetError, match="no run of robot 'scout'"):  # the default recipe's runs know no scout
         choose_runs(Store(tmp_path / "store"), Recipe(), robot="scout", tags={})
 

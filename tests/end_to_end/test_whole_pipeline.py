@@ -13,10 +13,11 @@ from installed_command import tcpipe, told
 from scipy.interpolate import CubicHermiteSpline
 
 import tcpipe as package
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.simulation import SimulatedSite, read_truth, scenario, simulate, true_cost
-from tcpipe.store import RunDirectory, Store
+from tcpipe.store import Store
 from tcpipe.tables.bits import DropReason
 
 Demo = tuple[Path, subprocess.CompletedProcess[str]]

@@ -13,7 +13,7 @@ from tcpipe.formats.json_files import MOST_BYTES, digest, to_json
 from tcpipe.formats.seals import SEAL
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 
 FORMATS = ("zarr", "parquet")
 
@@ -22,8 +22,7 @@ FORMATS = ("zarr", "parquet")
 def made(tmp_path_factory):
     """Twelve samples in either format."""
     directory = tmp_path_factory.mktemp("damage")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory / "rasters")
     add_run(store, "a", segments("a", *lanes(0.0, -6.0, 6.0)))
     with pytest.MonkeyPatch.context() as patch:

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 from tcpipe.errors import MapError
-from tcpipe.formats.atomic import PlaceState, atomic_directory
+from tcpipe.formats.atomic import atomic_directory
 from tcpipe.formats.maps.class_table import read_class_scheme
 from tcpipe.formats.maps.geotiff import USES, Use
 from tcpipe.formats.maps.layer_building import LayerSource, RasterLayer, shards_of
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
-from tcpipe.formats.maps.map_files import SHARD_PX, MapFile, MapWriter, open_map
+from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter
 from tcpipe.formats.maps.mosaic import Raster, open_raster
 from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
 from tcpipe.formats.seals import write_checksums
@@ -68,8 +68,6 @@ def build_map(
     crs: str | None = None,
     pitch_m: float | None = None,
     inputs: MapInputs | None = None,
-    instead_of: PlaceState | None = None,
-    look: Callable[[MapFile, Path], None] | None = None,
 ) -> MapFacts:
     """Put rasters on one common grid and write them as a map; nothing is left behind if that fails.
 
@@ -95,17 +93,13 @@ def build_map(
         Side of a map pixel [m]; None takes the finest raster's.
     inputs
         What the caller wants to know the map by later; kept in its facts.
-    instead_of
-        What it may replace; None: whatever is there.
-    look
-        Is given the finished map, and where it lies, before it appears at its place.
 
     Raises
     ------
     MapError
         A raster cannot be placed or read, or holds nothing here; the class table is not the store's: one line each.
     StoreError
-        The map cannot be written, or another process has put something else there.
+        The map cannot be written.
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, **more.files}
     paths = {role: [files] if isinstance(files, Path) else list(files) for role, files in given.items() if files}
@@ -132,15 +126,13 @@ def build_map(
         if drawn:
             layers["terrain"] = place_polygons(drawn, scheme, map_crs, grid.bounds_m)
         kinds = {role: source.layer for role, source in layers.items()}
-        with atomic_directory(out_path, instead_of=instead_of) as half:
+        with atomic_directory(out_path) as half:
             writer = MapWriter(half, name=name, grid=grid, scheme=scheme, layers=kinds)
             _write_layers(writer, layers, grid)
             _refuse_empty(layers)
             facts = _facts(grid, layers, origin, inputs or MapInputs())
             writer.finish(facts, {role: _ranged(source) for role, source in layers.items()})
             write_checksums(half)
-            if look is not None:
-                look(open_map(half), half)
     return facts
 
 

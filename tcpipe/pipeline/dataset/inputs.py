@@ -27,10 +27,11 @@ from tcpipe.formats.json_files import digest, plain
 from tcpipe.formats.published import here_by_range
 from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_checksums
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
 from tcpipe.recipe import Recipe
-from tcpipe.store import RunDirectory, Store
+from tcpipe.store import Store
 from tcpipe.tables.levels import TABLES_VERSION
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from tcpipe.errors import MapError
 from tcpipe.formats.dataset_card import MapRegistration
 from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.recipe import Recipe
-from tcpipe.store import RunDirectory
 from tcpipe.tables.columns import floats
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.registration import Registration, register_track

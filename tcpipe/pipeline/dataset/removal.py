@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from tcpipe.formats.dataset_card import Removal
 from tcpipe.formats.maps.map_files import MapFile
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.motion.ledger import interval_length_m, interval_reason
 from tcpipe.motion.pieces import piece_of_rows
 from tcpipe.motion.removal import Group, main_reason, named_groups, tally_m, uneven
 from tcpipe.recipe import Recipe
-from tcpipe.store import RunDirectory
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
 from tcpipe.terrain.point_classes import OFF_THE_MAP, classes_at

@@ -13,10 +13,11 @@ from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import LogOrigin, ManifestHead, RunJson
+from tcpipe.formats.stored_runs import Ingestions, RunDirectory
 from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
-from tcpipe.store import Ingestions, RunDirectory, Store
+from tcpipe.store import Store
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
@@ -45,9 +46,9 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
         raise DatasetError(*_nothing_to_pool(store, found))
     runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
     known = {run.run_id for run in mine}
-    for path, line in found.damaged.items():
-        if path.parent.name not in known and _belongs(_known(store, path.parent.name), robot, tags):
-            damaged.setdefault(path.parent.name, line)
+    for (run_id, _), line in found.damaged.items():
+        if run_id not in known and _belongs(_known(store, run_id), robot, tags):
+            damaged.setdefault(run_id, line)
     lines = tuple(
         f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items()
     )
@@ -68,7 +69,7 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
 def _remarks(store: Store, found: Ingestions) -> Iterator[str]:
     """Yield a line about runs that have not finished, and about those that others have taken the place of."""
     seen = {*found.outdated, *(run.run_id for run in found.finished)}
-    unfinished = set(store.run_ids()) - seen - found.superseded.keys() - {path.parent.name for path in found.damaged}
+    unfinished = set(store.run_ids()) - seen - found.superseded.keys() - {run_id for run_id, _ in found.damaged}
     if unfinished:
         yield f"no ingestion of {_named(unfinished)} has finished; ingest again"
     if found.superseded:
@@ -144,7 +145,7 @@ def _wrong_with_log(store: Store, run: RunDirectory) -> str:
         store.run_json(run.run_id)
     except StoreError as error:
         return error.problems[0]
-    return f"{run.path.parent / 'run.json'}: is gone"
+    return f"{store.runs_place.where(run.run_id)}/run-1.json: is gone"
 
 
 def _missing(store: Store, by_recipe: Mapping[str, str], by_version: Mapping[str, str], total: int) -> list[str]:

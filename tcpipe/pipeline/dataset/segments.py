@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.arrow_file import map_table, write_pieces
-from tcpipe.store import RunDirectory
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import LABELLED_SEGMENTS

@@ -50,8 +50,10 @@ def test_what_is_put_is_there(place: Place) -> None:
     assert _names(place.entries("runs/x")) == [NAMES[3]]
     assert [entry.size_bytes for entry in place.entries("runs/100%")] == [len(NAMES[2])]
     assert place.folders() == ["drives of May", "runs"]
+    assert place.files() == ["a.json"]
+    assert place.files("runs/x") == ["[1] & 'two'+~.bin"]
     assert place.folders("runs") == ["100%", "x"]
-    assert place.folders("nowhere") == place.entries("nowhere") == []
+    assert place.folders("nowhere") == place.files("nowhere") == place.entries("nowhere") == []
     there = pickle.loads(pickle.dumps(place))  # noqa: S301  as a worker gets it
     assert there.below("runs").read("100%/track.parquet") == NAMES[2].encode()
 

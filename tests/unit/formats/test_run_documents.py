@@ -10,6 +10,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import plain, read_as
 from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.formats.seals import SEAL, write_sealed
+from tcpipe.pipeline.migrate import migrate
 from tcpipe.store import Store
 
 KEPT = Path(__file__).parents[2] / "data" / "store-1.0.tar.xz"
@@ -17,6 +18,8 @@ SINCE = dict.fromkeys(("weight_over_efficiency_newton", "rolling_resistance", "g
     "blamed": True,
     "sha256_of": "log",
     "gnss_velocity_std_mps": 0.1,
+    "streams": {},
+    "streams_key": "",
 }
 """Keys that are always there since, and what they hold where they were left out."""
 
@@ -56,7 +59,8 @@ def test_a_kept_document_is_read_whole_and_written_as_it_was(kept, pattern, cls)
     ],
 )
 def test_a_value_of_another_type_is_named_by_file_and_key(kept, keys, line):
-    (path,) = kept.glob("runs/*/*/manifest.json")
+    migrate(kept)
+    (path,) = kept.glob("runs/*/*/manifest-1.json")
     document = json.loads(path.read_text())
     place = document
     for key in keys[:-1]:
@@ -64,11 +68,14 @@ def test_a_value_of_another_type_is_named_by_file_and_key(kept, keys, line):
     place[keys[-1]] = []
     write_sealed(path, document)
     found = Store(kept).ingestions()
-    assert found.damaged == {path.parent: f"{path}: is not what this version writes: {line}"}
+    assert found.damaged == {
+        (path.parents[1].name, path.parent.name): f"{path}: is not what this version writes: {line}"
+    }
 
 
 def test_a_run_json_without_its_source_is_refused(kept):
-    (path,) = kept.glob("runs/*/run.json")
+    migrate(kept)
+    (path,) = kept.glob("runs/*/run-1.json")
     write_sealed(path, {"robot": "husky"})
-    with pytest.raises(StoreError, match=r"run\.json: is not what this version writes: source is missing$"):
+    with pytest.raises(StoreError, match=r"run-1\.json: is not what this version writes: source is missing$"):
         Store(kept).run_json(path.parent.name)

@@ -14,15 +14,14 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 
 @pytest.fixture
 def store(tmp_path):
     """Three runs: two in dry weather, one of them driven by Eva; one in wet weather."""
-    store = Store(tmp_path / "store")
-    store.root.mkdir()
+    store = open_store(tmp_path / "store", create=True)
     add_world(store, tmp_path / "rasters")
     tags = {"a": {"weather": "dry"}, "b": {"weather": "wet"}, "c": {"weather": "dry", "driver": "Eva"}}
     for number, (run_id, own) in enumerate(tags.items()):
@@ -54,7 +53,7 @@ def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path)
 def make_outdated(store, *run_ids):
     """Have runs look as if an earlier version of tcpipe had made them."""
     for run_id in run_ids:
-        for path in store.root.glob(f"runs/{run_id}/*/manifest.json"):
+        for path in store.root.glob(f"runs/{run_id}/*/manifest-1.json"):
             path.write_text(json.dumps({**json.loads(path.read_text()), "data_model_version": "0.9"}))
 
 

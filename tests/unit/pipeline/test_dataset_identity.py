@@ -9,7 +9,7 @@ from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 
 OTHER = {
     "robot": "husky",
@@ -39,8 +39,7 @@ OTHER = {
 def places(tmp_path_factory):
     """A store with a map and a run, and the dataset of the default recipe."""
     directory = tmp_path_factory.mktemp("identity")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory)
     add_run(store, "a", segments("a", *lanes(np.array([-3.0, 3.0]), -8.0, 8.0)))
     with pytest.MonkeyPatch.context() as patch:

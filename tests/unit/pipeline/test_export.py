@@ -9,9 +9,8 @@ from mcap.writer import Writer
 from random_messages import ROS1, Message, random_messages, write_bag, write_mcap
 
 from tcpipe.errors import LogError, UsageError
-from tcpipe.formats.record_files import Sighting
 from tcpipe.pipeline.export import export
-from tcpipe.store import Store
+from tcpipe.store import open_store
 
 TYPES = ("sensor_msgs/msg/Imu", "sensor_msgs/msg/BatteryState", "nav_msgs/msg/Path")
 
@@ -67,8 +66,6 @@ def test_a_bare_number_is_told_by_the_name_of_its_topic(tmp_path):
     ("sign", "kind"),
     [
         ("dataset.json", "dataset"),
-        ("run.json", "run"),
-        ("manifest.json", "run's recipe"),
         ("zarr.json", "map"),
         ("model.json", "model"),
         ("cost-map.json", "cost map"),
@@ -84,7 +81,7 @@ def test_nothing_is_written_between_files_that_are_counted(tmp_path, log, sign, 
 
 
 def test_nothing_is_written_into_a_store(tmp_path, log):
-    Store(tmp_path / "out").remember("logs/where/what", Sighting(("/a.bag",), (), "0"))
+    open_store(tmp_path / "out", create=True)
     with pytest.raises(UsageError, match="out: is a store; give another directory"):
         export(log, tmp_path / "out")
 

@@ -10,7 +10,7 @@ import pytest
 from synthetic_store import add_run, lanes, segments
 
 import tcpipe.store as stores
-from tcpipe.formats import index_files
+from tcpipe.formats import index_files, stored_runs
 from tcpipe.formats.record_files import Sighting
 from tcpipe.pipeline.dataset.runs import choose_runs
 from tcpipe.recipe import Recipe
@@ -35,11 +35,11 @@ def read(monkeypatch):
     paths = []
 
     def heard(real):
-        return lambda path, *rest, **how: (paths.append(path), real(path, *rest, **how))[1]
+        return lambda place, *rest, **how: (paths.append(place.where(rest[0])), real(place, *rest, **how))[1]
 
-    for name in ("read_sealed", "read_sealed_as"):
-        monkeypatch.setattr(stores, name, heard(getattr(stores, name)))
-    stores._manifest.cache_clear()
+    for module, name in ((stores, "read_sealed_at"), (stores, "read_as_at"), (stored_runs, "read_as_at")):
+        monkeypatch.setattr(module, name, heard(getattr(module, name)))
+    stored_runs._manifest.cache_clear()
     return paths
 
 
@@ -53,7 +53,7 @@ def test_the_index_says_what_the_documents_say(store):
         assert run.facts.log.source == store.run_json(run.run_id).source
         stamps = run.table("segments").column("start_ns").to_pylist()
         assert (run.facts.start_ns, run.facts.end_ns) == (min(stamps), max(stamps) + 1_200_000_000)
-    assert index_files.read_runs(store.index_path) == fresh.rows
+    assert index_files.read_runs(store.index_place) == fresh.rows
 
 
 def test_no_document_is_read_again_until_it_is_written_again(store, read):
@@ -62,17 +62,17 @@ def test_no_document_is_read_again_until_it_is_written_again(store, read):
     store.tag_run("b", {"weather": "wet"})
     read.clear()
     found = store.ingestions()
-    assert {path.parent.name if path.name == "run.json" else path.parent.parent.name for path in read} == {"b"}
+    assert {path.partition("/runs/")[2][0] for path in read} == {"b"}
     assert found.stale
     assert found.rows["b", found.finished[1].recipe_id].tags == {"weather": "wet"}
 
 
 @pytest.mark.parametrize("what", [b"", b"PAR1 and then nothing", None])
 def test_a_broken_index_is_made_again_and_a_wrong_one_is_not_believed(store, what):
-    path, right = store.index_path / "runs.parquet", store.ingestions()
+    path, right = store.root / "index" / "runs.parquet", store.ingestions()
     if what is None:  # of another store, copied over
         rows = {key: replace(row, state="1-2-3", robot="other") for key, row in right.rows.items()}
-        index_files.write_runs(store.index_path, rows.values())
+        index_files.write_runs(store.index_place, rows.values())
     else:
         path.write_bytes(what)
     found = store.ingestions()
@@ -82,7 +82,7 @@ def test_a_broken_index_is_made_again_and_a_wrong_one_is_not_believed(store, wha
 
 
 def test_a_changed_byte_anywhere_in_the_index_changes_nothing(store):
-    path, right, rng = store.index_path / "runs.parquet", store.ingestions().rows, np.random.default_rng(0)
+    path, right, rng = store.root / "index" / "runs.parquet", store.ingestions().rows, np.random.default_rng(0)
     whole = path.read_bytes()
     for at in rng.integers(0, len(whole), 40):
         path.write_bytes(whole[:at] + bytes([whole[at] ^ (1 << int(rng.integers(8)))]) + whole[at + 1 :])
@@ -90,11 +90,11 @@ def test_a_changed_byte_anywhere_in_the_index_changes_nothing(store):
 
 
 def test_a_manifest_that_is_changed_under_the_index_is_told(store):
-    (path,) = store.root.glob("runs/b/*/manifest.json")
+    (path,) = store.root.glob("runs/b/*/manifest-1.json")
     path.write_text(path.read_text().replace('"husky"', '"other"'))
     found = store.ingestions()
     assert [run.run_id for run in found.finished] == ["a", "c"]
-    assert "is not as it was written" in found.damaged[path.parent]
+    assert "is not as it was written" in found.damaged["b", path.parent.name]
 
 
 def test_two_writers_lose_nothing_but_time(store):
@@ -119,7 +119,7 @@ def test_files_that_were_proved_are_proved_again_when_they_are_written_again(sto
     assert hashed == ["a", "b", "c"]
     assert chosen() == (["a", "b", "c"], ())
     assert len(hashed) == 3
-    (path,) = store.root.glob("runs/b/*/segments.parquet")
+    (path,) = store.root.glob("runs/b/*/*/segments.parquet")
     data = path.read_bytes()
     os.utime(path, ns=(0, 0))
     assert chosen() == (["a", "b", "c"], ())
@@ -133,8 +133,8 @@ def test_logs_that_were_seen_are_read_once_and_damage_is_named(store, caplog):
     sighting = Sighting(("/logs/a.mcap",), ((10, 20),), "f" * 64)
     store.remember(f"{LOG}/one", sighting)
     assert store.seen_logs() == {LOG: [sighting]}
-    assert [row.sighting for row in index_files.read_logs(store.index_path).values()] == [sighting]
-    path = store.records_path / f"{LOG}/one.json"
+    assert [row.sighting for row in index_files.read_logs(store.index_place).values()] == [sighting]
+    path = store.root / "records" / f"{LOG}/one.json"
     path.write_text(path.read_text().replace("f" * 64, "e" * 64))
     assert store.seen_logs() == {}
     assert f"{path}: is not as it was written" in caplog.text
@@ -150,7 +150,7 @@ def test_a_name_that_is_no_text_is_in_the_index_and_is_read_from_its_document(st
         store.keep_index(found)
         assert found.finished[0].facts.log.source.paths == (odd,)
         assert store.seen_logs()[LOG][0].log == (odd,)
-        assert next(iter(index_files.read_runs(store.index_path).values())).log.source.paths == (readable,)
+        assert next(iter(index_files.read_runs(store.index_place).values())).log.source.paths == (readable,)
     assert not found.stale
 
 
@@ -158,7 +158,7 @@ def test_a_store_that_cannot_be_written_is_read_all_the_same(store, monkeypatch)
     monkeypatch.setattr(
         index_files, "write_table", lambda *_: (_ for _ in ()).throw(index_files.StoreError("read-only"))
     )
-    (store.index_path / "runs.parquet").unlink()
+    (store.root / "index" / "runs.parquet").unlink()
     found = store.ingestions()
     store.keep_index(found)
     assert len(found.finished) == 3
@@ -168,7 +168,7 @@ def test_a_store_that_cannot_be_written_is_read_all_the_same(store, monkeypatch)
 def test_other_tools_read_the_segments_of_all_runs_by_the_index(store):
     store.supersede("c", "b")
     store.keep_index(store.ingestions())
-    runs = pl.read_parquet(store.index_path / "runs.parquet").filter(pl.col("superseded_by").is_null())
+    runs = pl.read_parquet(store.root / "index" / "runs.parquet").filter(pl.col("superseded_by").is_null())
     files = [f"{store.root}/{name}" for name in runs["segments_file"]]
     assert pl.scan_parquet(files).select("run_id").collect()["run_id"].value_counts().sort("run_id").rows() == [
         ("a", 20),

@@ -15,7 +15,6 @@ from tcpipe.pipeline import known_trouble
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.known_trouble import accept
-from tcpipe.pipeline.supersession import remember_earlier
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
@@ -108,11 +107,9 @@ def test_a_store_made_before_this_was_remembered_knows_where_its_runs_came_from(
     copy_part(whole, log, 0.6)
     half = night()[0]["run.mcap"].run_id
     shutil.rmtree(tmp_path / "store" / "records")
-    (tmp_path / "store" / "sources.json").write_text("{cut")
     shutil.copy(whole, log)
     night()
     assert half not in counted(tmp_path)
-    assert not (tmp_path / "store" / "sources.json").exists()
 
 
 # --- logs that are still written ------------------------------------------------------------------------------------
@@ -136,7 +133,7 @@ def test_a_log_that_changes_while_it_is_looked_at_waits_also_where_it_cannot_be_
             file.write(b"more")
         raise ValueError("half a message")
 
-    monkeypatch.setattr(ingestion, "_streams", growing)
+    monkeypatch.setattr(ingestion, "_read", growing)
     found, code = night()
     assert (found["other.mcap"].status, code) == ("waiting", 0)
     monkeypatch.undo()
@@ -210,7 +207,7 @@ def test_damage_is_news_once_and_accepted_trouble_is_counted_apart(tmp_path, nig
     copy_part(tmp_path / "whole.mcap", cut, 0.5)
     assert night()[1] == 3  # that is another damage
     checked = verify(tmp_path / "store")
-    assert (checked.problems, checked.read["records"]) == ((), 14)
+    assert (checked.problems, checked.read["records"]) == ((), 17)
 
 
 # --- the memory of logs ---------------------------------------------------------------------------------------------
@@ -268,24 +265,22 @@ def test_two_recordings_of_one_name_whose_hashes_begin_alike_are_two_runs(tmp_pa
     store, names = Store(tmp_path), []
     hashes = ["abcdef01" + digit * 56 for digit in "012"] + ["abcdef01" + "0" * 55 + "9"]
     for sha256 in hashes:
-        with store.claimed_run("latest", sha256) as run_id:
-            store.write_run_json(run_id, RunJson(LogOrigin(("/latest.bag",), sha256)))
-            names.append(run_id)
+        names.append(store.claim_run("latest", sha256))
+        store.write_run_json(names[-1], RunJson(LogOrigin(("/latest.bag",), sha256)))
     assert names == ["latest-abcdef01", "latest-abcdef011111", "latest-abcdef012222", "latest-abcdef010000"]
     for sha256, name in zip(hashes, names, strict=True):
-        with store.claimed_run("other", sha256) as run_id:
-            assert run_id == store.run_of(sha256, store.run_ids_by_hash()) == name
+        assert store.claim_run("other", sha256) == store.run_of(sha256, store.run_ids_by_hash()) == name
 
 
 def test_a_run_json_that_is_not_as_it_was_written_costs_no_other_log_and_is_made_again(tmp_path, night):
     run_id = night(tags={"weather": "dry"})[0]["other.mcap"].run_id
-    path = tmp_path / "store" / "runs" / run_id / "run.json"
+    path = tmp_path / "store" / "runs" / run_id / "run-1.json"
     whole = path.read_bytes()
     path.write_bytes(whole.replace(b'"dry"', b'"wet"'))
     (tmp_path / "logs" / "junk.mcap").write_bytes(JUNK)
     found, _ = night()
     assert [found[name].status for name in ("other.mcap", "junk.mcap")] == ["done", "failed"]
-    assert path.read_bytes() == whole, "its tags are those of the manifest, which is whole"
+    assert path.with_name("run-2.json").read_bytes() == whole, "its tags are those of the manifest, which is whole"
     assert night()[0]["other.mcap"].status == "unchanged"
 
 
@@ -302,9 +297,9 @@ def test_a_part_of_a_split_recording_takes_static_transforms_from_the_part_befor
     assert taken == [0, 1]
 
 
-def test_a_store_whose_first_ingest_was_killed_is_of_no_earlier_version(tmp_path):
-    store = Store(tmp_path / "store")
-    remember_earlier(store)
-    store.write_run_json("run-12345678", RunJson(LogOrigin(("/gone/run.mcap",), "1" * 64)))  # and then it is killed
-    remember_earlier(store)
-    assert not any(store.records_path.rglob("*.json"))
+def test_records_that_were_lost_are_found_out_again_from_the_runs(tmp_path, night):
+    run_id = night()[0]["other.mcap"].run_id
+    shutil.rmtree(tmp_path / "store" / "records")
+    (tmp_path / "logs" / "other.mcap").rename(tmp_path / "logs" / "renamed.mcap")
+    found = night()[0]["renamed.mcap"]
+    assert (found.run_id, found.status) == (run_id, "unchanged")

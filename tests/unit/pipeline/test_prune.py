@@ -8,11 +8,12 @@ import pytest
 from synthetic_store import add_run, lanes, segments
 
 from tcpipe.errors import UsageError
-from tcpipe.formats import atomic
+from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.record_files import DatasetMade
 from tcpipe.pipeline.prune import prune
+from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 
 OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
 
@@ -20,39 +21,39 @@ OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
 @pytest.fixture
 def store(tmp_path):
     """Runs a and b under an older recipe and the ruling one, c under the older alone; b is superseded by a."""
-    store = Store(tmp_path / "store")
+    store = open_store(tmp_path / "store", create=True)
     for recipe in (OLD, Recipe()):
         for number, run_id in enumerate(("a", "b", "c")[: 3 if recipe is OLD else 2]):
             add_run(store, run_id, segments(run_id, *lanes(np.array([number]), -10.0, 10.0)), recipe=recipe)
-    for path in store.root.glob(f"runs/*/{old_recipe(store)}/manifest.json"):
+    for path in store.root.glob(f"runs/*/{old_recipe(store)}/manifest-1.json"):
         os.utime(path, ns=(10**18, 10**18))
     store.supersede("b", "a")
     return store
 
 
 def old_recipe(store):
-    return next((store.runs_path / "c").glob("[!r]*")).name
+    return next((store.root / "runs" / "c").glob("[!r]*")).name
 
 
 def there(store):
-    return {(path.parent.parent.name, path.parent.name) for path in store.root.glob("runs/*/*/manifest.json")}
+    return {(path.parent.parent.name, path.parent.name) for path in store.root.glob("runs/*/*/manifest-1.json")}
 
 
 def test_old_recipes_and_superseded_runs_go_and_a_dry_run_says_the_same(store):
     before, old = there(store), old_recipe(store)
     planned = prune(store=store.root, recipe=Recipe(), dry_run=True)
     assert there(store) == before
-    size = sum(path.stat().st_size for path in store.root.glob(f"runs/a/{old}/*"))
+    size = sum(path.stat().st_size for path in store.root.glob(f"runs/a/{old}/**/*") if path.is_file())
     assert (planned.removed[0].what, planned.removed[0].size_bytes) == ("old recipe", size)
     done = prune(store=store.root, recipe=Recipe())
     assert (done.removed, done.size_bytes) == (planned.removed, planned.size_bytes)
     assert [(each.what, each.path) for each in done.removed] == [
-        ("old recipe", store.runs_path / "a" / old),
-        ("superseded run", store.runs_path / "b"),
+        ("old recipe", str(store.root / "runs" / "a" / old)),
+        ("superseded run", str(store.root / "runs" / "b")),
     ]
     assert {run for run, _ in there(store)} == {"a", "c"}, "c has no other"
     assert len(there(store)) == 2
-    assert not (store.runs_path / "b").exists()
+    assert not (store.root / "runs" / "b").exists()
     assert str(prune(store=store.root, recipe=Recipe())).endswith("there is nothing to remove")
     assert not list(store.root.rglob(".tmp-*"))
 
@@ -72,7 +73,7 @@ def test_what_a_dataset_refers_to_stays_also_where_that_was_moved(store, tmp_pat
 
 def test_what_is_kept_and_what_is_somebody_else_s_stays(store):
     old = old_recipe(store)
-    (store.runs_path / "b" / "notes.txt").write_text("mine")
+    (store.root / "runs" / "b" / "notes.txt").write_text("mine")
     found = prune(store=store.root, recipe=Recipe(), keep=[old])
     assert found.removed == ()
     stays = [each.stays for each in found.kept]
@@ -80,14 +81,14 @@ def test_what_is_kept_and_what_is_somebody_else_s_stays(store):
     found = prune(store=store.root, recipe=Recipe(), keep=["a"])
     assert [each.stays for each in found.kept] == [
         "--keep names it",
-        f"{store.runs_path / 'b' / 'notes.txt'} is no file of this store",
+        f"{store.root / 'runs' / 'b' / 'notes.txt'} is no file of this store",
     ]
     with pytest.raises(UsageError, match="no run or recipe is called nosuch; nothing is removed"):
         prune(store=store.root, recipe=Recipe(), keep=["nosuch"])
 
 
 def test_what_a_killed_call_left_goes_when_it_is_old(store):
-    holder = store.runs_path / ".tmp-d-12345678"
+    holder = store.root / ".tmp-d-12345678"
     (holder / "d").mkdir(parents=True)
 
     def planned():
@@ -96,18 +97,37 @@ def test_what_a_killed_call_left_goes_when_it_is_old(store):
 
     assert planned() == []
     os.utime(holder, (0, 0))
-    assert planned() == [holder]
+    assert planned() == [str(holder)]
     prune(store=store.root, recipe=Recipe())
     assert not holder.exists()
 
 
-def test_a_kill_in_the_midst_of_it_leaves_the_place_empty(store, monkeypatch):
-    def killed(*_, **__):
-        raise KeyboardInterrupt
+def test_a_kill_in_the_midst_of_it_leaves_what_no_reader_sees_and_a_later_call_removes(store, monkeypatch):
+    delete, left = DirectoryPlace.delete, [1]
 
-    monkeypatch.setattr(atomic.shutil, "rmtree", killed)
-    with pytest.raises(KeyboardInterrupt):
-        prune(store=store.root, recipe=Recipe())
-    monkeypatch.undo()
-    assert ("a", old_recipe(store)) not in there(store)
+    def killed(*args):
+        if not left[0]:
+            raise KeyboardInterrupt
+        left[0] -= 1
+        delete(*args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(DirectoryPlace, "delete", killed)
+        with pytest.raises(KeyboardInterrupt):
+            prune(store=store.root, recipe=Recipe())
+    assert ("a", old := old_recipe(store)) not in there(store)
     assert len(store.ingestions("a").finished) == 1
+    assert list(store.root.glob(f"runs/a/{old}/*/*.parquet"))
+    prune(store=store.root, recipe=Recipe(), min_age_s=0.0)
+    assert not list(store.root.glob(f"runs/a/{old}/*/*.parquet"))
+    assert verify(store.root).problems == ()
+
+
+def test_earlier_generations_go_when_they_are_old_and_the_last_stays(store):
+    add_run(store, "c", segments("c", *lanes(np.array([2.0]), -10.0, 5.0)), recipe=OLD)
+    files = {path for path in store.root.glob("runs/c/**/*") if path.is_file()}
+    prune(store=store.root, recipe=OLD, min_age_s=0.0)
+    gone = {path.name for path in files if not path.exists()}
+    assert gone == {"manifest-1.json", "segments.parquet"} | {"track.parquet", "rejections.parquet"}
+    assert [run.segments().num_rows for run in store.recipes_of("c")] == [15]
+    assert verify(store.root).problems == ()

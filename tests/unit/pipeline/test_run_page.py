@@ -5,6 +5,7 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from stored_files import run_document
 
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.pipeline.ingest import ingest
@@ -23,10 +24,10 @@ def store(tmp_path_factory):
     site = simulate(here / "site", scenario=tiny(Faults.every(), seconds=40.0), seed=4)
     assert ingest(site.logs, store=here / "store").exit_code == 0
     add_map("site", store=here / "store", height=site.rasters["height"])
-    maps = here / "store" / "maps"
-    shutil.copytree(maps / "site.zarr", maps / "damaged.zarr")
-    (maps / "damaged.zarr" / "zarr.json").write_text("{")
-    return Store(here / "store")
+    add_map("damaged", store=here / "store", height=site.rasters["height"])
+    store = Store(here / "store")
+    (store.map_path("damaged") / "zarr.json").write_text("{")
+    return store
 
 
 def page(store):
@@ -43,7 +44,7 @@ def test_a_map_that_cannot_be_read_is_named_and_the_next_one_drawn(store):
 def test_without_any_readable_map_the_path_stands_alone(store, tmp_path):
     alone = tmp_path / "store"
     shutil.copytree(store.root, alone)
-    shutil.copy(alone / "maps/damaged.zarr/zarr.json", alone / "maps/site.zarr/zarr.json")
+    (Store(alone).map_path("site") / "zarr.json").write_text("{")
     _, html = page(Store(alone))
     assert "<h2>Path</h2>" in html
     assert html.count("cannot be shown") == 2
@@ -79,7 +80,7 @@ def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
 
 def test_every_topic_stands_on_the_page_and_may_break(store):
     run, html = page(store)
-    source = json.loads((run.path.parent / "run.json").read_text())
+    source = json.loads(run_document(run).read_text())
     with open_log(source["source"]["paths"][0]) as log:
         names = set(log.topics)
     played = {sensor["topic"] for sensor in source["sensors"].values()}

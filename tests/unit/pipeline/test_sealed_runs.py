@@ -2,8 +2,10 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import pytest
+from stored_files import manifest, run_document, table
 from synthetic_store import add_run, add_world, box, lanes, region_file, segments
 
 from tcpipe.dataset import open_dataset
@@ -13,7 +15,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
 from tcpipe.pipeline.report import report
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.levels import STREAMS, Sensor, Streams
 
 
@@ -21,8 +23,7 @@ from tcpipe.tables.levels import STREAMS, Sensor, Streams
 def made(tmp_path_factory):
     """Four runs beside each other."""
     directory = tmp_path_factory.mktemp("made")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory / "rasters")
     for number, run_id in enumerate("abcd"):
         add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 10.0), start_ns=number * 10**15))
@@ -72,15 +73,14 @@ def flip(path):
 
 
 DAMAGE = {
-    "the robot in the manifest": lambda run: edit(run.path / "manifest.json", robot),
-    "the ledger": lambda run: edit(run.path / "manifest.json", ledger),
-    "the log's sha256": lambda run: edit(run.path.parent / "run.json", sha256),
-    "a flipped bit of the manifest": lambda run: flip(run.path / "manifest.json"),
-    "a flipped bit of the segments": lambda run: flip(run.path / "segments.parquet"),
-    "a flipped bit of the track": lambda run: flip(run.path / "track.parquet"),
-    "a lost track": lambda run: (run.path / "track.parquet").unlink(),
-    "a lost manifest": lambda run: (run.path / "manifest.json").unlink(),
-    "a lost run.json": lambda run: (run.path.parent / "run.json").unlink(),
+    "the robot in the manifest": lambda run: edit(manifest(run), robot),
+    "the ledger": lambda run: edit(manifest(run), ledger),
+    "the log's sha256": lambda run: edit(run_document(run), sha256),
+    "a flipped bit of the manifest": lambda run: flip(manifest(run)),
+    "a flipped bit of the segments": lambda run: flip(table(run, "segments")),
+    "a flipped bit of the track": lambda run: flip(table(run, "track")),
+    "a lost track": lambda run: table(run, "track").unlink(),
+    "a lost run.json": lambda run: run_document(run).unlink(),
 }
 
 
@@ -89,41 +89,47 @@ def test_a_run_that_is_not_as_it_was_written_is_named_and_left_out(store, damage
     DAMAGE[damage](store.recipes_of("b")[0])
     result = build(store)
     (line,) = result.problems
-    assert line.startswith(f"run b: left out: {store.runs_path / 'b'}/")
+    assert line.startswith(f"run b: left out: {store.root / 'runs' / 'b'}/")
     assert "ingest its log again" in line
     assert (result.exit_code, runs(store)) == (3, ["a", "c", "d"])
     again = build(store, min_runs=3)
     assert (again.status, again.problems) == ("unchanged", (line,)), "damage is told until it is mended"
 
 
+def test_a_run_that_lost_its_manifest_is_unfinished(store):
+    manifest(store.recipes_of("b")[0]).unlink()
+    result = build(store)
+    assert runs(store) == ["a", "c", "d"]
+    assert any("b" in line and "ingest" in line for line in result.warnings)
+
+
 def test_a_manifest_of_another_run_is_not_believed_though_its_seal_is_whole(store):
-    ours, theirs = (store.recipes_of(name)[0].path for name in "bc")
-    shutil.copy(theirs / "manifest.json", ours / "manifest.json")
-    assert f"is of c/{ours.name}, but lies in b/{ours.name}" in build(store).problems[0]
+    ours, theirs = (store.recipes_of(name)[0] for name in "bc")
+    shutil.copy(manifest(theirs), manifest(ours))
+    assert f"is of c/{ours.recipe_id}, but lies in b/{ours.recipe_id}" in build(store).problems[0]
 
 
 def test_a_document_that_is_sealed_and_lacks_something_is_named(store):
-    path = store.recipes_of("b")[0].path / "manifest.json"
-    manifest = json.loads(path.read_text())
-    write_sealed(path, {**manifest, "counts": {}})
+    path = manifest(store.recipes_of("b")[0])
+    write_sealed(path, {**json.loads(path.read_text()), "counts": {}})
     assert "is not what this version writes: counts.segments is missing" in build(store).problems[0]
 
 
 def test_damaged_runs_are_told_by_inspect_and_report(store):
-    flip(store.recipes_of("b")[0].path / "manifest.json")
+    flip(manifest(store.recipes_of("b")[0]))
     found = inspect(store.root, recipe=Recipe())
     assert [run.run_id for run in found.runs] == ["a", "c", "d"]
     assert len(found.damaged_runs) == 1
     assert found.unfinished == ()
     with pytest.raises(StoreError, match="is not as it was written"):
-        report(store.runs_path / "b")
+        report(store.root / "runs" / "b")
 
 
 def under_another_recipe(store, *run_ids):
     for run_id in run_ids:
-        shutil.rmtree(store.runs_path / run_id)
-        table = segments(run_id, *lanes(3.0 * ord(run_id), -10.0, 10.0))
-        add_run(store, run_id, table, recipe=Recipe(label=LabelConfig(velocity="fused")))
+        shutil.rmtree(store.root / "runs" / run_id)
+        laid = segments(run_id, *lanes(3.0 * ord(run_id), -10.0, 10.0))
+        add_run(store, run_id, laid, recipe=Recipe(label=LabelConfig(velocity="fused")))
 
 
 def test_runs_that_have_to_be_ingested_again_are_told_each_time_unless_so_many_are_enough(store):
@@ -145,10 +151,10 @@ def test_runs_that_have_to_be_ingested_again_are_told_each_time_unless_so_many_a
 
 def test_runs_of_the_dataset_before_that_are_gone_are_told_once(store):
     build(store)
-    shutil.rmtree(store.runs_path / "c")
+    shutil.rmtree(store.root / "runs" / "c")
     assert build(store).problems == ("1 of the 4 runs of the dataset that is replaced are no longer in the store: c",)
     assert build(store).exit_code == 0
-    shutil.rmtree(store.runs_path / "d")
+    shutil.rmtree(store.root / "runs" / "d")
     result = build(store, min_runs=2)
     assert result.exit_code == 0
     assert any("no longer in the store: d" in line for line in result.warnings)
@@ -177,7 +183,7 @@ def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
 )
 def test_a_split_that_is_empty_is_told_each_time(store, tmp_path, x_m, holdout, said):
     for run_id in "bcd":
-        shutil.rmtree(store.runs_path / run_id)
+        shutil.rmtree(store.root / "runs" / run_id)
     region = region_file(tmp_path / "region.geojson", box(-20, -20, x_m, 20))
     for _ in range(2):
         result = build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), holdout=holdout, split=region)
@@ -193,9 +199,10 @@ def test_no_test_is_no_problem_where_none_is_wanted(store, tmp_path):
 def test_streams_that_are_not_as_they_were_written_are_made_again(store):
     """A lever arm stands in a footer that no page's checksum covers."""
     sensor = Sensor("/fix", "sensor_msgs/msg/NavSatFix", "gps", "the only one", (0.1, 0.0, 0.3), (0.0, 0.0, 0.0, 1.0))
-    store.write_streams("a", Streams({"gnss": STREAMS["gnss"].empty()}, {"gnss": sensor}, "husky"), key="k")
+    files = store.write_streams("a", Streams({"gnss": STREAMS["gnss"].empty()}, {"gnss": sensor}, "husky"), key="k")
+    store.write_run_json("a", replace(store.run_json("a"), streams=files, streams_key="k"))
     assert store.read_streams("a", key="k").sensors["gnss"].xyz_m == (0.1, 0.0, 0.3)
-    path = store.runs_path / "a" / "streams" / "gnss.parquet"
+    (path,) = store.root.glob("runs/a/streams/*/gnss.parquet")
     data = path.read_bytes()
     assert data.count(b"0.3") == 1
     path.write_bytes(data.replace(b"0.3", b"0.7"))

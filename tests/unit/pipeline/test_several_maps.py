@@ -20,7 +20,7 @@ from tcpipe.pipeline.dataset import sampling as dataset_sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
 from tcpipe.report.overview import joint_bounds_m, maps_overview
-from tcpipe.store import Store
+from tcpipe.store import open_store
 
 
 def put_map(store, directory, name, first_m, last_m, *, layers=("height", "ortho", "terrain"), crs=None):
@@ -37,15 +37,15 @@ def put_map(store, directory, name, first_m, last_m, *, layers=("height", "ortho
         "terrain": WORLD.terrain(x, y).astype(np.uint8),
     }
     paths = {layer: write_tif(directory / f"{layer}.tif", values[layer][None], WORLD.crs, affine) for layer in layers}
-    build_map(store.map_path(name), name=name, crs=crs, **paths)
+    with store.new_map(name) as path:
+        build_map(path, name=name, crs=crs, **paths)
 
 
 @pytest.fixture(scope="module")
 def store(tmp_path_factory):
     """Lanes across two overlapping maps, the eastern one in a national CRS on another datum."""
     directory = tmp_path_factory.mktemp("maps")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     put_map(store, directory, "west", -20.0, 4.0)
     put_map(store, directory, "east", -4.0, 20.0, crs="EPSG:31256")
     put_map(store, directory, "bare", -20.0, 20.0, layers=("height",))

@@ -2,22 +2,24 @@
 
 import json
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
+from pathlib import Path
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from map_worlds import World
-from synthetic_store import WORLD, add_run, box, lanes, region_file, segments, small_store
+from stored_files import manifest, run_document, table
+from synthetic_store import WORLD, add_run, box, lanes, put_map, region_file, segments, small_store
 
 from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError, UsageError
-from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
-from tcpipe.formats.parquet import write_table
+from tcpipe.formats.numbered import read_as_at
 from tcpipe.formats.record_files import Sighting
-from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_checksums, write_sealed
+from tcpipe.formats.run_documents import MapDocument
+from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_sealed
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.diff import diff
 from tcpipe.pipeline.explain import explain
@@ -27,7 +29,7 @@ from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe, SampleConfig
 from tcpipe.report.overview import quick_look, write_quick_look
 from tcpipe.store import Store
-from tcpipe.tables.levels import DATA_MODEL_VERSION, STREAMS
+from tcpipe.tables.levels import DATA_MODEL_VERSION, STREAMS, Sensor, Streams
 
 
 @pytest.fixture(scope="module")
@@ -67,22 +69,33 @@ def test_a_store_its_runs_and_its_map_verify(made):
     found = verify(made / "store")
     assert (found.problems, found.kind, found.read["runs"], found.read["maps"]) == ((), "store", 2, 1)
     assert verify(made / "store" / "runs" / "north").kind == "run"
-    assert verify(made / "store" / "maps" / "site.zarr").kind == "map"
+    assert verify(Store(made / "store").map_path("site")).kind == "map"
 
 
 def dress(store):
     """Add what `ingest`, `add-map` and `report` also leave in a store."""
     store.remember("logs/where/what", Sighting(("/logs/north.mcap",), (), "north"))
-    path = store.map_path("site")
-    write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
+    with store.new_map("site", after=1) as path:
+        shutil.copytree(store.map_path("site"), path)
+        write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
+    shutil.rmtree(store.map_path("site").parents[1] / replaced(store))
+    (store.root / "maps" / "site-1.json").unlink()
+    sensor = Sensor("/power", "x/msg/Power", "base", "the only one", None, None)
     for run in store.runs():
-        (run.path / "report.html").write_text(sealed_page("<p>\nwhat was driven\n</p>"))
-        streams = run.path.parent / "streams"
-        write_table(STREAMS["power"].empty(), streams / "power.parquet")
-        write_checksums(streams)
+        (Path(run.where) / "report.html").write_text(sealed_page("<p>\nwhat was driven\n</p>"))
+        files = store.write_streams(
+            run.run_id, Streams({"power": STREAMS["power"].empty()}, {"power": sensor}, "husky"), key="k"
+        )
+        store.write_run_json(run.run_id, replace(store.run_json(run.run_id), streams=files, robot="husky"))
+        run_document(run).with_name("run-1.json").unlink()
 
 
-SEALED = ("dataset.json", "report.html", "run.json", "manifest.json", "checksums.json")
+def replaced(store):
+    """The directory of the map that was there first."""
+    return read_as_at(store.place.below("maps"), "site-1.json", MapDocument).zarr.split("/")[1]
+
+
+SEALED = ("dataset.json", "report.html", "run-2.json", "manifest-1.json", "site-2.json", "store.json")
 
 
 @pytest.mark.parametrize("name", ["zarr", "parquet", "store"])
@@ -169,11 +182,11 @@ def test_rows_that_are_joined_to_others_patches_are_found(copy, name):
 
 def test_a_run_that_holds_anothers_segments_is_found(copy):
     store = copy("store")
-    north, south = (next((store / "runs" / name).glob("*/manifest.json")).parent for name in ("north", "south"))
-    shutil.copy(north / "segments.parquet", south / "segments.parquet")
-    manifest = json.loads((south / "manifest.json").read_text())
-    manifest["checksums"] = json.loads((north / "manifest.json").read_text())["checksums"]
-    write_sealed(south / "manifest.json", manifest)
+    north, south = (Store(store).recipes_of(name)[0] for name in ("north", "south"))
+    shutil.copytree(table(north, "segments").parent, Path(south.where) / table(north, "segments").parent.name)
+    found = json.loads(manifest(south).read_text())
+    found["checksums"] = json.loads(manifest(north).read_text())["checksums"]
+    write_sealed(manifest(south), found)
     problems = "\n".join(verify(store).problems)
     assert "holds segments of run_id north; wanted south" in problems
     assert "its segment ids are not the run's id" in problems
@@ -191,22 +204,24 @@ def test_files_that_went_or_came_are_found(copy):
 
 def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
     store = copy("store")
-    layers = store / "maps" / "site.zarr"
+    layers = Store(store).map_path("site")
     flip(files(layers / "height" / "c")[0])
     shutil.rmtree(layers / "ortho" / "c")
-    shutil.rmtree(store / "runs" / "north" / next((store / "runs" / "north").glob("*/manifest.json")).parent.name)
+    shutil.rmtree(Store(store).recipes_of("north")[0].where)
+    assert any("height, rows 0" in problem for problem in verify(layers).problems)
+    assert any("ortho covers 0.000000%" in problem for problem in verify(layers).problems)
     problems = verify(store).problems
-    for words in ("height, rows 0", "ortho covers 0.000000%", "north: holds no finished ingestion"):
+    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is gone", "north: holds no finished ingestion"):
         assert any(words in problem for problem in problems), words
 
 
 def test_a_manifest_that_counts_otherwise_is_found(copy):
     store = copy("store")
-    path = next((store / "runs" / "south").glob("*/manifest.json"))
-    manifest = json.loads(path.read_text())
-    manifest["counts"]["segments"] += 1
-    manifest["ledger_m"]["kept"] += 1.0
-    write_sealed(path, manifest)
+    path = manifest(Store(store).recipes_of("south")[0])
+    found = json.loads(path.read_text())
+    found["counts"]["segments"] += 1
+    found["ledger_m"]["kept"] += 1.0
+    write_sealed(path, found)
     problems = verify(store).problems
     assert any("segments is 225, but segments.parquet has 224 rows" in problem for problem in problems)
     assert any("the ledger keeps 225.000 m" in problem for problem in problems)
@@ -214,25 +229,34 @@ def test_a_manifest_that_counts_otherwise_is_found(copy):
 
 def test_strange_files_in_a_store_are_named_and_what_a_killed_command_left_behind(copy):
     store = copy("store")
-    strange = ("maps/notes.txt", "runs/notes.txt", "runs/north/notes.txt", "maps/site.zarr/height/notes.txt")
-    for name in (*strange, f"{next((store / 'runs' / 'south').glob('*/manifest.json')).parent}/notes.txt"):
+    stored, map_path = Store(store), Store(store).map_path("site").relative_to(store)
+    recipe = Path(stored.recipes_of("south")[0].where).relative_to(store)
+    strange = ("notes.txt", "maps/notes.txt", "runs/north/notes.txt", f"{recipe}/notes.txt")
+    for name in (*strange, f"{map_path}/height/notes.txt"):
         (store / name).write_text("mine")
-    (store / "runs" / ".tmp-north-1").mkdir()
+    (recipe_left := store / recipe / "0123456789abcdef").mkdir()
+    (recipe_left / "track.parquet").touch()
+    (store / ".tmp-new-01234567").mkdir()
     problems = verify(store).problems
-    assert sum("is no file of this store" in problem for problem in problems) == 5
-    assert next(problem for problem in problems if "killed" in problem).startswith(str(store / "runs" / ".tmp-north-1"))
-    assert len(problems) == 6
+    assert sum("is no file of this store" in problem for problem in problems) == 4
+    assert sorted(problem.partition(": ")[0] for problem in problems if "killed" in problem) == sorted(
+        str(store / name)
+        for name in (".tmp-new-01234567", recipe_left / "track.parquet", f"{map_path}/height/notes.txt")
+    )
+    assert len(problems) == 7
 
 
 def test_an_ingestion_that_lost_its_manifest_or_a_table_does_not_hide_behind_another(copy):
     store = copy("store")
-    run = next((store / "runs" / "north").glob("*/manifest.json")).parent
-    shutil.copytree(run, run.with_name("00000000"))
-    (run / "manifest.json").unlink()
-    (run.with_name("00000000") / "track.parquet").unlink()
+    run = Store(store).recipes_of("north")[0]
+    other = Path(run.where).with_name("00000000")
+    shutil.copytree(run.where, other)
+    manifest(run).unlink()
+    (lost,) = other.glob("*/track.parquet")
+    lost.unlink()
     problems = "\n".join(verify(store).problems)
-    assert f"{run / 'manifest.json'}: cannot be read" in problems
-    assert f"{run.with_name('00000000') / 'track.parquet'}: is gone" in problems
+    assert f"{table(run, 'track')}: was left behind" in problems
+    assert f"{lost}: is gone" in problems
 
 
 def test_what_is_none_of_these_is_said(tmp_path):
@@ -258,7 +282,7 @@ def test_a_sample_is_explained_and_comes_out_the_same(made, name):
 
 def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path):
     store = Store(copy("store"))
-    shutil.rmtree(store.runs_path / "north")
+    shutil.rmtree(store.root / "runs" / "north")
     start, end = lanes(1.0 + 2.0 * np.arange(8), -14.0, 14.0)
     table = segments("north", start, end, start_ns=int(1e18 + 1e12))
     power = table.column("power_watt").to_numpy() + 1.0
@@ -275,9 +299,9 @@ def test_a_pixel_or_a_label_that_is_not_the_stores_is_found(copy, made, tmp_path
 def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
     store = Store(copy("store"))
     sample = open_dataset(made / "zarr")["train"].samples["sample_id"][0].as_py()
-    build_map(
-        store.map_path("site"),
-        name="site",
+    put_map(
+        store,
+        "site",
         height=made / "rasters" / "height.tif",
         inputs=MapInputs({"height": {"height.tif": "another"}}),
     )
@@ -285,9 +309,9 @@ def test_a_map_that_was_replaced_is_named_as_the_reason(made, copy, tmp_path):
     assert "terrain: map site has no such layer any more" in found
     assert found[-1] == "map site was added anew since, from other files"
     elsewhere = World(WORLD.crs, WORLD.x_m + 500.0, WORLD.y_m, side_m=20.0).write(tmp_path, pitch_m=0.2)
-    build_map(
-        store.map_path("site"),
-        name="site",
+    put_map(
+        store,
+        "site",
         height=elsewhere["height"],
         inputs=MapInputs({"height": {"height.tif": "another"}}),
     )

@@ -8,7 +8,7 @@ from tcpipe.dataset import open_dataset
 from tcpipe.errors import DatasetError
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.unknown_robots import alike
-from tcpipe.store import Store
+from tcpipe.store import open_store
 from tcpipe.tables.levels import Sensor
 
 
@@ -41,8 +41,7 @@ def test_what_is_one_robot(other, groups):
 
 @pytest.fixture
 def store(tmp_path):
-    store = Store(tmp_path / "store")
-    store.root.mkdir()
+    store = open_store(tmp_path / "store", create=True)
     add_world(store, tmp_path / "rasters")
     sensors = {"a": ROVER, "b": {"imu": sensor("/imu/data", frame="base_imu")}, "c": ROVER}
     for number, (run_id, of) in enumerate(sensors.items()):

@@ -14,7 +14,7 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import CovariateConfig, Recipe, SampleConfig, SplitConfig
 from tcpipe.robots.profiles import Robot
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 
 START_NS = 1_760_000_000 * 10**9
 DAY_NS = 86_400 * 10**9
@@ -26,8 +26,7 @@ LOADS = {"a": "0", "b": "12.5", "c": "0", "d": "2e1"}
 def store(tmp_path_factory):
     """Four runs of a lane and a day each, tagged."""
     directory = tmp_path_factory.mktemp("tagged")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory)
     for day, run_id in enumerate(SEASONS):
         table = segments(run_id, *lanes(np.array([3.0 * day]), -10.0, 10.0), start_ns=START_NS + day * DAY_NS)

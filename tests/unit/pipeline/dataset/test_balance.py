@@ -13,7 +13,7 @@ from synthetic_store import WORLD, add_run, add_world, box, lanes, region_file, 
 from tcpipe.balance.cells import SLOPE_NAMES, slope_ranges
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 
 CLOSED = box(-19, -19, -5, 19)
 NOISE_WATT = 7.0
@@ -23,8 +23,7 @@ NOISE_WATT = 7.0
 def built(tmp_path_factory):
     """Eight lanes that are driven twice, the second time a little off and with other noise, and one that is driven back."""
     directory = tmp_path_factory.mktemp("balance")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory / "rasters")
     rng = np.random.default_rng(0)
     start, end = lanes(-15.0 + 4.0 * np.arange(8), -4.0, 16.0)

@@ -14,15 +14,14 @@ from tcpipe.formats.recipe_toml import recipe_id
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import LabelConfig, Recipe, SplitConfig
-from tcpipe.store import Store
+from tcpipe.store import Store, open_store
 
 
 @pytest.fixture(scope="module")
 def map_store(tmp_path_factory):
     """A store with the map alone."""
     directory = tmp_path_factory.mktemp("maps")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory)
     return store
 

@@ -11,7 +11,7 @@ from tcpipe.formats.dataset_card import RunSource
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.dataset.findings import doubt_in_words, doubtful, findings_in_words, findings_of_runs
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 
 LATE = "gnss: its stamps seem {} s late against imu (± 0.01 s, by speed)"
@@ -55,8 +55,7 @@ def test_any_bit_makes_a_sample_doubtful_once():
 
 
 def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_found(tmp_path):
-    store = Store(tmp_path / "store")
-    store.root.mkdir()
+    store = open_store(tmp_path / "store", create=True)
     add_world(store, tmp_path)
     table = segments("a", *lanes([0.0], -10.0, 10.0))
     place = table.column_names.index("position_std_m")
@@ -74,8 +73,7 @@ def test_where_no_position_is_sure_enough_it_is_said_how_sure_and_what_ingest_fo
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     directory = tmp_path_factory.mktemp("found")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory)
     for number, run_id in enumerate("ab"):
         table = segments(run_id, *lanes([4.0 * number], -10.0, 10.0), start_ns=number * 10**12)

@@ -9,7 +9,7 @@ from tcpipe.errors import MapError
 from tcpipe.formats.dataset_files import read_card
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 from tcpipe.tables.levels import GATED_TRACK
 
 GEOID_M = 46.3
@@ -40,8 +40,7 @@ def winding(count=3000):
 @pytest.fixture(scope="module")
 def built(tmp_path_factory):
     directory = tmp_path_factory.mktemp("registered")
-    store = Store(directory / "store")
-    store.root.mkdir()
+    store = open_store(directory / "store", create=True)
     add_world(store, directory)
     xy = winding()
     for number, (run_id, shift_m, std_m) in enumerate(
@@ -83,8 +82,7 @@ def test_how_the_heights_rise_and_what_they_miss_is_on_the_card(built):
 
 @pytest.mark.parametrize(("scale", "wrong"), [(0.3048, "in feet"), (1.4, "rise by 0.71 m")])
 def test_a_map_that_rises_otherwise_than_the_track_is_refused_or_named(tmp_path, scale, wrong):
-    store = Store(tmp_path / "store")
-    store.root.mkdir()
+    store = open_store(tmp_path / "store", create=True)
     add_world(store, tmp_path)
     xy = winding()
     start, end = lanes([0.0], -10.0, 10.0)
@@ -101,8 +99,7 @@ def test_a_map_that_rises_otherwise_than_the_track_is_refused_or_named(tmp_path,
 
 def test_ground_that_is_not_the_maps_is_a_warning(tmp_path):
     """Heights of 1.5 m of brushwood that the map has not."""
-    store = Store(tmp_path / "store")
-    store.root.mkdir()
+    store = open_store(tmp_path / "store", create=True)
     add_world(store, tmp_path)
     xy = winding()
     track = track_at(xy, xy)

@@ -3,8 +3,8 @@
 It was run once, with tcpipe 0.2.0 at commit 755ebd5, the last that wrote data model 1.0; what it made is kept and never made again:
 
     git worktree add /tmp/tcpipe-1.0 755ebd5
-    cp tests/data/make_store_1_0.py /tmp/tcpipe-1.0
-    cd /tmp/tcpipe-1.0 && PYTHONPATH=. python make_store_1_0.py store-1.0.tar.xz
+    cp tests/data/make_kept_store.py /tmp/tcpipe-1.0
+    cd /tmp/tcpipe-1.0 && PYTHONPATH=. python make_kept_store.py store-1.0.tar.xz
 
 A simulated drive of half a minute, its sensors slowed down, and rasters of half a metre over 26 m x 22 m keep it small. The log itself
 is left out.

@@ -1,0 +1,149 @@
+"""Finished ingestions as they lie in a store: their documents and tables, each proved when it is read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+
+import pyarrow as pa
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.numbered import digest_of, read_as_at
+from tcpipe.formats.parquet import highest, lowest, read_table, write_table
+from tcpipe.formats.place import Place
+from tcpipe.formats.run_documents import Manifest, ManifestHead
+from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
+from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
+
+
+@dataclass(frozen=True, slots=True)
+class RunDirectory:
+    """One finished ingestion: a run under one recipe."""
+
+    run_id: str
+    recipe_id: str
+    place: Place
+    """``runs/<run_id>/<recipe_id>``."""
+    facts: RunFacts
+    """What the index has of it: enough to choose by."""
+    files_state: str
+    """Tells its segments and track from files that were written since."""
+
+    @property
+    def manifest(self) -> Manifest:
+        """The whole manifest, with the run's tags as they are now; `StoreError` if it is not as it was written."""
+        return replace(_manifest(self.place, self.facts.state), tags=self.facts.tags)
+
+    @property
+    def where(self) -> str:
+        """Path or URL of its place."""
+        return self.place.where()
+
+    def checksum(self, name: str) -> Checksum:
+        """Return what the manifest has of ``track.parquet`` and such."""
+        return self.manifest.checksums[self._name(name)]
+
+    def file(self, name: str) -> Path:
+        """Return ``track.parquet`` and such on this machine, proved; `StoreError` if it is not as it was written."""
+        return local_file(self.place, self._name(name), self.checksum(name))
+
+    def table(self, name: str, columns: Sequence[str] | None = None) -> pa.Table:
+        """Read ``track``, ``segments`` or ``rejections``, or some of its columns; `StoreError` if it is not as it was written."""
+        columns = None if columns is None else list(columns)
+        return read_table(self.file(f"{name}.parquet"), columns).replace_schema_metadata(None)
+
+    def prove(self, *names: str) -> None:
+        """Compare files with what the manifest has of them; `StoreError` names the first that is not as it was written."""
+        for name in names:
+            self.file(name)
+
+    def segments(self) -> pa.Table:
+        """Read the labelled segments (schema LABELLED_SEGMENTS; columns that an earlier data model lacks are null)."""
+        return LABELLED_SEGMENTS.completed(self.table("segments"))
+
+    def track(self) -> GatedTrack:
+        """Read the gated track as a checked level."""
+        return GatedTrack(self.table("track"), self.manifest.info)
+
+    def rejections(self) -> pa.Table:
+        """Read the measurements that the filter refused (schema REJECTIONS)."""
+        return self.table("rejections")
+
+    def _name(self, name: str) -> str:
+        found = next((of for of in self.manifest.checksums if PurePosixPath(of).name == name), None)
+        if found is None:
+            raise StoreError(f"{self.where}: its manifest lists no {name}; ingest the log again")
+        return found
+
+
+@dataclass(frozen=True, slots=True)
+class Ingestions:
+    """What a store, or one of its runs, holds of finished ingestions."""
+
+    finished: tuple[RunDirectory, ...]
+    """Those of this data-model version, by run and recipe."""
+    outdated: Mapping[str, ManifestHead]
+    """By run, of those that are finished in other data-model versions only: the last."""
+    damaged: Mapping[tuple[str, str], str]
+    """By run and recipe: what is not as it was written."""
+    superseded: Mapping[str, str] = field(default_factory=dict)
+    """Runs whose log was completed or repaired, which are in none of the others, and the run that took their place."""
+    rows: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
+    """Of the index, by run and recipe: of all that are finished, those of superseded runs too."""
+    stale: bool = False
+    """Whether the index has to be written again."""
+
+
+@lru_cache(maxsize=64)
+def _manifest(place: Place, state: str) -> Manifest:
+    """Return the manifest whose file is in this state, which begins with its name."""
+    return read_as_at(place, state.rsplit("-", 2)[0], Manifest)
+
+
+def with_span(row: RunFacts, place: Place, manifest: Manifest) -> RunFacts:
+    """Return a row with when its segments begin and end, from the statistics of their file; without where it has none."""
+    name = row.segments_file.removeprefix(f"runs/{row.run_id}/{row.recipe_id}/")
+    with suppress(StoreError):
+        if row.segments:
+            path = place.local(name, manifest.checksums[name])
+            return replace(row, start_ns=lowest(path, "start_ns"), end_ns=highest(path, "end_ns"))
+    return row
+
+
+@contextmanager
+def told_of(where: str, directory: Path) -> Iterator[None]:
+    """Tell what goes wrong in a working directory of the place for which it is."""
+    try:
+        yield
+    except StoreError as error:
+        raise StoreError(*(problem.replace(str(directory), where) for problem in error.problems)) from error.__cause__
+
+
+def put_tables(place: Place, tables: Mapping[str, pa.Table], *, folder: str = "") -> dict[str, Checksum]:
+    """Put tables as Parquet into a directory named after their content; return the files."""
+    with place.workshop() as directory:
+        with told_of(place.where(folder), directory):
+            for name, table in tables.items():
+                write_table(table, directory / f"{name}.parquet")
+        checksums = file_checksums(directory)
+        prefix = f"{folder}{digest_of(checksums)}"
+        place.put_files(prefix, directory)
+    return below(prefix, checksums)
+
+
+def below(prefix: str, checksums: Mapping[str, Checksum]) -> dict[str, Checksum]:
+    """Return checksums by the names that their files have where ``prefix`` lies."""
+    return {f"{prefix}/{name}": of for name, of in checksums.items()}
+
+
+def local_file(place: Place, name: str, wanted: Checksum) -> Path:
+    """Return a file on this machine, proved; `StoreError` if it is not as it was written."""
+    path = place.local(name, wanted)
+    wrong = wrong_checksum(place.where(name), file_checksum(path) if path.is_file() else None, wanted)
+    if wrong:
+        raise StoreError(f"{wrong}; 'tcpipe verify {place.where()}' tells what else is not as it was written")
+    return path

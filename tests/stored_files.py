@@ -1,0 +1,37 @@
+"""Where the files of a store lie, for tests that damage or count them."""
+
+from pathlib import Path
+
+from tcpipe.formats.numbered import name_of, numbers
+from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.store import Store
+
+
+def last(directory: Path, stem: str) -> Path:
+    """The document of the highest number in a directory."""
+    number = numbers(path.name for path in directory.iterdir())[stem]
+    return directory / name_of(stem, number)
+
+
+def manifest(run: RunDirectory) -> Path:
+    return last(Path(run.where), "manifest")
+
+
+def run_document(run: RunDirectory) -> Path:
+    return last(Path(run.where).parent, "run")
+
+
+def table(run: RunDirectory, name: str) -> Path:
+    """The file of ``segments`` and such."""
+    (path,) = Path(run.where).glob(f"*/{name}.parquet")
+    return path
+
+
+def tables(store: Path, name: str = "segments") -> list[Path]:
+    """The files of ``segments`` and such of all runs of a store, by path."""
+    return [table(run, name) for run in Store(store).runs()]
+
+
+def only_run(store: Path) -> RunDirectory:
+    (run,) = Store(store).runs()
+    return run

@@ -1,0 +1,233 @@
+"""The protocol of the store, on disk and in a bucket: what readers see of writers that are killed, race, replace or copy by halves."""
+
+import shutil
+import uuid
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from object_gateway import gateway, in_environment  # noqa: F401  a fixture
+from storage_server import OVERWRITING, READ_ONLY, object_store
+from stored_files import manifest, table
+from synthetic_store import add_run, lanes, segments
+
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.bucket import BucketPlace
+from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.run_documents import LogOrigin, RunJson
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.verify import verify
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store, open_store
+
+RUN = "north"
+
+
+@pytest.fixture(params=["directory", "bucket", "gateway"])
+def root(request, tmp_path, monkeypatch):
+    """Where a store is to be."""
+    if request.param == "directory":
+        yield tmp_path / "store"
+    elif request.param == "gateway":
+        in_environment(monkeypatch, request.getfixturevalue("gateway"), tmp_path / "cache")
+        yield f"s3://tests/{uuid.uuid4().hex}/a store"
+    else:
+        (tmp_path / "served" / "tests").mkdir(parents=True)
+        with object_store(tmp_path / "served") as (environment, _):
+            in_environment(monkeypatch, environment, tmp_path / "cache")
+            yield "s3://tests/a store"
+
+
+def put(store: Store, length_m: float = 10.0, **how: object) -> None:
+    add_run(store, RUN, segments(RUN, *lanes(0.0, 0.0, length_m)), **how)
+
+
+def contents(store: Store) -> dict[str, bytes | None]:
+    return {entry.name: store.place.read(entry.name) for entry in store.place.entries()}
+
+
+def counted(store: Store) -> list[int]:
+    """Segments of each run, as a reader finds them."""
+    return [run.segments().num_rows for run in store.runs()]
+
+
+class _Killed(BaseException):
+    pass
+
+
+def test_killed_at_any_step_a_reader_finds_the_generation_before_and_the_next_call_completes(root, monkeypatch):
+    left = [0]
+
+    def step():
+        if not left[0]:
+            raise _Killed
+        left[0] -= 1
+
+    def killing(act):
+        def acts(*args, **how):
+            step()
+            found = act(*args, **how)
+            step()
+            return found
+
+        return acts
+
+    undisturbed, store = (open_store(f"{root}-{name}", create=True) for name in "ab")
+    for each in (undisturbed, store):
+        put(each)
+    put(undisturbed, 12.0)
+    with monkeypatch.context() as patch:
+        for place in (DirectoryPlace, BucketPlace):
+            for name in ("put", "put_new", "put_files", "delete"):
+                patch.setattr(place, name, killing(getattr(place, name)))
+        for steps in range(100):
+            left[0] = steps
+            with suppress(_Killed):
+                put(store, 12.0)
+                break
+            assert counted(store) in ([10], [12])
+    assert steps > 3
+    assert counted(store) == [12]
+    assert contents(store) == contents(undisturbed)
+    assert verify(store.root).problems == ()
+
+
+def test_of_two_who_make_a_run_the_first_wins_and_what_replaces_it_is_a_new_number(root):
+    store = open_store(root, create=True)
+    put(store)
+    (first,) = store.runs()
+    tables = {"track": first.track().table, "segments": first.segments(), "rejections": first.rejections()}
+
+    class _Level:
+        def __init__(self, table: object, rejections: object = None) -> None:
+            self.table, self.rejections = table, rejections
+
+    def write(warning: str, *, force: bool = False) -> object:
+        made = replace(first.manifest, warnings=(warning,), checksums={})
+        levels = {"track": _Level(None, tables["rejections"]), "gated": _Level(tables["track"])}
+        return store.write_run(
+            made, **levels, labelled=_Level(tables["segments"]), settled=lambda _: not force
+        ).manifest.warnings
+
+    assert write("mine") == ()
+    assert write("mine", force=True) == ("mine",)
+    assert write("mine", force=True) == ("mine",)
+    assert store.runs()[0].place.files() == ["manifest-1.json", "manifest-2.json"]
+    assert store.runs()[0].manifest.warnings == ("mine",)
+
+
+def test_tags_of_two_writers_are_both_kept(root, monkeypatch):
+    store = open_store(root, create=True)
+    put(store)
+    place = type(store.place)
+    put_new = place.put_new
+
+    def later(self, name, data):
+        monkeypatch.setattr(place, "put_new", put_new)
+        assert store.tag_run(RUN, {"driver": "Eva"})
+        return put_new(self, name, data)
+
+    monkeypatch.setattr(place, "put_new", later)
+    assert store.tag_run(RUN, {"weather": "wet"})
+    assert not store.tag_run(RUN, {"driver": "Eva"})
+    wanted = {"driver": "Eva", "weather": "wet"}
+    assert store.run_json(RUN).tags == store.runs()[0].manifest.tags == wanted
+
+
+def test_a_recording_is_one_run_whoever_names_it_first(root, monkeypatch):
+    store = open_store(root, create=True)
+    sha256 = "abcdef01" * 8
+    free = Store._free_name
+
+    def meanwhile(self, stem, of):
+        monkeypatch.setattr(Store, "_free_name", free)
+        assert store.claim_run("copy", of) == "copy-abcdef01"
+        return free(self, stem, of)
+
+    monkeypatch.setattr(Store, "_free_name", meanwhile)
+    assert store.claim_run("drive", sha256) == "copy-abcdef01"
+    store.write_run_json("copy-abcdef01", RunJson(LogOrigin(("/drive.bag",), sha256)))
+    assert store.run_of(sha256, store.run_ids_by_hash()) == "copy-abcdef01"
+
+
+def test_what_a_copier_left_by_halves_is_named_and_not_used(tmp_path):
+    store = open_store(tmp_path / "store", create=True)
+    put(store)
+    (run,) = store.runs()
+    path = table(run, "track")
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-10])
+    assert store.runs() == []
+    assert f"track.parquet: has {len(whole) - 10} bytes, wanted {len(whole)}" in next(
+        iter(store.ingestions().damaged.values())
+    )
+    path.unlink()
+    assert "track.parquet: is gone" in next(iter(store.ingestions().damaged.values()))
+    path.write_bytes(whole)
+    manifest(run).unlink()
+    assert inspect(store.root, recipe=Recipe()).unfinished == (RUN,)
+    (store.root / "store.json").unlink()
+    with pytest.raises(UsageError, match="earlier data model, or of which not all was copied"):
+        open_store(store.root)
+
+
+def test_a_store_is_moved_by_copying_its_files(root, tmp_path):
+    store = open_store(root, create=True)
+    put(store)
+    for entry in store.place.entries():
+        path = tmp_path / "moved" / entry.name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(store.place.read(entry.name))
+    assert counted(Store(tmp_path / "moved")) == [10]
+    assert verify(tmp_path / "moved").problems == ()
+
+
+def test_a_store_of_a_later_layout_is_refused(tmp_path, monkeypatch):
+    with monkeypatch.context() as later:
+        later.setattr("tcpipe.formats.store_mark.DATA_MODEL_VERSION", "3.0")
+        open_store(tmp_path / "store", create=True)
+    with pytest.raises(StoreError, match=r"is of data model 3\.0, this version knows 1\.0, .*, 2\.0"):
+        open_store(tmp_path / "store")
+
+
+def test_a_bucket_that_keeps_no_two_writers_apart_or_cannot_be_written_is_refused(tmp_path, monkeypatch):
+    for name in (OVERWRITING, READ_ONLY):
+        (tmp_path / "served" / name).mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, _):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        for _ in range(2):
+            with pytest.raises(StoreError, match=r"s3://overwriting/x: this object store overwrites what is there"):
+                open_store("s3://overwriting/x", create=True)
+        with pytest.raises(
+            StoreError, match=r"s3://read-only/x/store.json: it cannot be written \(the credentials .*; name another"
+        ):
+            open_store("s3://read-only/x", create=True)
+        with pytest.raises(UsageError, match="s3://read-only/x: there is no store here"):
+            open_store("s3://read-only/x")
+
+
+def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, monkeypatch):
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        store = open_store("s3://tests/store", create=True)
+        put(store)
+        for _ in range(2):
+            assert counted(store) == [10]
+        assert sum(name.endswith("segments.parquet") for name in fetched) == 1
+        (path,) = (tmp_path / "served").rglob("segments.parquet")
+        path.write_bytes(b"x" * path.stat().st_size)
+        shutil.rmtree(tmp_path / "cache")
+        with pytest.raises(StoreError, match=r"s3://tests/store/runs/north/.*/segments.parquet: its sha256 is"):
+            store.runs()[0].segments()
+        assert any("segments.parquet: its sha256 is" in problem for problem in verify("s3://tests/store").problems)
+
+
+def test_paths_lead_to_runs_and_recipes(root):
+    store = open_store(root, create=True)
+    put(store)
+    (run,) = store.runs()
+    for path in (f"{root}/runs/{RUN}", run.where):
+        found = verify(path if "://" in str(path) else Path(path))
+        assert (found.kind, found.problems) == ("run", ())
