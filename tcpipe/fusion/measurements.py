@@ -127,11 +127,11 @@ class Measurements:
     """
 
     gnss: Positions | None = None
-    doppler: GroundVelocities | None = None
     imu: InertialMeasurements | None = None
     wheels: BodyVelocities | None = None
     visual: BodyVelocities | None = None
     nonholonomic_std_mps: float = 0.15
+    doppler: GroundVelocities | None = None
 
     def sensors(self) -> dict[str, Positions | GroundVelocities | InertialMeasurements | BodyVelocities]:
         """Return the sensors that are there, by role."""
