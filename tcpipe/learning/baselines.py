@@ -33,6 +33,9 @@ SIMPLEST_FIRST = (*CURVES.values(), PHYSICS, TREES)
 _FEWEST_RUNS = 10
 """Runs of a split that are drawn as wholes; of fewer, blocks of ground are."""
 
+_ALIKE = 1.005
+"""Ratio up to which errors are the same: by digits of rounding nobody is better."""
+
 Predictor = Callable[[Split], Array]
 """Power [W] and velocity [m/s] of the samples of a split, shape (N, 2)."""
 
@@ -198,6 +201,6 @@ def _verdict(rows: Sequence[Compared]) -> str:
     simplest = (
         "" if equal == best.baseline else f"; already '{equal}' is no worse than the model, as far as can be told"
     )
-    if ratio.low > 1.0:
+    if ratio.low > 1.0 and (ratio.value or 0.0) > _ALIKE:
         return f"'{best.baseline}' is better than the model by {100.0 * (1.0 - 1.0 / (ratio.value or 1.0)):.0f} % ({sure}){simplest}"
     return f"the model and '{best.baseline}' cannot be told apart ({sure}){simplest}"

@@ -114,5 +114,7 @@ def test_who_is_better_is_said_in_words():
     assert verdicts([mean, alike])[0].startswith(
         "unseen, energy E: the model and 'class and slope, spline' cannot be told apart"
     )
+    rounded = row("physics", 4.5, Ratio(1.0001, 1.00005, 1.0002))
+    assert "cannot be told apart" in verdicts([mean, rounded])[0]
     assert "34 runs are too few" in verdicts([row("physics", 5.0, Ratio(0.5, None, None))])[0]
     assert verdicts([row("physics", 5.0, Ratio(None, None, None))]) == []
