@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-dagster test-mutants check check-and-train kernels lock schemas docs clean
+.PHONY: help demo test test-object-storage test-dagster test-mutants check check-and-train kernels lock schemas docs clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -53,6 +53,11 @@ test: .venv/installed-dev
 
 check-and-train: check
 	$(if $(TORCH),$(MAKE) .venv/installed-train)
+
+# Stores in a real object store: OBJECT_STORAGE is a program that starts and stops one below a directory, which `start` fills with `env`.
+OBJECT_STORAGE ?= ../shared/tools/object-storage
+test-object-storage: .venv/installed-dev
+	TCPIPE_TEST_OBJECT_STORAGE=$(abspath $(OBJECT_STORAGE)) $(BIN)/pytest -k gateway tests/unit/test_store.py tests/unit/formats/test_place.py
 
 # Compiled while one core checks and installs, those of both estimators: each worker of the tests would compile them for itself.
 kernels: .venv/installed-dev

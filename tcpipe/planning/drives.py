@@ -14,11 +14,12 @@ from tcpipe.cost.prediction_errors import COVERAGE, Errors, errors_of
 from tcpipe.dataset import Dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError, UsageError
+from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.reasons import Reason
 from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
 from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
-from tcpipe.store import RunDirectory, Store
+from tcpipe.store import Store
 from tcpipe.tables.bits import name_of
 from tcpipe.tables.columns import floats
 from tcpipe.terrain.patches import patch_frames
