@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import fields, is_dataclass
-from functools import cache
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -59,7 +59,30 @@ def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
 
 def ingest_key(recipe: Recipe | Mapping[str, Json]) -> str:
     """Return the hash (hex) of what rules a run's files in a recipe or in what a manifest holds of one; the dataset's sections do not."""
-    values = plain(recipe.ingest) if isinstance(recipe, Recipe) else recipe
+    if isinstance(recipe, Recipe):
+        return _key_of(_Itself(recipe))
+    return _key_of_values(recipe)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Itself:
+    """One recipe, equal to itself alone: a thousand logs ask for the key of the same one."""
+
+    recipe: Recipe
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Itself) and other.recipe is self.recipe
+
+    def __hash__(self) -> int:
+        return id(self.recipe)
+
+
+@lru_cache(maxsize=4)
+def _key_of(of: _Itself) -> str:
+    return _key_of_values(plain(of.recipe.ingest))
+
+
+def _key_of_values(values: Mapping[str, Json]) -> str:
     names = [section.name for section in fields(IngestSections)]
     return digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
 
