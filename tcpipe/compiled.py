@@ -11,10 +11,10 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import shutil
 import stat
 import tempfile
 from collections.abc import Callable
-from contextlib import suppress
 from numbers import Number
 from typing import Any
 
@@ -50,7 +50,7 @@ def kernel(function: Callable[..., Any]) -> Any:
     try:
         compiled = numba.njit(**options)(function)
     except RuntimeError:  # numba finds no place to write its cache
-        numba.config.CACHE_DIR = _cache_directory()
+        numba.config.CACHE_DIR = _cache_directory(numba.config.CACHE_DIR)
         compiled = numba.njit(**options)(function)
     if isinstance(compiled, Dispatcher):  # it is none where NUMBA_DISABLE_JIT is set
         index = _index_of(compiled)
@@ -85,11 +85,21 @@ def _is_plain(value: object) -> bool:
     return all(map(_is_plain, value)) if isinstance(value, tuple) else isinstance(value, Number | str)
 
 
-def _cache_directory() -> str:
-    """Return a temporary directory that nobody else can write to: numba executes what it finds there."""
+def _cache_directory(compiled: str = "") -> str:
+    """Return a temporary directory that nobody else can write to: numba executes what it finds there.
+
+    It begins with what was ``compiled`` before, in a directory that cannot be written to: numba reads none of such.
+    """
     directory = f"{tempfile.gettempdir()}/tcpipe-kernels-{os.getuid()}"
-    with suppress(FileExistsError):
-        os.mkdir(directory, mode=0o700)  # noqa: PTH102  stages reach no pathlib
+    if not os.path.lexists(directory):
+        new = tempfile.mkdtemp(prefix="tcpipe-kernels-")
+        if os.path.isdir(compiled):  # noqa: PTH112
+            shutil.copytree(compiled, new, dirs_exist_ok=True, copy_function=shutil.copyfile)
+        os.chmod(new, 0o700)  # noqa: PTH101
+        try:
+            os.rename(new, directory)  # noqa: PTH104
+        except OSError:  # another process was first
+            shutil.rmtree(new)
     found = os.lstat(directory)
     ours = stat.S_ISDIR(found.st_mode) and found.st_uid == os.getuid() and not found.st_mode & 0o022
     return directory if ours else tempfile.mkdtemp(prefix="tcpipe-kernels-")

@@ -135,6 +135,14 @@ def test_an_imu_in_degrees_or_in_g_is_refused_until_it_is_declared(drive, tmp_pa
     assert "imu" in fused(declared)
 
 
+def test_an_imu_that_feels_nothing_is_not_used_and_said(drive, tmp_path):
+    mute = drive.changed("imu", lambda c: {n: 0.0 * v for n, v in c.items() if n.startswith("linear_acceleration.")})
+    labelled = run(mute, tmp_path)
+    assert refused(labelled) == {"imu"}
+    assert any("its specific force is zero throughout" in line for line in labelled.info.findings.warnings)
+    assert_labels_hold(labelled, drive.truth)
+
+
 def test_degrees_are_seen_without_any_odometry(drive, tmp_path):
     other = drive.without("wheels", "visual").changed(
         "imu", lambda c: {n: v * np.degrees(1.0) for n, v in c.items() if n.startswith("angular_velocity.")}

@@ -117,3 +117,12 @@ def test_a_link_is_not_trusted(temporary):
     (temporary / "elsewhere").mkdir()
     (temporary / f"tcpipe-kernels-{os.getuid()}").symlink_to(temporary / "elsewhere")
     assert _cache_directory() != str(temporary / f"tcpipe-kernels-{os.getuid()}")
+
+
+def test_what_was_compiled_into_a_directory_that_cannot_be_written_to_is_taken_along(temporary, tmp_path):
+    (tmp_path / "image" / "deep").mkdir(parents=True)
+    (tmp_path / "image" / "deep" / "kernel.nbi").write_bytes(b"compiled")
+    (tmp_path / "image").chmod(0o555)
+    first = Path(_cache_directory(str(tmp_path / "image")))
+    assert (first / "deep" / "kernel.nbi").read_bytes() == b"compiled"
+    assert first.stat().st_mode & 0o777 == 0o700

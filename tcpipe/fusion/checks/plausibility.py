@@ -55,9 +55,11 @@ def yaw_axis(yaw_rate_radps: Floats, rate: Floats) -> YawAxis | None:
 
 
 def up_axis(force: Floats) -> Floats:
-    """Return the direction of the mean specific force (N, 3), shape (3,)."""
-    mean: Floats = np.mean(force / np.linalg.norm(force, axis=1, keepdims=True), axis=0)
-    return mean / np.linalg.norm(mean)
+    """Return the direction of the mean specific force (N, 3), shape (3,); of none at all that is z."""
+    size = np.linalg.norm(force, axis=1, keepdims=True)
+    mean: Floats = np.mean(np.divide(force, size, out=np.zeros_like(force), where=size > 0), axis=0)
+    length = np.linalg.norm(mean)
+    return mean / length if length > 0 else np.array([0.0, 0.0, 1.0])
 
 
 def levelling(up: Floats) -> Floats:

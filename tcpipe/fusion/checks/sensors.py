@@ -195,6 +195,8 @@ def _check_imu(
     if units is not None:
         checks.refusals.append(Refusal(IMU, _units_text(units, axes, rate, felt), units=units))
         return {}
+    if felt == 0.0:
+        checks.refusals.append(Refusal(IMU, "its specific force is zero throughout: it measures none"))
     if not _IN_MPS2[0] <= felt <= _IN_MPS2[1]:
         return {}
     level = levelling(up)
