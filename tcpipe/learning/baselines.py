@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tcpipe.dataset import Dataset, Split
 from tcpipe.dataset.beside import beside_of
 from tcpipe.errors import ModelError
+from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.learning.curves import Curves, Form, fit_curves
 from tcpipe.learning.evaluation_facts import SPLITS, Compared
 from tcpipe.learning.metrics import LEAST, LEAST_VELOCITY_MPS, Array, Costs, costs, errors
@@ -137,9 +138,9 @@ def _groups(split: Split, block_m: float) -> tuple[Literal["runs", "blocks"], ND
     runs = split.column("run_id").astype(np.str_)
     if len(np.unique(runs)) >= _FEWEST_RUNS:
         return "runs", runs
-    middle = (split.column(f"{end}_{axis}_m").astype(np.float64) for axis in "xy" for end in ("start", "end"))
-    x0, x1, y0, y1 = middle
-    places = np.floor(np.column_stack([x0 + x1, y0 + y1]) / (2.0 * block_m))
+    lon_deg, lat_deg = (split.column(f"start_{axis}_deg").astype(np.float64) for axis in ("lon", "lat"))
+    datum = float(lon_deg[0]), float(lat_deg[0]), 0.0  # one for all: x and y of a sample are in its own run's frame
+    places = np.floor(enu_from_geodetic(lon_deg, lat_deg, 0.0, datum_deg_m=datum)[:, :2] / block_m)
     return "blocks", np.unique(places, axis=0, return_inverse=True)[1].reshape(-1)
 
 

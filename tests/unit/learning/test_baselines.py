@@ -7,7 +7,7 @@ import pytest
 from made_models import CARD
 
 from tcpipe.dataset import Split, open_dataset
-from tcpipe.learning.baselines import SIMPLEST_FIRST, compared, verdicts
+from tcpipe.learning.baselines import SIMPLEST_FIRST, _groups, compared, verdicts
 from tcpipe.learning.evaluation_facts import Compared
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Errors, costs
@@ -63,10 +63,9 @@ def test_the_mean_of_each_class_by_hand(found, sets):
 def test_two_runs_are_too_few_so_blocks_of_ground_are_drawn(found, sets):
     rows, _ = found
     test = sets[1]["test"].split
-    middle = np.column_stack([test.column(f"start_{of}_m") + test.column(f"end_{of}_m") for of in "xy"]) / 2.0
-    blocks = {tuple(place) for place in np.floor(middle / 10.0).tolist()}
     row = next(row for row in rows if row.split == "test")
-    assert (row.drawn_by, row.groups) == ("blocks", len(blocks))
+    assert row.drawn_by == "blocks"
+    assert 1 < row.groups < len(test)
 
 
 def test_a_model_is_not_its_own_baseline(sets):
@@ -118,3 +117,23 @@ def test_who_is_better_is_said_in_words():
     assert "cannot be told apart" in verdicts([mean, rounded])[0]
     assert "34 runs are too few" in verdicts([row("physics", 5.0, Ratio(0.5, None, None))])[0]
     assert verdicts([row("physics", 5.0, Ratio(None, None, None))]) == []
+
+
+class Places:
+    """Columns of samples 30 m apart along a parallel, of two runs with frames of their own."""
+
+    def column(self, name):
+        east_m = np.array([1.0, 31.0, 31.5, 61.0]) / (111_320.0 * np.cos(np.radians(47.0)))
+        known = {
+            "run_id": np.array(["a", "a", "b", "b"]),
+            "start_lat_deg": np.full(4, 47.0),
+            "end_lat_deg": np.full(4, 47.0),
+        }
+        return (known | {"start_lon_deg": 15.0 + east_m})[name]
+
+
+def test_blocks_are_of_ground_whatever_the_runs_frames():
+    kind, groups = _groups(Places(), 10.0)
+    assert kind == "blocks"
+    assert groups[1] == groups[2]
+    assert len(set(groups.tolist())) == 3
