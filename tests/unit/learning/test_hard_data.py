@@ -17,7 +17,7 @@ from tcpipe.learning.models import load_model
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store
+from tcpipe.store import open_store
 
 pytest.importorskip("lightgbm")
 
@@ -29,8 +29,7 @@ real_column, real_labels = Split.column, Split.labels.fget
 def bare(tmp_path_factory):
     """A store whose map has heights alone, and its dataset."""
     here = tmp_path_factory.mktemp("bare")
-    store = Store(here / "store")
-    store.root.mkdir()
+    store = open_store(here / "store", create=True)
     add_world(store, here / "rasters", layers=())
     for run_id, first in (("north", 1.0), ("south", -15.5)):
         start, end = lanes(first + 2.0 * np.arange(8), -14.0, 14.0)

@@ -68,7 +68,7 @@ def test_no_runs(store, tmp_path):
 
 
 def test_no_map(tmp_path):
-    store = Store(tmp_path / "store")
+    store = open_store(tmp_path / "store", create=True)
     add(store)
     assert "no map in the store" in refused(store, tmp_path)
 
@@ -316,7 +316,7 @@ def test_the_fused_velocity_can_be_the_label(store, tmp_path):
 
 
 def test_a_map_of_height_alone_has_no_other_layers(tmp_path):
-    store = Store(tmp_path / "store")
+    store = open_store(tmp_path / "store", create=True)
     add_world(store, tmp_path / "rasters", layers=())
     add(store)
     build(store, tmp_path, page=True)
