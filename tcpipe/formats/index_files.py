@@ -22,6 +22,7 @@ from tcpipe.formats.parquet import parquet_of, write_table
 from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
+from tcpipe.tables.arrays import column_of
 from tcpipe.tables.findings import EnergyBudget
 
 T = TypeVar("T")
@@ -215,21 +216,8 @@ def _rows(place: Place, name: str, cls: type[T]) -> list[T]:
 
 def _write(place: Place, name: str, rows: Sequence[object], schema: pa.Schema) -> None:
     values = [plain(as_stored(row)) for row in rows]
-    columns = [_column([row[field.name] for row in values], field.type) for field in schema]
+    columns = [column_of([row[field.name] for row in values], field.type) for field in schema]
     table = pa.table(columns, schema=schema.with_metadata({_ABOUT: _VERSION}))
     with suppress(StoreError), place.workshop() as directory:
         write_table(table, directory / name)
         place.put(name, (directory / name).read_bytes())
-
-
-def _column(values: list[object], of: pa.DataType) -> pa.Array:
-    return pa.array([_with_pairs(value, of) for value in values], of)
-
-
-def _with_pairs(value: object, of: pa.DataType) -> object:
-    """Return a value with its maps as Arrow takes them: as pairs."""
-    if pa.types.is_map(of) and isinstance(value, Mapping):
-        return sorted(value.items())
-    if pa.types.is_struct(of) and isinstance(value, Mapping):
-        return {field.name: _with_pairs(value.get(field.name), field.type) for field in of}
-    return value

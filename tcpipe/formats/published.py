@@ -97,6 +97,33 @@ def here(path: str | Path) -> Path:
     return Path(path) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda _: True)[0]
 
 
+@contextmanager
+def anew(url: str) -> Iterator[Path]:
+    """Yield a copy of what a card in a bucket lists, as it lies there now: nothing is taken from the cache, and nothing proved.
+
+    Raises
+    ------
+    UsageError
+        There is no card at the URL.
+    StoreError
+        It cannot be read.
+    """
+    place = open_place(url)
+    with tempfile.TemporaryDirectory(prefix="tcpipe-") as held:
+        root = Path(held, *(part for part in url.split("/") if part not in ("", "..")))
+        root.mkdir(parents=True)
+
+        def bring(name: str) -> None:
+            if (data := place.read(name)) is not None:
+                (root / name).parent.mkdir(parents=True, exist_ok=True)
+                (root / name).write_bytes(data)
+
+        _, checksums, _ = _card_of(place, url)
+        with ThreadPoolExecutor(_AT_ONCE) as pool:
+            list(pool.map(bring, [*checksums, *CARDS, *_UNLISTED]))
+        yield root
+
+
 def here_by_range(path: str | Path, *, by_range: Callable[[str], bool]) -> tuple[Path, FetchedShards | None]:
     """Return a directory as `here`, without the files whose names are ``by_range``, and where these are read; None on this machine."""
     return (Path(path), None) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda name: not by_range(name))
@@ -120,8 +147,8 @@ def _card_at(place: Place) -> tuple[str, bytes] | None:
     return next(((name, data) for name in CARDS if (data := place.read(name)) is not None), None)
 
 
-def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
-    place = open_place(url)
+def _card_of(place: Place, url: str) -> tuple[str, Mapping[str, Checksum], bytes]:
+    """Return the name of the card at a place, what it lists, and the card."""
     found = _card_at(place)
     if found is None:
         raise UsageError(f"{url}: there is no dataset, model or cost map here: none of {', '.join(CARDS)}")
@@ -130,6 +157,12 @@ def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedSha
     checksums = typed(parse_json(data, Path(where)), Checksums, Path(where)).checksums
     if outside := [file for file in checksums if file.startswith("/") or ".." in file.split("/")]:
         raise StoreError(f"{where}: names {outside[0]!r}, which is no file beside it")
+    return name, checksums, data
+
+
+def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
+    place = open_place(url)
+    name, checksums, data = _card_of(place, url)
     root = _directory_of(url, data)
     (root / name).write_bytes(data)
     for unlisted in _UNLISTED:

@@ -6,11 +6,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from tcpipe.errors import StoreError, TcpipeError, UsageError, plain_lines
+from tcpipe.errors import TcpipeError, UsageError, plain_lines
 from tcpipe.formats.atomic import left_beside
 from tcpipe.formats.dataset_files import CARD
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published import here, others_beside
+from tcpipe.formats.published import anew, others_beside
 from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
@@ -61,10 +61,8 @@ def verify(path: Path | str) -> Verified:
     """
     stored = _stored(str(path)) if is_url(path) else None
     if is_url(path) and stored is None:
-        try:
-            found = verify(here(path))
-        except StoreError as error:  # of what is fetched, the first that is not what its card says
-            return Verified(str(path), "dataset, model or cost map", {}, error.problems)
+        with anew(str(path).rstrip("/")) as copy:
+            found = verify(copy)
         strangers = (f"{name}: is no file of this {found.kind}" for name in others_beside(str(path)))
         return replace(found, path=str(path), problems=(*found.problems, *strangers))
     if stored is None and not Path(path).exists():

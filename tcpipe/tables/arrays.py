@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -48,6 +48,36 @@ def text_column(values: Iterable[str]) -> pa.Array:
     ends = np.cumsum([0, *map(len, raw)], dtype=np.int64)
     buffers = [None, pa.py_buffer(ends), pa.py_buffer(b"".join(raw))]
     return pa.Array.from_buffers(pa.large_string(), len(raw), buffers).cast(pa.string())
+
+
+def column_of(values: Sequence[Any], of: pa.DataType) -> pa.Array:
+    """Return values as an Arrow array: numbers, truth values, texts, None; mappings as structs or maps, sequences as lists."""
+    known = np.array([value is not None for value in values], np.bool_)
+    valid = None if known.all() else pa.py_buffer(np.packbits(known, bitorder="little"))
+    if pa.types.is_struct(of):
+        rows = [value or {} for value in values]
+        parts = [column_of([row.get(field.name) for row in rows], field.type) for field in of]
+        return pa.Array.from_buffers(of, len(values), [valid], children=parts)
+    if pa.types.is_string(of):
+        raw = [(value or "").encode() for value in values]
+        return pa.Array.from_buffers(of, len(raw), [valid, _ends(raw), pa.py_buffer(b"".join(raw))])
+    if pa.types.is_map(of):
+        pairs = [[{"key": key, "value": row[key]} for key in sorted(row)] for row in (value or {} for value in values)]
+        entries = pa.struct([pa.field("key", of.key_type, nullable=False), pa.field("value", of.item_type)])
+        parts = [column_of([pair for row in pairs for pair in row], entries)]
+        return pa.Array.from_buffers(of, len(values), [valid, _ends(pairs)], children=parts)
+    if pa.types.is_list(of):
+        lists = [value or () for value in values]
+        parts = [column_of([item for row in lists for item in row], of.value_type)]
+        return pa.Array.from_buffers(of, len(values), [valid, _ends(lists)], children=parts)
+    made = np.array([value or 0 for value in values], of.to_pandas_dtype())
+    data = np.packbits(made, bitorder="little") if pa.types.is_boolean(of) else made
+    return pa.Array.from_buffers(of, len(values), [valid, pa.py_buffer(data)])
+
+
+def _ends(rows: Sequence[Sequence[Any]]) -> pa.Buffer:
+    """Return where each row begins and ends when they lie one after another, as Arrow has it."""
+    return pa.py_buffer(np.cumsum([0, *map(len, rows)], dtype=np.int32))
 
 
 def rows_where(table: pa.Table, name: str, value: str | int) -> pa.Table:

@@ -12,7 +12,7 @@ PAGES = ("tutorials/first-dataset.md", "how-to/damaged-logs.md")
 
 def _masked(text: str) -> list[str]:
     """Return lines with runs of digits, hashes and blanks as one sign each; lists in alphabetical order, not by size."""
-    text = re.sub(r"(?<![\d.])\b[0-9a-f]{8}\b", "#", text)
+    text = re.sub(r"(?<![\d.])\b[0-9a-f]{8}(?:[0-9a-f]{8})?\b", "#", text)
     text = re.sub(r"[-+]?\b\d[\d.,e+-]*", "#", text)
     text = re.sub(r"[ ]*([\[\],])[ ]*", r"\1 ", text)  # numpy pads its arrays to the widest number
     return [re.sub(r"[\s─═-]+", " ", ", ".join(sorted(line.split(", ")))).strip() for line in text.splitlines()]
