@@ -77,7 +77,7 @@ class Call:
     @property
     def end(self) -> str:
         """When it ended, as ``begin``."""
-        return (datetime.fromisoformat(self.begin) + timedelta(seconds=self.wall_s)).isoformat(timespec="seconds")
+        return (datetime.fromisoformat(self.begin) + timedelta(seconds=self.wall_s)).isoformat(timespec="milliseconds")
 
 
 @dataclass(frozen=True, slots=True)

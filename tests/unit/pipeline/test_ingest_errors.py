@@ -24,7 +24,7 @@ def test_a_disk_that_fails_in_mid_write_is_told_with_the_output(tmp_path, monkey
     (result,) = ingest([log], store=store).results
     (line,) = result.problems
     assert re.fullmatch(
-        rf"{re.escape(str(log))}: {re.escape(str(store))}/runs/.*/streams: cannot be written \({os.strerror(number)}\)",
+        rf"{re.escape(str(log))}: {re.escape(str(store))}/runs/.*/streams/gnss\.parquet: cannot be written \({os.strerror(number)}\)",
         line,
     )
     assert not store.exists()
