@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import shutil
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -37,7 +37,7 @@ from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
-from tcpipe.formats.place import DirectoryPlace
+from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.places import local_output
 from tcpipe.formats.published import has_card, here_by_range, published
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
@@ -71,6 +71,9 @@ from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 
 logger = logging.getLogger("tcpipe")
+
+_SPOOL = "spool"
+"""Where segments and pixels wait until the dataset is written; it goes in the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +168,7 @@ def build_dataset(
     jobs
         Processes that sample side by side; the bytes do not depend on it.
     cluster
-        Address of a Dask scheduler whose workers sample instead; they see maps and ``out`` under the same absolute paths.
+        Address of a Dask scheduler whose workers sample instead; they see the store under the same absolute path or URL.
     file_format
         ``zarr`` or ``parquet``.
     holdout, seed
@@ -187,7 +190,7 @@ def build_dataset(
     """
     watch, ruling = started(), _ruling(recipe, holdout=holdout, seed=seed)
     place = str(out).rstrip("/") if is_url(out) else local_output(out)
-    opened = open_store(store)
+    opened = open_store(store if cluster is None or is_url(store) else Path(store).absolute())
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
     known, proved = _card_in_bucket(place) if isinstance(place, str) else _card_in_place(place)
@@ -214,9 +217,18 @@ def build_dataset(
     elif dry_run:
         return _planned(place, opened, inputs, jobs=jobs)
     else:
-        with published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute()) as directory:
+        whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
+        with whole as directory, _waiting_place(directory, opened, inputs.digest, cluster=cluster) as pixels:
             known = _build(
-                directory, inputs, ruling, regions, earlier, file_format=file_format, jobs=jobs, cluster=cluster
+                directory,
+                inputs,
+                ruling,
+                regions,
+                earlier,
+                file_format=file_format,
+                pixels=pixels,
+                jobs=jobs,
+                cluster=cluster,
             )
         result = _result(place, "done", known, problems)
     if not dry_run:
@@ -333,6 +345,20 @@ def _card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
     return card, proved
 
 
+@contextmanager
+def _waiting_place(directory: Path, store: Store, inputs: str, *, cluster: str | None) -> Iterator[Place]:
+    """Yield where pixels wait: in the directory that is made, or, where workers elsewhere write them, in the store, which they see."""
+    if cluster is None:
+        yield DirectoryPlace(directory / _SPOOL / "pixels")
+        return
+    place = store.place.below(f"{_SPOOL}/{inputs}")
+    try:
+        yield place
+    finally:
+        for entry in place.entries():
+            place.delete(entry.name)
+
+
 def _build(
     directory: Path,
     inputs: Inputs,
@@ -341,13 +367,13 @@ def _build(
     earlier: pa.Table | None,
     *,
     file_format: FileFormat,
+    pixels: Place,
     jobs: int,
     cluster: str | None,
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
-    waiting = directory / "spool"
+    waiting = directory / _SPOOL
     waiting.mkdir()
-    pixels = DirectoryPlace(waiting / "pixels")
     content = gather_content(waiting, inputs, recipe, regions, earlier, spool_place=pixels, jobs=jobs, cluster=cluster)
     logger.info("writing %d samples", len(content.samples))
     with parquet_rows(directory / SAMPLES, content.samples.schema) as write:

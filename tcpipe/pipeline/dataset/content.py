@@ -164,7 +164,7 @@ def gather_content(
         jobs=jobs,
         cluster=cluster,
     )
-    sources = tuple(open_map(path) for path in inputs.map_paths)
+    sources = tuple(open_map(path) for path in inputs.map_paths())
     lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
         raise DatasetError(

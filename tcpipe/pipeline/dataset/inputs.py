@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -46,7 +47,8 @@ class Inputs:
     sources: tuple[RunSource, ...]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap."""
-    map_paths: tuple[Path, ...]
+    map_paths: Callable[[], tuple[Path, ...]]
+    """Where they lie, on the machine that asks."""
     map_sha256: tuple[str, ...]
     """Over the checksums of each map's files."""
     again: Mapping[str, NDArray[np.bool_]]
@@ -76,8 +78,8 @@ def choose_inputs(
     chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
     once = each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
     runs = once.runs
-    paths = tuple(store.map_path(name) for name in names)
-    map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths, strict=True))
+    paths = partial(_map_paths, store, names)
+    map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths(), strict=True))
     sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
     fingerprint = digest(
         {
@@ -93,6 +95,10 @@ def choose_inputs(
     )
     warnings = (*chosen.warnings, *once.warnings)
     return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings, covariates)
+
+
+def _map_paths(store: Store, names: Sequence[str]) -> tuple[Path, ...]:
+    return tuple(store.map_path(name) for name in names)
 
 
 def _map_digest(name: str, path: Path) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -41,6 +41,10 @@ _PLACING = ("map_index", "footprint_xy_m", "footprint_lonlat_deg")
 
 _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
+
+
+MapPaths = Callable[[], tuple[Path, ...]]
+"""Where maps lie on the machine that asks, in order of priority; picklable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +95,7 @@ class _Batch:
     number: int
     ranks: NDArray[np.uint64]
     segments: pa.Table
-    map_paths: tuple[Path, ...]
+    map_paths: MapPaths
     config: SampleConfig
     gnss_crs: str
     spool: Spool
@@ -114,7 +118,7 @@ class _Batches(Sequence[_Batch]):
     rows: Sequence[NDArray[np.int64]]
     ranks: NDArray[np.uint64]
     segments: pa.Table
-    map_paths: tuple[Path, ...]
+    map_paths: MapPaths
     config: SampleConfig
     gnss_crs: str
     spool: Spool
@@ -139,7 +143,7 @@ class _Batches(Sequence[_Batch]):
 def sample_all_segments(
     segments: pa.Table,
     ranks: NDArray[np.uint64],
-    map_paths: tuple[Path, ...],
+    map_paths: MapPaths,
     config: SampleConfig,
     *,
     gnss_crs: str,
@@ -170,10 +174,8 @@ def sample_all_segments(
         The map or the segments cannot be used.
 
     """
-    sources = [open_map(path) for path in map_paths]
+    sources = [open_map(path) for path in map_paths()]
     check_alike(sources)
-    if cluster is not None:  # its workers are elsewhere
-        map_paths = tuple(path.absolute() for path in map_paths)
     rows = list(_batch_rows(segments))
     spool = Spool(spool_place, in_order(joint([source.layers for source in sources])), config.patch_px)
     placed = segments.select(PLACED_SEGMENTS.names())
@@ -233,7 +235,7 @@ def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
 def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     """Sample one batch; its pixels go to its file of the spool."""
     try:
-        held = [_held_map(path, batch.config) for path in batch.map_paths]
+        held = [_held_map(path, batch.config) for path in batch.map_paths()]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
         batch.spool.write(batch.number, _in_order(batch.ranks[sampled.kept]), sampled.patches.pixels)
