@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
 from tcpipe.cli.options import ONE_OF_SEVERAL, duration_value, json_option, recipe_option, store_option
@@ -38,7 +36,7 @@ def status(
     from tcpipe.pipeline.status import status as run
     from tcpipe.store import is_store
 
-    if paths and is_store(Path(paths[0])):
+    if paths and is_store(paths[0]):
         store, paths = paths[0], paths[1:]
     found = run(paths, store=store, recipe=ruling_recipe(recipe)[0], robot=robot, min_age_s=min_age_s)
     if as_json:
