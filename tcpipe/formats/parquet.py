@@ -68,7 +68,8 @@ def _with_a_member(of: pa.DataType) -> pa.DataType:
 def parquet_of(data: bytes, where: str) -> pa.Table:
     """Return the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
     try:
-        return pq.read_table(pa.BufferReader(data), page_checksum_verification=True)
+        with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
+            return file.read(use_threads=False)  # Arrow's threads could outlive a command that ends at once
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"{where}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
 
