@@ -144,14 +144,16 @@ class Store:
 
     def map_path(self, name: str) -> Path:
         """Return where a map lies on this machine; from a bucket its files are copied to the cache first."""
-        return self._map_file(name, self.map_document(name).zarr)
+        return self.map_at(self.map_document(name))
+
+    def map_at(self, document: MapDocument) -> Path:
+        """Return where the map of a document lies on this machine, whatever has taken its place since."""
+        return self.place.below("maps").tree(document.checksums) / document.zarr
 
     def map_picture(self, name: str) -> Path:
         """Return where the quick look of a map lies on this machine."""
-        return self._map_file(name, self.map_document(name).picture)
-
-    def _map_file(self, name: str, wanted: str) -> Path:
-        return self.place.below("maps").tree(self.map_document(name).checksums) / wanted
+        document = self.map_document(name)
+        return self.place.below("maps").tree(document.checksums) / document.picture
 
     @contextmanager
     def new_map(self, name: str, *, after: int = 0) -> Iterator[Path]:

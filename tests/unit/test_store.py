@@ -231,3 +231,18 @@ def test_paths_lead_to_runs_and_recipes(root):
     for path in (f"{root}/runs/{RUN}", run.where):
         found = verify(path if "://" in str(path) else Path(path))
         assert (found.kind, found.problems) == ("run", ())
+
+
+def test_the_map_of_a_document_stays_where_it_is_when_another_takes_its_place(root):
+    store = open_store(root, create=True)
+
+    def add(text, after):
+        with store.new_map("site", after=after) as directory:
+            directory.mkdir()
+            (directory / "tile").write_text(text)
+
+    add("old", 0)
+    old = store.map_document("site")
+    add("new", 1)
+    assert (store.map_at(old) / "tile").read_text() == "old"
+    assert (store.map_path("site") / "tile").read_text() == "new"

@@ -26,7 +26,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.json_files import digest, plain
 from tcpipe.formats.published import here_by_range
-from tcpipe.formats.run_documents import LogOrigin
+from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_checksums
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
@@ -78,7 +78,7 @@ def choose_inputs(
     chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
     once = each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
     runs = once.runs
-    paths = partial(_map_paths, store, names)
+    paths = partial(_map_paths, store, tuple(store.map_document(name) for name in names))
     map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths(), strict=True))
     sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
     fingerprint = digest(
@@ -97,8 +97,8 @@ def choose_inputs(
     return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings, covariates)
 
 
-def _map_paths(store: Store, names: Sequence[str]) -> tuple[Path, ...]:
-    return tuple(store.map_path(name) for name in names)
+def _map_paths(store: Store, maps: Sequence[MapDocument]) -> tuple[Path, ...]:
+    return tuple(map(store.map_at, maps))
 
 
 def _map_digest(name: str, path: Path) -> str:
