@@ -20,9 +20,23 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, json_option, quiet_option
     "--hidden", default=1.0, show_default=True, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
     help="Variance of the resistance that nothing shows, over that of the frozen site.",
 )  # fmt: skip
+@click.option(
+    "--baselines/--no-baselines", default=True, show_default=True,
+    help="Train the height-only networks of Wei and Isler, which take most of the time.",
+)  # fmt: skip
 @json_option
 @quiet_option
-def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, hidden: float, as_json: bool, quiet: bool) -> None:
+def reproduce(
+    directory: str,
+    *,
+    quick: bool,
+    seeds: int,
+    jobs: int,
+    hidden: float,
+    baselines: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and say which of the paper's claims hold.
 
     Takes up to an hour and a half on two cores, and goes on from where it was stopped. The data are simulated: what is compared with the
@@ -32,5 +46,5 @@ def reproduce(directory: str, *, quick: bool, seeds: int, jobs: int, hidden: flo
     from tcpipe.learning.reproduction import reproduce as run
 
     with progress("reproduce", 1, quiet=quiet):
-        result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden)
+        result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden, baselines=baselines)
     say_result(result, as_json=as_json)

@@ -121,7 +121,13 @@ class Reproduction:
 
 
 def reproduce(
-    directory: str | Path, *, quick: bool = False, seeds: int = 1, jobs: int = 1, hidden: float = 1.0
+    directory: str | Path,
+    *,
+    quick: bool = False,
+    seeds: int = 1,
+    jobs: int = 1,
+    hidden: float = 1.0,
+    baselines: bool = True,
 ) -> Reproduction:
     """Simulate the paper's site, build the dataset, train, evaluate, and compare with the paper's claims.
 
@@ -137,6 +143,8 @@ def reproduce(
         Logs read side by side.
     hidden
         Variance of the resistance that nothing shows, over that of the frozen site.
+    baselines
+        Train the networks of Wei and Isler; without them what is claimed of them is not measured.
 
     Raises
     ------
@@ -145,6 +153,7 @@ def reproduce(
 
     """
     place, plan = Path(directory), QUICK if quick else FULL
+    plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))
     clear(place)
     if place.exists() and (not place.is_dir() or (any(place.iterdir()) and not (place / "site").exists())):
         raise UsageError(f"{place}: exists and is no reproduction; give another DIR")
@@ -220,6 +229,6 @@ def _write(result: Reproduction, plan: Experiment, hidden: float) -> None:
             terrain=result.counts.terrain,
             shares=result.variance_shares,
             hidden=hidden,
-            quick=plan is QUICK,
+            quick=plan.scenario == QUICK.scenario,
         ),
     )

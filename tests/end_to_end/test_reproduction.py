@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 
@@ -81,6 +82,18 @@ def test_again_is_nothing_to_do(reproduced):
     assert "epoch" not in again.stderr
     assert (here / "here" / "reproduction.json").read_bytes() == before
     assert again.stdout.splitlines()[:-2] == first.stdout.splitlines()[:-2]
+
+
+def test_without_baselines_their_claims_are_not_measured(reproduced, tmp_path):
+    here, _ = reproduced
+    shutil.copytree(here / "here", tmp_path / "here")
+    done = tcpipe("reproduce", "here", "--quick", "--no-baselines", cwd=tmp_path, env=ENV)
+    assert done.returncode == 0, done.stderr
+    with_them, without = (
+        json.loads((at / "here" / "reproduction.json").read_text())["claims"] for at in (here, tmp_path)
+    )
+    for one, other in zip(with_them, without, strict=True):
+        assert (other["verdict"] == "not measured") if "net per class" in other["says"] else (other == one)
 
 
 def test_train_and_evaluate_by_hand(reproduced):
