@@ -14,18 +14,18 @@ from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
 from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_current_card, read_samples, rows_in_files
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.report.balance import balance_sections
+from tcpipe.report.colours import SPLIT_COLOURS
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.figures import (
-    SPLIT_COLOURS,
     against_slope,
     histograms,
-    ledger_bars,
     patch_gallery,
     path_on_map,
 )
 from tcpipe.report.overview import Bounds, joint_bounds_m, read_overview
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.physics import physics_sections
+from tcpipe.report.plots import waterfall
 from tcpipe.report.quality import quality_sections
 from tcpipe.tables.bits import Quality, name_of
 
@@ -71,7 +71,9 @@ def dataset_report(directory: Path) -> str:
             *physics_sections(dict(card.physics)),
             *budget_sections(card.energy_budget),
             Section(
-                "Where every metre went", "In samples and lost add up to the odometer.", ledger_bars(card.ledger_m)
+                "Where every metre went",
+                "In samples and lost add up to the odometer.",
+                plots=[waterfall(card.ledger_m)],
             ),
             *_removal_sections(card),
             *balance_sections(card.balance),

@@ -14,16 +14,12 @@ from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, INK, KEPT
+
 Array = NDArray[np.float64]
 Stored = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 S = TypeVar("S", bound=np.generic)
 
-INK = "#22303c"
-FAINT = "#8a97a3"
-KEPT = "#1b7f5c"
-DROPPED = "#c9572c"
-SPLIT_COLOURS = {"train": "#2a6fb0", "test": "#e0a100", "unseen": "#1b7f5c", "buffer": "#9aa3ab"}
-CLASS_COLOURS = ("#2e5d34", "#4aa3c7", "#b04a5a", "#6fae4f", "#7a4b22", "#d0b070", "#8a929a")
 _MAX_POINTS = 4000
 
 _STYLE: dict[Any, Any] = {

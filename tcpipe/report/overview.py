@@ -14,7 +14,7 @@ from pyproj import Transformer
 from tcpipe.formats.atomic import atomic_file
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import picture_text, seal_of
-from tcpipe.report.figures import CLASS_COLOURS
+from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.terrain.layers import Pixels
 
 _SIDE_PX = 900

@@ -1,21 +1,32 @@
-"""One self-contained HTML page from plain values."""
+"""The frame of every page: one self-contained HTML file from plain values, which asks for nothing and can be read without a mouse.
+
+Figures are `tcpipe.report.plots.Plot`; BokehJS stands in a page once, and only where there is one. A page's own script is a file
+beside this one that finds its data as ``page.data`` and its figures with ``page.model(name)`` (``page.js``).
+"""
 
 from __future__ import annotations
 
 import html
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
-from typing import Any
+from typing import Any, Literal
+from urllib.parse import quote
 
 from jinja2 import Environment, StrictUndefined
 
 from tcpipe import __version__
 from tcpipe.errors import plain_line
+from tcpipe.formats.json_files import Json
+from tcpipe.report import plots
+from tcpipe.report.plots import Plot
 
 _UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Characters that cannot be seen in a page, or turn its text round: a name may hold them."""
+
+_SCRIPTS = "<!-- scripts -->"
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,8 +38,42 @@ class Number:
 
 
 @dataclass(frozen=True, slots=True)
+class Verdict:
+    """One sentence of what a reader has to know first: what is good, thin or doubtful, and what to do."""
+
+    kind: Literal["good", "thin", "doubtful", "do"]
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Link:
+    """Another page: its text, and where it lies from this one (a relative path, not yet quoted)."""
+
+    text: str
+    path: str
+
+    def __html__(self) -> str:
+        """Return it as HTML; no path becomes another scheme or leaves the attribute."""
+        return f'<a href="{quote(self.path)}">{_breakable(self.text)}</a>'
+
+
+@dataclass(frozen=True, slots=True)
+class Shaded:
+    """A cell of a table that is a heat map: its text, and how full it is, from 0 to 1; ``alarm`` marks it."""
+
+    text: str
+    share: float
+    alarm: bool = False
+
+    def __html__(self) -> str:
+        """Return it as HTML."""
+        mark = " alarm" if self.alarm else ""
+        return f'<span class="shaded{mark}" style="--share:{min(max(self.share, 0.0), 1.0):.2f}">{_breakable(self.text)}</span>'
+
+
+@dataclass(frozen=True, slots=True)
 class Section:
-    """A heading with a sentence, pictures (SVG text) and a table, each optional."""
+    """A heading with a sentence, figures, controls and a table, each optional."""
 
     title: str
     text: str = ""
@@ -37,21 +82,96 @@ class Section:
     rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
     figures_from: int | None = None
     """First column of figures that are written out already: these stand to the right, as numbers do."""
+    plots: Sequence[Plot] = ()
+    controls: str = ""
+    """File beside this one with the HTML that stands above the figures."""
+    folded: bool = False
+    """Whether the table waits behind a line to click."""
 
 
 def render_page(
-    *, title: str, lead: str, numbers: Sequence[Number], warnings: Sequence[str], sections: Sequence[Section]
+    *,
+    title: str,
+    lead: str,
+    numbers: Sequence[Number],
+    warnings: Sequence[str],
+    sections: Sequence[Section],
+    verdict: Sequence[Verdict] = (),
+    links: Sequence[Link] = (),
+    script: str = "",
+    data: Json = None,
 ) -> str:
-    """Return the page's HTML; every text is escaped, pictures are inline."""
-    source = files("tcpipe.report").joinpath("page.html.j2").read_text(encoding="utf-8")
+    """Return the page's HTML; every text is escaped, everything is inline.
+
+    Parameters
+    ----------
+    title, lead, numbers, warnings, verdict
+        What stands at the top, in the order verdict, numbers, warnings.
+    sections
+        In the order of the page; the table of contents is made of their titles.
+    links
+        Pages that belong to it.
+    script
+        File beside this one that runs when all figures are drawn.
+    data
+        What it is told.
+
+    """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    environment.filters["breakable"] = _breakable
-    page = environment.from_string(source).render(
-        title=title, lead=lead, numbers=numbers, warnings=warnings, sections=sections, version=__version__
+    environment.filters["cell"] = _cell
+    every = [plot for section in sections for plot in section.plots]
+    drawn, ids = plots.document(every) if every else (None, [])
+    names = iter(ids)
+    page = environment.from_string(_file("page.html.j2")).render(
+        title=title,
+        lead=lead,
+        numbers=numbers,
+        warnings=warnings,
+        verdict=verdict,
+        links=links,
+        sections=[
+            (
+                section,
+                [(plot, next(names)) for plot in section.plots],
+                _file(section.controls) if section.controls else "",
+            )
+            for section in sections
+        ],
+        version=__version__,
+        style=_file("page.css"),
+        scripts=_SCRIPTS,
     )
-    return _UNSEEN.sub(lambda found: plain_line(found[0]), page)
+    seen = _UNSEEN.sub(lambda found: plain_line(found[0]), page)
+    blocks = [_json_block("page-data", _shown(data)), _json_block("page-figures", drawn)]
+    code = [plots.script()] if every else []
+    code += [_file("page.js"), *([_file(script)] if script else [])]
+    return seen.replace(_SCRIPTS, "\n".join(blocks + [f"<script>\n{part}\n</script>" for part in code]), 1)
+
+
+def _file(name: str) -> str:
+    return files("tcpipe.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _json_block(name: str, value: Json) -> str:
+    """Return JSON as a part of the page that no text in it can end."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>'
+
+
+def _shown(value: Json) -> Json:
+    """Return plain data with every text as one line that can be seen whole."""
+    if isinstance(value, Mapping):
+        return {plain_line(key): _shown(part) for key, part in value.items()}
+    if isinstance(value, str):
+        return value if value.isprintable() else plain_line(value)
+    return [_shown(part) for part in value] if isinstance(value, Sequence) else value
+
+
+def _cell(cell: object) -> str:
+    """Return a cell as HTML."""
+    return cell.__html__() if isinstance(cell, Link | Shaded) else _breakable(cell)
 
 
 def _breakable(cell: object) -> str:
-    """Return a cell's text as HTML, escaped, that may break after every / and _, as topics and types are long."""
+    """Return a text as HTML, escaped, that may break after every / and _, as topics and types are long."""
     return html.escape(str(cell)).replace("/", "/<wbr>").replace("_", "_<wbr>")

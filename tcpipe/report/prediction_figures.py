@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from tcpipe.report.figures import FAINT, INK, Array, figure_svg
+from tcpipe.report.colours import FAINT, INK
+from tcpipe.report.figures import Array, figure_svg
 
 MEASURED = "#b3202a"
 PREDICTED = "#2a6fb0"

@@ -13,8 +13,9 @@ from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.run_documents import RunJson
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.report.colours import DROPPED, KEPT
 from tcpipe.report.error_budget import budget_sections
-from tcpipe.report.figures import DROPPED, KEPT, histograms, ledger_bars, over_distance, path_on_map
+from tcpipe.report.figures import histograms, ledger_bars, over_distance, path_on_map
 from tcpipe.report.overview import map_overview
 from tcpipe.report.page import Number, Section, render_page
 from tcpipe.report.physics import physics_sections

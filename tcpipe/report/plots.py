@@ -1,0 +1,186 @@
+"""Plots of pages that can be zoomed and asked: the one house of Bokeh.
+
+A page makes a plot, calls the glyph methods of ``plot.figure``, and hands it to a section (`tcpipe.report.page.Section`)::
+
+    plot = new_plot("speed", alt="Speed over time", axes=("time [s]", "speed [m/s]"))
+    plot.figure.line(time_s, speed_mps, color=KEPT)
+
+Colours of axes and grids follow the page's light or dark scheme (``page.css``); those of glyphs come from `tcpipe.report.colours`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import bokeh
+import numpy as np
+from bokeh.document import Document
+from bokeh.models import DataRange1d, FactorRange, HoverTool
+from bokeh.plotting import figure
+from numpy.typing import NDArray
+
+from tcpipe.errors import plain_line
+from tcpipe.formats.json_files import Json
+from tcpipe.report.colours import DROPPED, KEPT, SPLIT_COLOURS
+
+_TEX = re.compile(r"\$\$|\\\(|\\\[")
+_UNREAD = "\u2060"
+"""Between the signs of a formula it keeps a name from being read as one; it takes no room."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """A figure, what it shows for who cannot see it, and its colours by name; ``figure.name`` finds it in the page's scripts."""
+
+    figure: Any
+    alt: str
+    legend: Mapping[str, str] = field(default_factory=dict)
+
+
+def new_plot(
+    name: str,
+    *,
+    alt: str,
+    axes: tuple[str, str],
+    legend: Mapping[str, str] | None = None,
+    height_px: int = 300,
+    tools: str = "pan,wheel_zoom,box_zoom,reset,save",
+    drag: str | None = None,
+    tooltips: Sequence[tuple[str, str]] = (),
+    names: Sequence[str] = (),
+    true_to_scale: bool = False,
+    beside: Plot | None = None,
+) -> Plot:
+    """Return an empty plot as wide as the page.
+
+    Parameters
+    ----------
+    name
+        Of the figure, one of its kind on a page.
+    alt
+        What it shows, in a sentence.
+    axes
+        What the axes hold, with unit.
+    legend
+        Colours by name; written below the plot, where it has room on a phone.
+    height_px
+        Its height.
+    tools, drag
+        Bokeh's tools, and which one a drag moves at first; none lets a finger scroll the page.
+    tooltips
+        Label and ``@column`` of what hovering shows.
+    names
+        What stands along the vertical axis instead of numbers, from below.
+    true_to_scale
+        A metre is as long across as along.
+    beside
+        A plot whose horizontal axis moves together with this one's.
+
+    """
+    drawn = figure(
+        name=name,
+        x_axis_label=axes[0],
+        y_axis_label=axes[1],
+        height=height_px,
+        tools=tools,
+        active_drag=drag,
+        active_scroll=None,
+        toolbar_location="above",
+        sizing_mode="stretch_width",
+        background_fill_alpha=0.0,
+        border_fill_alpha=0.0,
+        outline_line_color=None,
+        match_aspect=true_to_scale,
+        x_range=DataRange1d() if beside is None else beside.figure.x_range,
+        y_range=FactorRange(factors=list(names)) if names else DataRange1d(),
+    )
+    drawn.toolbar.logo = None
+    drawn.axis.axis_label_text_font_style = "normal"
+    drawn.axis.axis_label_text_font_size = "13px"
+    drawn.axis.major_label_text_font_size = "12px"
+    drawn.axis.minor_tick_line_color = None
+    if tooltips:
+        drawn.add_tools(HoverTool(tooltips=list(tooltips)))
+    return Plot(drawn, alt, legend or {})
+
+
+def waterfall(ledger_m: Mapping[str, float]) -> Plot:
+    """Return where every metre went: all that was driven, each loss taken away, the largest first, and what is left."""
+    losses = sorted(((n, m) for n, m in ledger_m.items() if n != "kept" and m > 0), key=lambda item: -item[1])
+    total, kept = sum(ledger_m.values()), ledger_m.get("kept", 0.0)
+    ends = total - np.cumsum([metres for _, metres in losses])
+    names = ["driven", *(name.replace("_", " ") for name, _ in losses), "kept"]
+    metres = [total, *(metres for _, metres in losses), kept]
+    plot = new_plot(
+        "ledger",
+        alt=f"Waterfall of the loss ledger: of {total:.0f} m driven, {kept:.0f} m are kept.",
+        axes=("metres", ""),
+        height_px=90 + 26 * len(names),
+        tools="save",
+        names=names[::-1],
+        tooltips=[("", "@name"), ("metres", "@metres{0.0}"), ("share", "@share{0.0} %")],
+    )
+    plot.figure.hbar(
+        y="name",
+        left="left",
+        right="right",
+        height=0.7,
+        color="colour",
+        source={
+            "name": names,
+            "left": [0.0, *ends, 0.0],
+            "right": [total, *(ends + [m for _, m in losses]), kept],
+            "metres": metres,
+            "share": [100.0 * value / max(total, 1e-9) for value in metres],
+            "colour": [SPLIT_COLOURS["buffer"], *[DROPPED] * len(losses), KEPT],
+        },
+    )
+    plot.figure.x_range.start = 0
+    plot.figure.ygrid.visible = False
+    return plot
+
+
+def histogram(name: str, values: NDArray[np.float64], *, label: str, of_what: str) -> Plot:
+    """Return how often values occur; what is not finite is left out, and said."""
+    finite = values[np.isfinite(values)]
+    lost = len(values) - len(finite)
+    alt = f"Histogram of {label} of {len(finite)} {of_what}" + (f"; {lost} have none" if lost else "")
+    plot = new_plot(name, alt=f"{alt}.", axes=(label, of_what), height_px=220, tools="save")
+    if len(finite):
+        counts, edges = np.histogram(finite, bins=min(40, max(5, int(np.sqrt(len(finite))))))
+        plot.figure.quad(left=edges[:-1], right=edges[1:], bottom=0, top=counts, color=SPLIT_COLOURS["train"])
+        plot.figure.add_tools(HoverTool(tooltips=[(label, "@left to @right"), (of_what, "@top")]))
+    plot.figure.y_range.start = 0
+    return plot
+
+
+def script() -> str:
+    """Return BokehJS: what a page needs of it."""
+    return (Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
+
+
+def document(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
+    """Return the JSON of plots and the id of each; the same plots have the same ids, whatever was drawn before in this process."""
+    whole = Document()
+    for plot in plots:
+        whole.add_root(plot.figure)
+    ids: dict[str, str] = {}
+    told = _told(cast("Json", whole.to_json(deferred=False)), ids)
+    return told, [ids[plot.figure.id] for plot in plots]
+
+
+def _told(value: Json, ids: dict[str, str]) -> Json:
+    """Return a part of Bokeh's JSON with ids in order of appearance, and texts that nothing reads as a formula or a control character."""
+    if isinstance(value, Mapping):
+        return {
+            key: ids.setdefault(part, f"p{len(ids) + 1}") if key == "id" and isinstance(part, str) else _told(part, ids)
+            for key, part in value.items()
+        }
+    if isinstance(value, str):
+        text = value if value.isprintable() else plain_line(value)
+        return _TEX.sub(lambda found: found[0][0] + _UNREAD + found[0][1:], text)
+    return [_told(part, ids) for part in value] if isinstance(value, Sequence) else value

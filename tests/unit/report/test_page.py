@@ -1,0 +1,103 @@
+"""The frame: what people name their things is text in it, the same page is the same bytes, and nothing is asked of the network."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+
+from tcpipe.report.page import Link, Number, Section, Shaded, Verdict, render_page
+from tcpipe.report.plots import histogram, new_plot, waterfall
+
+EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
+"""Ends a script, colours a terminal, turns its text round, reads as two formulas, leaves an attribute."""
+
+
+class Seen(HTMLParser):
+    """What a browser makes of a page: its tags with attributes, its text outside scripts, its scripts."""
+
+    def __init__(self, html):
+        super().__init__()
+        self.tags, self.text, self.scripts, self.inside = [], [], [], ""
+        self.feed(html)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self.inside = tag if tag in {"script", "style"} else ""
+
+    def handle_endtag(self, _tag):
+        self.inside = ""
+
+    def handle_data(self, data):
+        (self.scripts if self.inside == "script" else self.text).append(data)
+
+
+def drawn():
+    plot = new_plot("evil", alt=EVIL, axes=("x", EVIL), legend={EVIL: "#000000"})
+    plot.figure.scatter([1.0, 2.0], [3.0, 4.0])
+    return [plot, waterfall({"kept": 60.0, "standing": 40.0})]
+
+
+def page():
+    return render_page(
+        title=EVIL,
+        lead=EVIL,
+        numbers=[Number(EVIL, EVIL)],
+        warnings=[EVIL],
+        verdict=[Verdict("thin", EVIL)],
+        links=[Link(EVIL, EVIL), Link("plain", "javascript:alert(1)")],
+        sections=[
+            Section(EVIL, EVIL, header=(EVIL,), rows=[(EVIL,), (Link(EVIL, "a/b"),), (Shaded(EVIL, 2.0),)]),
+            Section("drawn", plots=drawn()),
+        ],
+        data={EVIL: [EVIL, 1]},
+    )
+
+
+def block(seen, name):
+    position = [attrs.get("id") for tag, attrs in seen.tags if tag == "script"].index(name)
+    return json.loads(seen.scripts[position])
+
+
+def test_a_name_is_text_wherever_it_stands():
+    html = page()
+    seen = Seen(html)
+    assert [attrs.get("id") for tag, attrs in seen.tags if tag == "script"] == ["page-data", "page-figures", None, None]
+    assert not [name for _, attrs in seen.tags for name in attrs if name.startswith("on")]
+    assert {
+        attrs["href"] for tag, attrs in seen.tags if tag == "a" and attrs["href"].startswith("javascript:")
+    } == set()
+    assert "alert(1)" in "".join(seen.text)
+    outside = html.replace(seen.scripts[2], "")
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200b-\u200f\u202a-\u202e\u2060]", outside)
+    told = json.dumps([block(seen, "page-data"), block(seen, "page-figures")])
+    assert "\\\\x1b[31m\\\\u202e" in told
+    assert "\\u001b" not in told
+    figures = json.dumps(block(seen, "page-figures"))
+    assert "$$" not in figures
+    assert "\\\\(" not in figures
+
+
+def test_the_same_page_is_the_same_bytes_whatever_was_drawn_before():
+    first = page()
+    histogram("other", np.arange(9.0), label="x", of_what="y")
+    assert page() == first
+
+
+def test_a_page_without_figures_carries_no_bokeh():
+    html = render_page(title="t", lead="", numbers=[], warnings=[], sections=[Section("s", "text")])
+    assert len(html) < 20_000
+
+
+def test_nothing_is_asked_of_the_network():
+    html = page()
+    assert "default-src 'none'" in html
+    assert not [attrs for _, attrs in Seen(html).tags if {"src", "srcset", "data", "action"} & set(attrs)]
+
+
+def test_the_waterfall_ends_at_what_is_kept():
+    plot = waterfall({"kept": 60.0, "standing": 30.0, "gap": 10.0, "curved": 0.0})
+    data = next(iter(plot.figure.renderers)).data_source.data
+    assert data["name"] == ["driven", "standing", "gap", "kept"]
+    assert list(zip(data["left"], data["right"], strict=True)) == [(0, 100), (70, 100), (60, 70), (0, 60)]
+    assert data["share"] == [100, 30, 10, 60]
