@@ -57,6 +57,9 @@ class MemoryMap:
     name: str = "memory"
     factors: tuple[int, ...] = (1,)
 
+    def expect(self, tiles):
+        """Hold all tiles already."""
+
     def read(self, layer, row0, row1, col0, col1):
         """Return a window of a layer: all that is asked of a map of one tile."""
         return self.arrays[layer][row0:row1, col0:col1]

@@ -57,6 +57,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.places import local_output
+from tcpipe.formats.published import FetchedShards, files_here
 from tcpipe.formats.record_files import (
     RunName,
     Sighting,
@@ -74,7 +75,7 @@ from tcpipe.formats.run_documents import (
     StreamInfo,
     Tags,
 )
-from tcpipe.formats.seals import Checksum, file_checksums, sealed
+from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory, below, local_file, put_tables, told_of, with_span
 from tcpipe.tables.levels import (
@@ -91,8 +92,6 @@ from tcpipe.tables.levels import (
 T = TypeVar("T")
 
 logger = logging.getLogger("tcpipe")
-
-RUN_FILES = ("track.parquet", "segments.parquet", "rejections.parquet")
 
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _STREAMS = "streams"
@@ -121,11 +120,6 @@ class Store:
         """Where its runs lie."""
         return self.place.below("runs")
 
-    def clear(self) -> None:
-        """Remove the temporaries of killed commands."""
-        if isinstance(place := self.place, DirectoryPlace):
-            place.clear()
-
     def maps(self) -> list[str]:
         """Return the names of the maps, sorted."""
         return sorted(numbers(self.place.files("maps")))
@@ -143,17 +137,23 @@ class Store:
         return read_as_at(self.place.below("maps"), name_of(name, self.map_number(name)), MapDocument)
 
     def map_path(self, name: str) -> Path:
-        """Return where a map lies on this machine; from a bucket its files are copied to the cache first."""
+        """Return where a map lies on this machine; of one in a bucket only its descriptions do."""
+        return self.map_files(name)[0]
+
+    def map_files(self, name: str) -> tuple[Path, FetchedShards | None]:
+        """Return where a map lies on this machine, and where its tiles are read if they lie in a bucket: what `open_map` takes."""
         return self.map_at(self.map_document(name))
 
-    def map_at(self, document: MapDocument) -> Path:
-        """Return where the map of a document lies on this machine, whatever has taken its place since."""
-        return self.place.below("maps").tree(document.checksums) / document.zarr
+    def map_at(self, document: MapDocument) -> tuple[Path, FetchedShards | None]:
+        """Return the same of the map of a document, whatever has taken its place since."""
+        place, described = self.place.below("maps"), ("/zarr.json", f"/{CHECKSUMS}")
+        root, fetched = files_here(place, document.checksums, by_range=lambda name: not name.endswith(described))
+        return root / document.zarr, fetched
 
     def map_picture(self, name: str) -> Path:
         """Return where the quick look of a map lies on this machine."""
         document = self.map_document(name)
-        return self.place.below("maps").tree(document.checksums) / document.picture
+        return self.place.below("maps").local(document.picture, document.checksums[document.picture])
 
     @contextmanager
     def new_map(self, name: str, *, after: int = 0) -> Iterator[Path]:
@@ -587,7 +587,8 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
     if create:
         mark_store(store.place, found=found)
-        store.clear()
+        if isinstance(place := store.place, DirectoryPlace):  # what killed commands left
+            place.clear()
     return store
 
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-import shutil
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
@@ -27,9 +26,6 @@ if TYPE_CHECKING:
 _PIECE_BYTES = 1 << 24
 _AT_ONCE = 8
 """Files that are on their way at once."""
-
-_TREES: dict[str, tempfile.TemporaryDirectory[str]] = {}
-"""They go when this process ends."""
 
 _SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
 
@@ -189,26 +185,6 @@ class BucketPlace:
                 )
 
         return cached(checksum.sha256, fetch)
-
-    def tree(self, checksums: Mapping[str, Checksum]) -> Path:
-        """Return a temporary directory of links into the cache: what goes from the cache while it is used stays here."""
-        key = f"{self.url} {sorted((name, of.sha256) for name, of in checksums.items())}"
-        if key not in _TREES:
-            made = tempfile.TemporaryDirectory(prefix="tcpipe-")
-
-            def link(name: str) -> None:
-                path = Path(made.name, name)
-                path.parent.mkdir(parents=True, exist_ok=True)
-                copy = self.local(name, checksums[name])
-                try:
-                    path.hardlink_to(copy)
-                except OSError:  # another file system
-                    shutil.copyfile(copy, path)
-
-            with ThreadPoolExecutor(_AT_ONCE) as pool:
-                list(pool.map(link, checksums))
-            _TREES[key] = made
-        return Path(_TREES[key].name)
 
     def pieces(self, name: str) -> Iterator[bytes]:
         """Yield an object piece by piece; `StoreError` where there is none."""

@@ -9,12 +9,12 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+import threading
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
-from tcpipe.errors import UsageError
-from tcpipe.formats.atomic import atomic_file
+from tcpipe.errors import StoreError, UsageError
 
 _MOST_BYTES = 8_000_000_000
 _SHARE_UNSEEN = 64
@@ -33,20 +33,43 @@ def cached(key: str, fetch: Callable[[Path], object]) -> Path:
     StoreError
         The cache cannot be written.
     """
-    digest = hashlib.sha256(key.encode()).hexdigest()
-    path = _directory() / digest[:2] / digest
-    with suppress(FileNotFoundError):
-        os.utime(path)
+    path = _path_of(key)
+    if _is_there(path):
         return path
-    with atomic_file(path) as temporary:
+    temporary = path.with_name(f"{path.name}-{os.getpid()}-{threading.get_ident()}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         fetch(temporary)
-        temporary.touch()
-    put = path.stat()
+        put = temporary.stat()
+        temporary.replace(
+            path
+        )  # nothing is synced, and what a killed process leaves goes in its turn: whoever reads it proves it
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
     _unseen_bytes[0] += put.st_size
     if _unseen_bytes[0] * _SHARE_UNSEEN > (most := _most_bytes()):
         _make_room(path.parent.parent, most, now=put.st_mtime)
         _unseen_bytes[0] = 0
     return path
+
+
+def is_cached(key: str) -> bool:
+    """Tell whether there is a file of a key, which then stays for a while."""
+    return _is_there(_path_of(key))
+
+
+def _is_there(path: Path) -> bool:
+    with suppress(FileNotFoundError):
+        os.utime(path)
+        return True
+    return False
+
+
+def _path_of(key: str) -> Path:
+    digest = hashlib.sha256(key.encode()).hexdigest()
+    return _directory() / digest[:2] / digest
 
 
 def _directory() -> Path:

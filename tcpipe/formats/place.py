@@ -12,7 +12,7 @@ Nothing appears before it is whole, and on disk before it is synced.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -85,9 +85,6 @@ class Place(Protocol):
 
     def local(self, name: str, checksum: Checksum) -> Path:
         """Return a file of this machine with the content of ``name``: itself, or a copy in the cache by content."""
-
-    def tree(self, checksums: Mapping[str, Checksum]) -> Path:
-        """Return a directory of this machine in which these files lie under their names, as long as this process lives."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,11 +187,6 @@ class DirectoryPlace:
         """Return the file itself."""
         del checksum
         return self._path(name)
-
-    def tree(self, checksums: Mapping[str, Checksum]) -> Path:
-        """Return the directory itself."""
-        del checksums
-        return self.root
 
     def clear(self) -> None:
         """Remove what killed writers left as temporaries."""

@@ -21,10 +21,10 @@ import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
-from tcpipe.formats.content_cache import cached
+from tcpipe.formats.content_cache import cached, is_cached
 from tcpipe.formats.json_files import parse_json, typed
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.seals import Checksum, Checksums, broken_checksums
 
 logger = logging.getLogger("tcpipe")
@@ -41,7 +41,7 @@ _AT_ONCE = 8
 
 @dataclass(frozen=True, slots=True)
 class FetchedShards:
-    """Shards of a dataset in a bucket, below ``root`` as if they were there; pieces are fetched by range, and cached."""
+    """Shards in a bucket, of a dataset or a map, below ``root`` as if they were there; pieces are fetched by range, and cached."""
 
     place: Place
     root: Path
@@ -63,16 +63,21 @@ class FetchedShards:
 
     def expect(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
         """Have pieces (shard, offset, size) cached that are read soon, fetched side by side."""
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
-            list(pool.map(lambda piece: self._held(*piece), pieces))
+        absent = [piece for piece in pieces if not is_cached(self._key(*piece))]
+        if absent:
+            with ThreadPoolExecutor(min(_AT_ONCE, len(absent))) as pool:
+                list(pool.map(lambda piece: self._held(*piece), absent))
 
     def whole(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
         return self.place.local(self._name(path), self._checksum(path))
 
     def _held(self, path: Path, offset: int, size: int) -> Path:
-        name, sha256 = self._name(path), self._checksum(path).sha256
-        return cached(f"{sha256} {offset} {size}", lambda to: to.write_bytes(self.place.read_range(name, offset, size)))
+        key, name = self._key(path, offset, size), self._name(path)
+        return cached(key, lambda to: to.write_bytes(self.place.read_range(name, offset, size)))
+
+    def _key(self, path: Path, offset: int, size: int) -> str:
+        return f"{self._checksum(path).sha256} {offset} {size}"
 
     def _name(self, path: Path) -> str:
         return path.relative_to(self.root).as_posix()
@@ -168,10 +173,30 @@ def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedSha
     for unlisted in _UNLISTED:
         if (page := place.read(unlisted)) is not None:
             (root / unlisted).write_bytes(page)
+    return root, _brought(place, root, checksums, wanted)
+
+
+def files_here(
+    place: Place, checksums: Mapping[str, Checksum], *, by_range: Callable[[str], bool]
+) -> tuple[Path, FetchedShards | None]:
+    """Return a directory of this machine in which files of a place lie but those that are ``by_range``, and where these are read.
+
+    A directory holds all of them: it is returned itself, with None. `StoreError` where a file cannot be had as its checksum says.
+    """
+    if isinstance(place, DirectoryPlace):
+        return place.root, None
+    root = _directory_of(place.where(), repr(sorted(checksums.items())).encode())
+    return root, _brought(place, root, checksums, lambda name: not by_range(name))
+
+
+def _brought(
+    place: Place, root: Path, checksums: Mapping[str, Checksum], wanted: Callable[[str], bool]
+) -> FetchedShards:
+    """Bring what is wanted of a place's files below ``root``; return where the others are read."""
     absent = [(file, checksum) for file, checksum in checksums.items() if wanted(file) and not (root / file).exists()]
     with ThreadPoolExecutor(_AT_ONCE) as pool:
         list(pool.map(lambda of: _bring(place, of[0], of[1], root / of[0]), absent))
-    return root, FetchedShards(place, root, checksums)
+    return FetchedShards(place, root, checksums)
 
 
 @cache

@@ -110,10 +110,15 @@ class ShardedArray:
         """Have chunks brought here that are read soon, where they lie elsewhere; what cannot be had is told when it is read."""
         if self.fetched is None:
             return
-        pieces = []
-        for index in indices:
-            shard, place = self._shard_and_place(index)
-            path = self._shard_path(shard)
+        wanted = [self._shard_and_place(index) for index in indices]
+        tables, pieces = list[tuple[Path, int, int]](), list[tuple[Path, int, int]]()
+        paths = {shard: self._shard_path(shard) for shard, _ in wanted}
+        for shard in paths.keys() - self._indices.keys():
+            with suppress(FileNotFoundError):
+                tables.append((paths[shard], *self._index_span(self.fetched.size(paths[shard]))))
+        self.fetched.expect(tables)
+        for shard, place in wanted:
+            path = paths[shard]
             with suppress(FileNotFoundError, ValueError):
                 table = self._index(shard, partial(self.fetched.size, path), partial(self.fetched.read, path))
                 offset, size = (int(value) for value in table[place])
@@ -130,7 +135,9 @@ class ShardedArray:
         high, wide = self.chunk_shape
         row1, col1 = min(row1, self.shape[0]), min(col1, self.shape[1])
         out = np.empty((row1 - row0, col1 - col0), self.dtype)
-        for i, j in product(range(row0 // high, -(-row1 // high)), range(col0 // wide, -(-col1 // wide))):
+        touched = list(product(range(row0 // high, -(-row1 // high)), range(col0 // wide, -(-col1 // wide))))
+        self.expect(touched)
+        for i, j in touched:
             top, left = max(i * high, row0), max(j * wide, col0)
             bottom, right = min((i + 1) * high, row1), min((j + 1) * wide, col1)
             part = self.chunk((i, j))[top - i * high : bottom - i * high, left - j * wide : right - j * wide]
@@ -194,11 +201,14 @@ class ShardedArray:
     ) -> NDArray[np.uint64]:
         """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
         if shard not in self._indices:
-            per_shard = self.per_shard
-            size = 16 * math.prod(per_shard) + _CRC_BYTES
-            table = _checked(read, size, max(end() - size, 0))
-            self._indices[shard] = np.frombuffer(table, "<u8").reshape(*per_shard, 2)
+            offset, size = self._index_span(end())
+            self._indices[shard] = np.frombuffer(_checked(read, size, offset), "<u8").reshape(*self.per_shard, 2)
         return self._indices[shard]
+
+    def _index_span(self, shard_bytes: int) -> tuple[int, int]:
+        """Return offset and size of the table in a shard of so many bytes."""
+        size = 16 * math.prod(self.per_shard) + _CRC_BYTES
+        return max(shard_bytes - size, 0), size
 
 
 def open_sharded(path: Path, *, sparse: bool = False, fetched: Fetched | None = None) -> ShardedArray:

@@ -201,7 +201,7 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     told = run.manifest
     read_with = read_key(card.recipe, told.robot_requested, definitions=told.message_definitions)
     streams = opened.read_streams(run.run_id, key=f"{read_with}-{told.tcpipe_version}")
-    source = open_map(opened.map_path(sample.map))
+    source = open_map(*opened.map_files(sample.map))
     made = _made_again(sample, run, streams, source, card.recipe)
     differences = tuple(_differences(open_patches(directory, card, fetched), card, sample, made))
     if differences:

@@ -7,7 +7,7 @@ import logging
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
@@ -17,6 +17,7 @@ from tcpipe.formats.maps.map_facts import MapInputs, MapSummary
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.maps.text import map_lines
+from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.formats.store_mark import gone_if_empty
 from tcpipe.report.overview import quick_look, write_quick_look
@@ -39,15 +40,15 @@ _CLASSES = "classes"
 class AddedMap:
     """What became of a map; ``str`` of it is what the command prints."""
 
-    path: Path
+    path: Path | str
     status: Literal["done", "unchanged"]
     map: MapSummary
-    picture: Path
+    picture: Path | str
     """A quick look at it: orthophoto or shaded relief, tinted by class, white where a layer has no data."""
 
     def __str__(self) -> str:
         """Return where the map is and what it holds, as plain lines."""
-        head = f"{self.path} (quick look: {self.picture.name})"
+        head = f"{self.path} (quick look: {PurePosixPath(self.picture).name})"
         if self.status == "unchanged":
             head += ": nothing to do: it is made from the same files and options"
         return plain_lines((head, *map_lines(self.map), *(f"warning: {text}" for text in self.map.warnings)))
@@ -160,8 +161,12 @@ def _unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
 
 
 def _added(store: Store, name: str, status: Literal["done", "unchanged"]) -> AddedMap:
-    path = store.map_path(name)
-    return AddedMap(path, status, open_map(path).summary(), store.map_picture(name))
+    document, place = store.map_document(name), store.place.below("maps")
+    found = open_map(*store.map_at(document)).summary()
+    path, picture = (
+        where if is_url(where) else Path(where) for where in map(place.where, (document.zarr, document.picture))
+    )
+    return AddedMap(path, status, found, picture)
 
 
 def _found(given: Mapping[str, Files]) -> dict[str, list[Path]]:
@@ -218,7 +223,7 @@ def _checksums(files: Mapping[str, Sequence[Path]]) -> dict[str, dict[str, str]]
 def _refuse_other(store: Store, name: str, inputs: MapInputs) -> None:
     """Raise `MapError` that says what differs, unless the map that is there is made from the same."""
     try:
-        found = open_map(store.map_path(name))
+        found = open_map(*store.map_files(name))
     except (MapError, StoreError) as error:
         raise MapError(*error.problems, f"map {name}: add it anew with --force") from None
     before = found.facts.inputs
@@ -255,7 +260,7 @@ def _agreed(opened: Store, name: str) -> ClassScheme | None:
         if other == name:
             continue
         try:
-            found = open_map(opened.map_path(other))
+            found = open_map(*opened.map_files(other))
         except (MapError, StoreError):
             logger.warning("map %s cannot be read; its classes are not compared", other)
             continue

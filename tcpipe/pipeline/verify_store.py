@@ -20,6 +20,7 @@ from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.numbered import name_of, numbers, read_as_at, read_sealed_at, stem_and_number
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.published import FetchedShards
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
 from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_seal_in, read_checksums, wrong_checksum
@@ -113,9 +114,9 @@ def _stored_map(store: Store, name: str) -> Iterator[Finding]:
     yield from wrong
     yield "files", len(document.checksums)
     if not wrong:
-        path, picture = store.map_path(name), store.map_picture(name)
-        yield from _tiles(path)
-        if document.picture in document.checksums and not shows_map(picture, path):
+        path, fetched = store.map_files(name)
+        yield from _tiles(path, fetched)
+        if document.picture in document.checksums and not shows_map(store.map_picture(name), path):
             yield f"{place.where(document.picture)}: does not show the map as it is; add the map again with --force"
 
 
@@ -155,8 +156,8 @@ def verify_map(path: Path) -> Iterator[Finding]:
     yield from _tiles(path)
 
 
-def _tiles(path: Path) -> Iterator[Finding]:
-    source = open_map(path, proved=False)
+def _tiles(path: Path, fetched: FetchedShards | None = None) -> Iterator[Finding]:
+    source = open_map(path, fetched, proved=False)
     for factor in source.factors:
         level = source if factor == 1 else source.at(factor)
         for layer in source.layers:

@@ -28,4 +28,4 @@ def chosen_map(store: str | Path, name: str | None) -> MapFile:
         raise UsageError(f"{opened.root}: {len(maps)} maps in the store ({', '.join(maps)}); name one with --map")
     if name is not None and name not in maps:
         raise MapError(f"{opened.root}: no map {name!r} in the store; there are {', '.join(maps)}")
-    return open_map(opened.map_path(name or maps[0]))
+    return open_map(*opened.map_files(name or maps[0]))

@@ -142,7 +142,7 @@ def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under
     lost: list[tuple[str, str]] = []
     for name in store.maps() if run.track().info.datum is not None else ():
         try:
-            source = open_map(store.map_path(name))
+            source = open_map(*store.map_files(name))
             x, y = Transformer.from_crs(gnss_crs, source.grid.crs, always_xy=True).transform(lon, lat)
             if source.grid.contains(np.column_stack([x, y])).mean() > _MOSTLY:
                 return (source, map_overview(source), np.asarray(x), np.asarray(y)), lost

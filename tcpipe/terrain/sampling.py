@@ -97,6 +97,7 @@ def sample_patches(
     )
     out = Stacks(np.empty(shape, np.uint16), floats, greys, classes, np.empty((chord_m.size, 7)))
     pool = pool or TilePool(level)
+    pool.expect(boxes)
     for chosen in groups_by_tile(level.grid.px_from_xy(frames.centre_xy_m), level):
         pool.hold(boxes[chosen])
         sample_tiles(pool.tiles, ground, chosen, out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any, Protocol
 
@@ -62,6 +62,9 @@ class MapReader(Protocol):
 
         Height is in metres above `height_reference_m`; no data is NaN, or 0 in layers of bytes.
         """
+
+    def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
+        """Have tiles (row, column) of all layers at hand that are read soon, where that takes long."""
 
     def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
         """Put the tile in row i and column j into ``out``, contiguous, `tile_px` each way; beyond the map it holds no data."""
@@ -129,6 +132,11 @@ class TilePool:
         """The held tiles, as the sampling kernel takes them."""
         flat = {str(stack): values.reshape(-1) for stack, values in self._flat.items()}
         return Tiles(**flat, slots=self.slots, rows=self.tile_shape[0], cols=self.tile_shape[1])
+
+    def expect(self, boxes: NDArray[np.int64]) -> None:
+        """Have the tiles at hand that any of the boxes touches, as `hold` has them: it is called for parts of them soon."""
+        touched = _touched(boxes, self._map.tile_px, self.slots.shape)
+        self._map.expect([tile for tile in touched if tile not in self._held])
 
     def hold(self, boxes: NDArray[np.int64]) -> None:
         """Make the tiles available that any of the boxes touches (first row and column, last row and column exclusive; (N, 4))."""

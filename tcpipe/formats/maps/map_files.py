@@ -20,7 +20,7 @@ so does GDAL from 3.13 on, the first that reads shards.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -35,7 +35,7 @@ from tcpipe.formats.json_files import plain, recast, typed
 from tcpipe.formats.layer_descriptions import Description, described, flags, layers_described
 from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
 from tcpipe.formats.seals import prove_files, read_checksums
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
+from tcpipe.formats.shards import DESCRIPTION, Fetched, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
 from tcpipe.tables.findings import LEFT_OUT
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
@@ -121,6 +121,11 @@ class MapFile:
         with self._told(layer, row0, row1, col0, col1):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
 
+    def expect(self, tiles: Sequence[tuple[int, int]]) -> None:
+        """Have tiles (row, column) of all layers brought here that are read soon, where they lie in a bucket."""
+        for array in self._levels[self._factor].values():
+            array.expect(tiles)
+
     def read_tile(self, layer: str, i: int, j: int, out: NDArray[Any]) -> None:
         """Decode the tile in row i and column j into ``out``, contiguous, `tile_px` each way; `MapError` as `read`."""
         grid, side = self.grid, self.tile_px
@@ -141,8 +146,8 @@ class MapFile:
             ) from error
 
 
-def open_map(path: Path, *, proved: bool = True) -> MapFile:
-    """Open a map for reading.
+def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True) -> MapFile:
+    """Open a map for reading; its shards lie beside their descriptions, or are ``fetched``.
 
     Raises
     ------
@@ -169,7 +174,7 @@ def open_map(path: Path, *, proved: bool = True) -> MapFile:
     if missing:
         raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
     if proved:
-        _prove(path)
+        _prove(path, fetched)
     return MapFile(
         name=kept.name,
         grid=kept.grid,
@@ -181,30 +186,38 @@ def open_map(path: Path, *, proved: bool = True) -> MapFile:
         id_by_value=kept.id_by_value,
         factors=kept.factors,
         _levels={
-            f: {layer: open_sharded(path / f"{_level_path(f)}{layer}", sparse=True) for layer in kept.layers}
-            for f in kept.factors
+            factor: {
+                layer: open_sharded(path / f"{_level_path(factor)}{layer}", sparse=True, fetched=fetched)
+                for layer in kept.layers
+            }
+            for factor in kept.factors
         },
     )
 
 
-def _prove(path: Path) -> None:
+def _prove(path: Path, fetched: Fetched | None) -> None:
     """Compare what describes a map with its checksums, and its other files by size: their tiles carry checksums of their own."""
     try:
         listed = read_checksums(path)
         prove_files(path, listed, [name for name in listed if Path(name).name == DESCRIPTION])
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
-    lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry.size_bytes)]
+    size_of = fetched.size if fetched else _size_on_disk
+    lost = [str(path / name) for name, entry in listed.items() if not _has_size(path / name, entry.size_bytes, size_of)]
     if lost:
         more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
         raise MapError(f"{lost[0]}{more}: gone or cut short; add the map again")
 
 
-def _has_size(path: Path, size_bytes: int) -> bool:
+def _has_size(path: Path, size_bytes: int, size_of: Callable[[Path], int]) -> bool:
     try:
-        return path.stat().st_size == size_bytes
+        return size_of(path) == size_bytes
     except OSError:
         return False
+
+
+def _size_on_disk(path: Path) -> int:
+    return path.stat().st_size
 
 
 def _level_path(factor: int) -> str:

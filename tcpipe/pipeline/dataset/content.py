@@ -157,14 +157,14 @@ def gather_content(
     sampled, slot, spool = sample_all_segments(
         pool.segments,
         ranks,
-        inputs.map_paths,
+        inputs.maps,
         recipe.sample,
         gnss_crs=gnss_crs,
         spool_place=spool_place,
         jobs=jobs,
         cluster=cluster,
     )
-    sources = tuple(open_map(path) for path in inputs.map_paths())
+    sources = tuple(open_map(*of) for of in inputs.maps())
     lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)
     if len(sampled.kept) == 0:
         raise DatasetError(

@@ -25,9 +25,9 @@ from tcpipe.formats.dataset_files import (
     sample_columns,
 )
 from tcpipe.formats.json_files import digest, plain
-from tcpipe.formats.published import here_by_range
+from tcpipe.formats.published import FetchedShards, here_by_range
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
-from tcpipe.formats.seals import CHECKSUMS, file_checksums, read_checksums
+from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, read_checksums
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.recordings import each_drive_once
@@ -47,8 +47,8 @@ class Inputs:
     sources: tuple[RunSource, ...]
     map_names: tuple[str, ...]
     """In order of priority where maps overlap."""
-    map_paths: Callable[[], tuple[Path, ...]]
-    """Where they lie, on the machine that asks."""
+    maps: Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
+    """What `open_map` takes, on the machine that asks."""
     map_sha256: tuple[str, ...]
     """Over the checksums of each map's files."""
     again: Mapping[str, NDArray[np.bool_]]
@@ -78,8 +78,12 @@ def choose_inputs(
     chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
     once = each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
     runs = once.runs
-    paths = partial(_map_paths, store, tuple(store.map_document(name) for name in names))
-    map_sha256 = tuple(_map_digest(name, path) for name, path in zip(names, paths(), strict=True))
+    documents = tuple(store.map_document(name) for name in names)
+    maps = partial(_map_files, store, documents)
+    map_sha256 = tuple(
+        _map_digest(name, path) if fetched is None else _digest_of(document.checksums, document.zarr)
+        for name, document, (path, fetched) in zip(names, documents, maps(), strict=True)
+    )
     sources = tuple(run_source(run, chosen.logs[run.run_id]) for run in runs)
     fingerprint = digest(
         {
@@ -94,10 +98,10 @@ def choose_inputs(
         }
     )
     warnings = (*chosen.warnings, *once.warnings)
-    return Inputs(runs, sources, names, paths, map_sha256, once.again, fingerprint, chosen, warnings, covariates)
+    return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, warnings, covariates)
 
 
-def _map_paths(store: Store, maps: Sequence[MapDocument]) -> tuple[Path, ...]:
+def _map_files(store: Store, maps: Sequence[MapDocument]) -> tuple[tuple[Path, FetchedShards | None], ...]:
     return tuple(map(store.map_at, maps))
 
 
@@ -115,7 +119,15 @@ def _map_digest(name: str, path: Path) -> str:
         raise MapError(
             f"map {name}: not as it was written: {what} ('tcpipe verify {path}' lists everything); add the map again with --force"
         )
-    return digest({name: (entry.size_bytes, entry.sha256) for name, entry in found.items()})
+    return _digest_of(found)
+
+
+def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
+    """Return one hash over the checksums of files, or of those below a directory."""
+    start = f"{below}/" if below else ""
+    return digest(
+        {name.removeprefix(start): (of.size_bytes, of.sha256) for name, of in files.items() if name.startswith(start)}
+    )
 
 
 def earlier_splits(dataset: str | Path) -> pa.Table:

@@ -18,6 +18,7 @@ from tcpipe.execution import run_all
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
+from tcpipe.formats.published import FetchedShards
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled
 from tcpipe.stages.sample_maps import check_alike, sample_on_maps
@@ -43,8 +44,8 @@ _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
 
 
-MapPaths = Callable[[], tuple[Path, ...]]
-"""Where maps lie on the machine that asks, in order of priority; picklable."""
+MapPlaces = Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
+"""What `open_map` takes on the machine that asks, in order of priority; picklable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class _Batch:
     number: int
     ranks: NDArray[np.uint64]
     segments: pa.Table
-    map_paths: MapPaths
+    maps: MapPlaces
     config: SampleConfig
     gnss_crs: str
     spool: Spool
@@ -118,7 +119,7 @@ class _Batches(Sequence[_Batch]):
     rows: Sequence[NDArray[np.int64]]
     ranks: NDArray[np.uint64]
     segments: pa.Table
-    map_paths: MapPaths
+    maps: MapPlaces
     config: SampleConfig
     gnss_crs: str
     spool: Spool
@@ -137,13 +138,13 @@ class _Batches(Sequence[_Batch]):
             return replace(self, rows=self.rows[index])
         rows = self.rows[index]
         segments = self.segments.take(pa.array(rows))
-        return _Batch(index, self.ranks[rows], segments, self.map_paths, self.config, self.gnss_crs, self.spool)
+        return _Batch(index, self.ranks[rows], segments, self.maps, self.config, self.gnss_crs, self.spool)
 
 
 def sample_all_segments(
     segments: pa.Table,
     ranks: NDArray[np.uint64],
-    map_paths: MapPaths,
+    maps: MapPlaces,
     config: SampleConfig,
     *,
     gnss_crs: str,
@@ -161,7 +162,7 @@ def sample_all_segments(
         M segments, of any runs.
     ranks
         Their ranks in the dataset's order, uniform over 64 bits, shape (M,).
-    map_paths, config, gnss_crs
+    maps, config, gnss_crs
         What is sampled, in order of priority, how, and the CRS of the segments' positions.
     spool_place
         Where the pixels wait.
@@ -174,12 +175,12 @@ def sample_all_segments(
         The map or the segments cannot be used.
 
     """
-    sources = [open_map(path) for path in map_paths()]
+    sources = [open_map(*of) for of in maps()]
     check_alike(sources)
     rows = list(_batch_rows(segments))
     spool = Spool(spool_place, in_order(joint([source.layers for source in sources])), config.patch_px)
     placed = segments.select(PLACED_SEGMENTS.names())
-    batches = _Batches(rows, ranks, placed, map_paths, config, gnss_crs, spool)
+    batches = _Batches(rows, ranks, placed, maps, config, gnss_crs, spool)
     lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     warnings: dict[int, tuple[str, ...]] = {}
@@ -235,7 +236,7 @@ def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
 def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     """Sample one batch; its pixels go to its file of the spool."""
     try:
-        held = [_held_map(path, batch.config) for path in batch.map_paths()]
+        held = [_held_map(*of, batch.config) for of in batch.maps()]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
         batch.spool.write(batch.number, _in_order(batch.ranks[sampled.kept]), sampled.patches.pixels)
@@ -244,11 +245,11 @@ def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     return replace(sampled, patches=replace(sampled.patches, pixels={}))
 
 
-def _held_map(path: Path, config: SampleConfig) -> _HeldMap:
+def _held_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> _HeldMap:
     """Return a map as this process's last batch left it: the next one lies beside it and wants the same tiles."""
     held = _held.pop(path, None)
     if held is None:
-        source = open_map(path)
+        source = open_map(path, fetched)
         held = _HeldMap(source, TilePool(level_for(source, config.patch_m / config.patch_px)))
     _held[path] = held
     if len(_held) > _HELD_MAPS:

@@ -9,12 +9,16 @@ import pytest
 import rasterio
 import xarray
 from map_worlds import World
+from object_gateway import in_environment
+from storage_server import object_store
 
 from tcpipe.errors import MapError
+from tcpipe.formats.bucket import open_place
 from tcpipe.formats.maps.building import build_map
 from tcpipe.formats.maps.map_facts import MapFacts, MapInputs
 from tcpipe.formats.maps.map_files import SHARD_PX, MapWriter, open_map
-from tcpipe.formats.seals import write_checksums
+from tcpipe.formats.published import files_here
+from tcpipe.formats.seals import file_checksums, write_checksums
 from tcpipe.terrain.classes import PAPER_SCHEME
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import paper_layers
@@ -98,24 +102,53 @@ def test_overviews_are_maps_of_the_same_ground(path):
             assert pyproj.CRS(decoded.spatial_ref.attrs["crs_wkt"]) == pyproj.CRS(WORLD.crs)
 
 
-def test_overviews_across_shards_have_no_seam(tmp_path):
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory):
+    """A map of 25 tiles in four shards, and its heights."""
+    path = tmp_path_factory.mktemp("wide") / "m.zarr"
     grid = MapGrid("EPSG:32633", 500_000.0, 5_200_000.0, 0.03, 2100, 2100)
     rng = np.random.default_rng(0)
     height, ids = rng.normal(600.0, 1.0, (2100, 2100)), rng.integers(1, 8, (2100, 2100)).astype(np.uint8)
     layers = paper_layers(("height", "terrain"), PAPER_SCHEME.table)
-    writer = MapWriter(tmp_path / "m.zarr", name="m", grid=grid, scheme=PAPER_SCHEME, layers=layers)
+    writer = MapWriter(path, name="m", grid=grid, scheme=PAPER_SCHEME, layers=layers)
     for row in (0, SHARD_PX):
         for col in (0, SHARD_PX):
             for layer, values in (("height", height), ("terrain", ids)):
                 writer.write(layer, row, col, values[row : row + SHARD_PX, col : col + SHARD_PX])
     writer.finish(FACTS, layers)
-    write_checksums(tmp_path / "m.zarr")
+    write_checksums(path)
+    return path, height
+
+
+def test_overviews_across_shards_have_no_seam(wide):
+    path, height = wide
     for factor in (2, 32):
-        level, side = open_map(tmp_path / "m.zarr").at(factor), 2100 // factor
+        level, side = open_map(path).at(factor), 2100 // factor
         cells = height[: side * factor, : side * factor].reshape(side, factor, side, factor).mean(axis=(1, 3))
         found = level.height_reference_m + level.read("height", 0, side, 0, side).astype(float)
         np.testing.assert_allclose(found, cells, atol=1e-5)
         assert (level.read("terrain", 0, side, 0, side) > 0).all()
+
+
+def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path, monkeypatch):
+    path, served = wide[0], tmp_path / "served" / "tests" / "m.zarr"
+    shutil.copytree(path, served)
+    checksums = {f"m.zarr/{name}": of for name, of in file_checksums(path).items()}
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        root, shards = files_here(open_place("s3://tests"), checksums, by_range=lambda name: "/c/" in name)
+        here, there = open_map(path), open_map(root / "m.zarr", shards)
+        opened, requests = fetched.sent_bytes, len(fetched)
+        for layer in here.layers:  # of one tile
+            np.testing.assert_array_equal(there.read(layer, 10, 500, 600, 1000), here.read(layer, 10, 500, 600, 1000))
+        there.expect([(0, 1)])
+        assert set(fetched[requests:]) == {f"m.zarr/{layer}/c/0/0" for layer in here.layers}
+        assert len(fetched) - requests == 2 * len(here.layers)  # the index of a shard, and its tile
+        whole = sum((served / layer / "c" / "0" / "0").stat().st_size for layer in here.layers)
+        assert fetched.sent_bytes - opened < 0.1 * whole
+        (served / "height" / "c" / "1" / "1").unlink()
+        with pytest.raises(MapError, match=r"height, rows 2050 to 2090.*cannot be read.*is gone"):
+            there.read("height", 2050, 2090, 2050, 2090)
 
 
 def test_what_is_no_map_says_so(path, tmp_path):

@@ -69,6 +69,12 @@ def test_a_dataset_that_is_built_into_a_bucket_is_the_same_as_on_disk(made, buck
     assert files(bucket[0] / "by name" / "ds") == files(made / "zarr")
 
 
+def test_from_a_store_in_a_bucket_the_same_dataset_is_built(made, bucket, tmp_path):
+    shutil.copytree(made / "store", bucket[0] / "st")
+    build_dataset(tmp_path / "ds", store="s3://sets/st", recipe=Recipe())
+    assert files(tmp_path / "ds") == files(made / "zarr")
+
+
 def test_what_lies_there_and_is_no_dataset_is_left_alone(made, bucket):
     (bucket[0] / "notes.txt").write_text("mine")
     with pytest.raises(UsageError, match=r"s3://sets: holds notes.txt and no dataset.json; it is left alone"):
