@@ -13,6 +13,7 @@ import logging
 import os
 import shutil
 import stat
+import sys
 import tempfile
 from collections.abc import Callable
 from numbers import Number
@@ -20,6 +21,7 @@ from typing import Any
 
 import numba
 from numba.core import event
+from numba.core.cpu import CPUContext
 from numba.core.dispatcher import Dispatcher
 
 logger = logging.getLogger("tcpipe")
@@ -42,6 +44,28 @@ class _Announce(event.Listener):  # type: ignore[misc]
 
 
 event.register("numba:compile", _Announce())
+
+
+_BLAS = "scipy.linalg.cython_blas"
+_load = CPUContext.load_additional_registries
+
+
+def _load_without_blas(context: CPUContext) -> None:
+    """Load what numba needs, in a process of our own without scipy's linear algebra: it only looks whether that is there, for 0.2 s.
+
+    A kernel that multiplies matrices would be refused. Who uses tcpipe as a library may have such.
+    """
+    if "tcpipe.cli" not in sys.modules or _BLAS in sys.modules:
+        _load(context)
+        return
+    sys.modules[_BLAS] = None  # type: ignore[assignment]
+    try:
+        _load(context)
+    finally:
+        del sys.modules[_BLAS]
+
+
+CPUContext.load_additional_registries = _load_without_blas
 
 
 def kernel(function: Callable[..., Any]) -> Any:

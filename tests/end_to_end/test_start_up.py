@@ -9,10 +9,11 @@ from tcpipe.simulation import tiny
 
 UNUSED = {
     "pandas", "filterpy", "pydantic", "zarr", "rasterio", "matplotlib", "polars", "pyproj", "shapely", "mcap", "torch", "lightgbm",
-    "scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.special", "scipy.stats",
+    "ruamel.yaml", "scipy.linalg", "scipy.optimize", "scipy.signal", "scipy.spatial", "scipy.special", "scipy.stats",
 }  # fmt: skip
 PROGRAM = """
 import sys
+import tcpipe.cli
 if __name__ == "__main__":
     from tcpipe.pipeline.ingest import ingest
     summary = ingest(sys.argv[3:], store=sys.argv[1], jobs=int(sys.argv[2]))

@@ -11,8 +11,6 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from tcpipe.errors import LogError
 from tcpipe.formats.logs.log_part import MAX_CHUNK_BYTES, LogPart, MessageBlock, is_bomb, no_room
@@ -225,6 +223,9 @@ def _unframed(frame: memoryview) -> bytes | None:
 
 def _bag_information(path: Path) -> dict[str, Any] | None:
     """Return what metadata.yaml says of the bag; None where it is missing or broken, as a recorder that is killed leaves it."""
+    from ruamel.yaml import YAML  # noqa: PLC0415  most logs are none of these
+    from ruamel.yaml.error import YAMLError  # noqa: PLC0415
+
     try:
         if path.stat().st_size > MAX_METADATA_BYTES:
             return None
