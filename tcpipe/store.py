@@ -62,6 +62,7 @@ from tcpipe.formats.record_files import (
     RunName,
     Sighting,
     Superseded,
+    in_force,
     put_record,
     read_record,
     read_records,
@@ -309,9 +310,7 @@ class Store:
 
     def superseded(self) -> dict[str, str]:
         """Return the runs whose log was completed or repaired, and by which run."""
-        records = sorted(self.records("superseded", Superseded), key=lambda record: (record.number, record.by is None))
-        latest = {record.run_id: record.by for record in records}
-        return {run_id: by for run_id, by in latest.items() if by is not None}
+        return in_force(self.records("superseded", Superseded))
 
     def supersede(self, run_id: str, by: str | None) -> None:
         """Remember that another run takes this one's place, or, without ``by``, that it counts again."""
@@ -325,11 +324,9 @@ class Store:
 
     def claim_run(self, stem: str, sha256: str) -> str:
         """Return the run that a recording is, by its content: the one that was named for it first, or a new one."""
-        if (run_id := self.run_of_content(sha256)) is None:
-            run_id = self._free_name(stem, sha256)
-            if not self.remember(f"runs/{sha256}", RunName(sha256, run_id)):
-                run_id = self.run_of_content(sha256) or run_id
-        return run_id
+        run_id = self._free_name(stem, sha256)
+        new = self.remember(f"runs/{sha256}", RunName(sha256, run_id))
+        return run_id if new else self.run_of_content(sha256) or run_id
 
     def run_of_content(self, sha256: str) -> str | None:
         """Return the run that was named for a recording; None where there was none."""
@@ -403,12 +400,13 @@ class Store:
 
     def write_run_json(self, run_id: str, values: RunJson) -> None:
         """Write what is known of a run's log; where that is known already nothing is written."""
-        place = self.runs_place.below(run_id)
-        known = self.known_run(run_id)
+        place, last = self.runs_place.below(run_id), numbers(self.runs_place.files(run_id))
+        known = self.known_run(run_id) if last.get("run") else None
         if known is None or not _alike(known, values) or values.streams != known.streams:
-            last = self._last(run_id, "run")
-            put_next(place, "run", values, after=last, settled=lambda found: _alike(found, values))
-        self.tag_run(run_id, values.tags)
+            settled = lambda found: _alike(found, values)  # noqa: E731
+            known = put_next(place, "run", values, after=last.get("run", 0), settled=settled)
+        if last.get("tags") or not values.tags.items() <= known.tags.items():
+            self.tag_run(run_id, values.tags)
 
     def remember(self, name: str, fact: object) -> bool:
         """Remember a fact under ``<kind>/<name>`` for good; return whether it was new."""
@@ -468,8 +466,8 @@ class Store:
         gated: GatedTrack,
         labelled: LabelledSegments,
         settled: Callable[[Manifest], bool] = lambda _: False,
-    ) -> RunDirectory:
-        """Write one ingestion, its checksums added to the manifest; return it, or the one of others that is ``settled``."""
+    ) -> Manifest:
+        """Write one ingestion, its checksums added to the manifest; return that, or the one of others that is ``settled``."""
         place = self.runs_place.below(f"{manifest.run_id}/{manifest.recipe_id}")
         told = {
             "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": plain(manifest.info.datum), "robot": manifest.robot,
@@ -477,11 +475,10 @@ class Store:
         tables = {"track": gated.table, "segments": labelled.table, "rejections": track.rejections}
         whole = next((run for run in self.recipes_of(manifest.run_id) if run.recipe_id == manifest.recipe_id), None)
         if whole is not None and settled(whole.manifest):
-            return whole
+            return whole.manifest
         checksums = put_tables(place, {name: with_metadata(table, told) for name, table in tables.items()})
         after = numbers(place.files()).get("manifest", 0)
-        put_next(place, "manifest", replace(manifest, checksums=checksums), after=after, settled=settled)
-        return next(run for run in self.recipes_of(manifest.run_id) if run.recipe_id == manifest.recipe_id)
+        return put_next(place, "manifest", replace(manifest, checksums=checksums), after=after, settled=settled)
 
 
 def _differ(rows: Mapping[tuple[str, str], object], known: Mapping[tuple[str, str], object]) -> bool:
@@ -580,10 +577,11 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         _refuse_file(root, create=create)
     else:
         store.place.check()
-    found = is_store(root)
+    version = layout_of(store.place)
+    found = version is not None or is_store(root)
     if not found and not create and not isinstance(root, Path):
         raise UsageError(f"{root}: there is no store here; run 'tcpipe ingest' first, or name another with --store")
-    if found and (version := layout_of(store.place)) not in READ_VERSIONS:
+    if version not in (None, *READ_VERSIONS):
         raise StoreError(f"{root}: is of data model {version}, this version knows {', '.join(READ_VERSIONS)}")
     if create:
         mark_store(store.place, found=found)

@@ -6,7 +6,7 @@ The name of a record follows from the fact, so that the same fact is one file wh
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import TypeVar
@@ -48,6 +48,13 @@ class Superseded:
     run_id: str
     by: str | None
     number: int
+
+
+def in_force(records: Iterable[Superseded]) -> dict[str, str]:
+    """Return the runs that are superseded, and by which run."""
+    by_number = sorted(records, key=lambda record: (record.number, record.by is None))
+    latest = {record.run_id: record.by for record in by_number}
+    return {run_id: by for run_id, by in latest.items() if by is not None}
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +120,10 @@ def put_record(place: Place, name: str, value: object) -> bool:
         It cannot be written.
 
     """
-    if read_record(place, name, type(value)) is not None:
-        return False
     data = to_json(sealed(value)).encode()
     if place.put_new(f"{name}.json", data):
         return True
-    if read_record(place, name, type(value)) is not None:  # another process was faster
+    if read_record(place, name, type(value)) is not None:
         return False
     place.put(f"{name}.json", data)
     return True

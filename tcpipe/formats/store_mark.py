@@ -30,10 +30,10 @@ def is_outdated(place: Place) -> bool:
     )
 
 
-def layout_of(place: Place) -> str:
-    """Return the data model of a store; `StoreError` where its mark is not as it was written."""
-    where = place.where(MARK)
-    return typed(proved(place.read(MARK) or b"", where), StoreDocument, where).data_model_version
+def layout_of(place: Place) -> str | None:
+    """Return the data model of a store, None where there is none; `StoreError` where its mark is not as it was written."""
+    where, data = place.where(MARK), place.read(MARK)
+    return None if data is None else typed(proved(data, where), StoreDocument, where).data_model_version
 
 
 def mark_store(place: Place, *, found: bool = False) -> None:

@@ -189,9 +189,10 @@ def _call_of(
 
 def _keep_index(store: Store, known: KnownRuns, results: Iterable[IngestResult]) -> None:
     """Write the index, with what this call made."""
+    results = list(results)
     if all(result.status in ("unchanged", "waiting") for result in results):
         store.keep_index(known.runs)
-    elif store.run_ids():
+    elif known.runs.rows or any(result.run_id for result in results):
         store.keep_index(store.ingestions())
         store.seen_logs()
 
@@ -228,7 +229,8 @@ def _without_work(
     run_id = store.run_of(sha256, runs) if sha256 else None
     if run_id and (made := made_before(store, run_id, task, str(source.sha256))):
         return made
-    failed = None if task.force or task.retry_failed else store.recall(task.failure, Trouble)
+    again = task.force or task.retry_failed or task.failure not in known.failed
+    failed = None if again else store.recall(task.failure, Trouble)
     if failed is not None:
         return IngestResult(source.name, "failed", problems=failed.lines, sha256=source.sha256, known=True)
     return too_young(task)

@@ -11,13 +11,12 @@ from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
-from tcpipe.formats.index_files import KnownLog, RunFacts
+from tcpipe.formats.index_files import KnownLog, RunFacts, facts_of
 from tcpipe.formats.logs.joined import AnyLog, open_logs
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.robot_files import profiles_of
-from tcpipe.formats.run_documents import RunJson
-from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.pipeline.ingest_documents import manifest_of, run_json_of
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, Status, result_of, told, too_young
 from tcpipe.pipeline.log_sources import LogSource
@@ -63,9 +62,9 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         if not known.streams:
             known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
-        run = _fuse_and_label(store, run_id, streams, known, task)
+        manifest = _fuse_and_label(store, run_id, streams, known, task)
         remember_outline(store, run_id, sha256, log)
-    return result_of(source, "done", run.facts, sha256, same_as=same_as)
+    return result_of(source, "done", facts_of(manifest, state=""), sha256, same_as=same_as)
 
 
 def made_before(store: Store, run_id: str, task: IngestTask, sha256: str) -> IngestResult | None:
@@ -93,7 +92,7 @@ def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
     return log
 
 
-def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> RunDirectory:
+def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> Manifest:
     track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id, name=task.source.name)
     manifest = manifest_of(task, known, streams, track, labelled)
     settled = (lambda _: False) if task.force else task.is_made_by

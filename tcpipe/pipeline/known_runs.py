@@ -23,6 +23,8 @@ class KnownRuns:
     """Logs that were seen, by lineage; none where they are to be read again."""
     parties: frozenset[str]
     """Runs that another has taken the place of, or did once, and those others."""
+    failed: frozenset[str]
+    """Names of the records of failures."""
 
     def has_seen(self, source: LogSource, sha256: str) -> bool:
         """Tell whether this is remembered of the log."""
@@ -38,4 +40,5 @@ def known_runs(store: Store, *, force: bool = False) -> KnownRuns:
     parties = {
         party for record in store.records("superseded", Superseded) for party in (record.run_id, record.by) if party
     }
-    return KnownRuns(runs, made, {} if force else store.seen_logs(), frozenset(parties))
+    failed = frozenset(f"failed/{name.removesuffix('.json')}" for name in store.place.files("records/failed"))
+    return KnownRuns(runs, made, {} if force else store.seen_logs(), frozenset(parties), failed)

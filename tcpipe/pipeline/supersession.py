@@ -13,7 +13,7 @@ import pyarrow as pa
 from tcpipe.errors import StoreError
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.record_files import RunName, Superseded, record_name
+from tcpipe.formats.record_files import RunName, Superseded, in_force, record_name
 from tcpipe.pipeline.log_sources import LogSource, is_there
 from tcpipe.store import Store
 
@@ -31,12 +31,13 @@ def superseded_by(
     A run counts again when its recording is seen again, wherever that is. A log that is as it was is looked at only where its run
     has a part in that.
     """
-    gone = store.superseded()
+    records = store.records("superseded", Superseded)
+    gone = in_force(records)
     if run_id in gone:
         store.supersede(run_id, None)
         yield f"run {run_id} counts again: its recording is back"
     seen = {sighting.sha256 for sighting in store.sightings(source.lineage)}
-    new, records = sha256 not in seen, store.records("superseded", Superseded)
+    new = sha256 not in seen
     parties = {party for record in records for party in (record.run_id, record.by)}
     earlier = seen - {sha256} if new or run_id in parties else ()
     for older in sorted(filter(None, (store.run_of(of, runs) for of in earlier))):
