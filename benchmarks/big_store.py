@@ -28,6 +28,7 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
+from tcpipe.tables.wkb import line_column
 
 RUN_ROWS = 3_300
 MARGIN_M = 12.0
@@ -98,8 +99,9 @@ def _add_run(store: Store, number: int, rows: int) -> None:
     rest = {
         column.name: rng.uniform(0.0, 0.01, rows).astype(column.dtype.to_pandas_dtype())
         for column in LABELLED_SEGMENTS.columns
-        if column.name not in given
+        if column.name not in {*given, "geometry"}
     }
+    rest["geometry"] = line_column(np.stack([lon, lat], 1)[:-1], np.stack([lon, lat], 1)[1:])
     table = LABELLED_SEGMENTS.table(**given, **rest)
     info = TrackInfo(run_id, "husky", Datum(lon[0], lat[0], 600.0), 20.0, "smoother")
     recipe = Recipe()

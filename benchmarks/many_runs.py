@@ -1,4 +1,4 @@
-"""Nights on a store of 10,000 runs: what it costs to ingest nothing, to tell where everything stands, and to choose a dataset's runs.
+"""Nights on a store of 10,000 runs: what it costs to ingest nothing, to tell where everything stands, to choose a dataset's runs, to prune.
 
 ::
 
@@ -24,10 +24,13 @@ from tcpipe.formats.logs.writing import write_mcap
 from tcpipe.formats.record_files import RunName, Sighting, record_name
 from tcpipe.formats.seals import file_checksum, sealed
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.pipeline.calls import latest_calls
 from tcpipe.pipeline.dataset.runs import Chosen, choose_runs
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.recordings import each_drive_once
+from tcpipe.pipeline.status import status
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
@@ -46,9 +49,8 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
     from wheel_drives import wheel_drive
 
     write_mcap(directory / "one.mcap", wheel_drive())
-    (result,) = ingest([directory / "one.mcap"], store=directory / "one", recipe=Recipe()).results
-    one = Store(directory / "one")
-    (run,) = one.recipes_of(result.run_id)
+    ingest([directory / "one.mcap"], store=directory / "one", recipe=Recipe())
+    (run,) = Store(directory / "one").runs()
     logs.mkdir(parents=True)
     for number in range(count):
         (logs / f"drive_{number:05d}.mcap").write_bytes(b"%08d" % number)
@@ -66,6 +68,10 @@ def _copy(run: RunDirectory, store: Store, source: LogSource, number: int) -> No
     place.mkdir(parents=True)
     for name in ("track", "rejections"):
         os.link(there / f"{name}.parquet", place / f"{name}.parquet")
+    for stream in there.parents[1].glob("streams/*/*.parquet"):
+        linked = place.parents[1] / stream.relative_to(there.parents[1])
+        linked.parent.mkdir(parents=True, exist_ok=True)
+        os.link(stream, linked)
     segments = run.table("segments")
     for name in ("start_ns", "end_ns"):
         at, column = segments.schema.get_field_index(name), pc.add(segments.column(name), number * DAY_NS)
@@ -109,9 +115,14 @@ def main() -> None:
     for again in ("first", "again"):
         summary = timed(f"nothing to ingest, {again}", lambda: ingest([logs], store=store.root, recipe=Recipe()))
         assert {result.status for result in summary.results} == {"unchanged"}
-    for again in ("first", "again"):
+        found = timed(f"status, {again}", lambda: status([logs], store=store.root, recipe=Recipe()))
+        assert found.counts == {"done": count}, found.counts
+        timed(f"history, {again}", lambda: latest_calls(store))
         chosen = timed(f"choice of runs, {again}", lambda: choose_runs(store, Recipe(), robot=None, tags={}))
         assert timed(f"each drive once, {again}", lambda chosen=chosen: once(chosen)) == count
+        assert not timed(
+            f"prune --dry-run, {again}", lambda: prune(store=store.root, recipe=Recipe(), dry_run=True)
+        ).removed
 
 
 if __name__ == "__main__":

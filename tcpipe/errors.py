@@ -27,6 +27,8 @@ from collections.abc import Iterable
 
 def plain_line(text: str) -> str:
     """Return ``text`` as one line that every terminal can show: control characters and bytes that are no text as escapes."""
+    if text.isprintable():
+        return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -31,6 +31,7 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.geoparquet import located_segments
 from tcpipe.formats.index_files import (
     RunFacts,
     SeenLog,
@@ -44,15 +45,7 @@ from tcpipe.formats.index_files import (
     write_runs,
 )
 from tcpipe.formats.json_files import digest, plain, to_json, typed
-from tcpipe.formats.numbered import (
-    digest_of,
-    name_of,
-    numbers,
-    put_next,
-    read_as_at,
-    read_sealed_at,
-    stem_and_number,
-)
+from tcpipe.formats.numbered import digest_of, name_of, numbers, put_next, read_as_at, read_sealed_at
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
@@ -68,17 +61,19 @@ from tcpipe.formats.record_files import (
     read_records,
     record_name,
 )
-from tcpipe.formats.run_documents import (
-    Manifest,
-    ManifestHead,
-    MapDocument,
-    RunJson,
-    StreamInfo,
-    Tags,
-)
+from tcpipe.formats.run_documents import Manifest, ManifestHead, MapDocument, RunJson, StreamInfo, Tags
 from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
-from tcpipe.formats.stored_runs import Ingestions, RunDirectory, below, local_file, put_tables, told_of, with_span
+from tcpipe.formats.stored_runs import (
+    Ingestions,
+    ListedRun,
+    RunDirectory,
+    below,
+    local_file,
+    put_tables,
+    told_of,
+    with_span,
+)
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     READ_VERSIONS,
@@ -196,63 +191,66 @@ class Store:
         known = read_runs(self.index_place) if run_id is None else {}
         finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[tuple[str, str], str]()
         rows = dict[tuple[str, str], RunFacts]()
-        for name, files in self._files(run_id).items():
-            for recipe, number in _manifests(files).items():
+        for listed in self._listed(run_id):
+            name, by = listed.run_id, superseded.get(listed.run_id)
+            for recipe, number in listed.manifests():
                 try:
-                    found = self._ingestion(name, recipe, number, files, known.get((name, recipe)))
+                    found = self._ingestion(listed, recipe, number, known.get((name, recipe)))
                 except StoreError as error:
-                    damaged.update({} if name in superseded else {(name, recipe): error.problems[0]})
+                    damaged.update({} if by else {(name, recipe): error.problems[0]})
                     continue
                 if isinstance(found, ManifestHead):
-                    others.update({} if name in superseded else {name: found})
+                    others.update({} if by else {name: found})
                     continue
-                rows[name, recipe] = replace(found.facts, superseded_by=superseded.get(name))
-                if name not in superseded:
+                row = found.facts
+                rows[name, recipe] = row if row.superseded_by == by else replace(row, superseded_by=by)
+                if by is None:
                     finished.append(found)
         current = {run.run_id for run in finished}
         outdated = {name: head for name, head in others.items() if name not in current}
         return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=_differ(rows, known))
 
-    def _files(self, run_id: str | None) -> dict[str, dict[str, Entry]]:
-        """Return the files of each run by name: one listing."""
-        found: dict[str, dict[str, Entry]] = {}
-        for entry in self.runs_place.entries(run_id or ""):
+    def _listed(self, run_id: str | None) -> Iterator[ListedRun]:
+        """Yield the files of each run: one listing."""
+        runs, found = self.runs_place, dict[str, dict[str, Entry]]()
+        for entry in runs.entries(run_id or ""):
             name, _, rest = entry.name.partition("/")
             found.setdefault(name, {})[rest] = entry
-        return found
+        return (ListedRun(name, runs.below(name), files, numbers(files)) for name, files in found.items())
 
     def _ingestion(
-        self, run_id: str, recipe_id: str, number: int, files: Mapping[str, Entry], row: RunFacts | None
+        self, of: ListedRun, recipe_id: str, number: int, row: RunFacts | None
     ) -> RunDirectory | ManifestHead:
         """Return an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone.
 
         ``row`` is what the index has of it.
         """
-        place, name = self.runs_place.below(f"{run_id}/{recipe_id}"), name_of("manifest", number)
-        state, where = state_of(files[f"{recipe_id}/{name}"]), place.where(name)
+        place, name = of.place.below(recipe_id), name_of("manifest", number)
+        state = state_of(of.files[f"{recipe_id}/{name}"])
         if row is None or row.state != state:
+            where = place.where(name)
             document = read_sealed_at(place, name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
             if document.get("data_model_version") not in READ_VERSIONS:
                 return typed(document, ManifestHead, where)
             manifest = typed(document, Manifest, where)
-            if (manifest.run_id, manifest.recipe_id) != (run_id, recipe_id):
+            if (manifest.run_id, manifest.recipe_id) != (of.run_id, recipe_id):
                 raise StoreError(
-                    f"{where}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {run_id}/{recipe_id}"
+                    f"{where}: is of {manifest.run_id}/{manifest.recipe_id}, but lies in {of.run_id}/{recipe_id}"
                 )
             row = with_span(facts_of(manifest, state), place, manifest)
         for file, wanted in row.sizes.items():
-            found = files.get(f"{recipe_id}/{file}")
+            found = of.files.get(f"{recipe_id}/{file}")
             if found is None or found.size_bytes != wanted:
                 how = "is gone" if found is None else f"has {found.size_bytes} bytes, wanted {wanted}"
                 raise StoreError(f"{place.where(file)}: {how}; ingest the log again")
-        tables = (name.removeprefix(f"runs/{run_id}/") for name in (row.segments_file, row.track_file))
-        files_state = " ".join(state_of(files[name]) for name in tables)
-        return RunDirectory(run_id, recipe_id, place, self._with_log(row, files), files_state)
+        above = len(f"runs/{of.run_id}/")
+        files_state = " ".join(state_of(of.files[name[above:]]) for name in (row.segments_file, row.track_file))
+        return RunDirectory(of.run_id, recipe_id, place, self._with_log(row, of), files_state)
 
-    def _with_log(self, row: RunFacts, files: Mapping[str, Entry]) -> RunFacts:
+    def _with_log(self, row: RunFacts, of: ListedRun) -> RunFacts:
         """Return what the index has of an ingestion with what is known of its log and tags now; None of a log that cannot be believed."""
-        last = {name_of(stem, number) for stem, number in numbers(files).items() if stem in ("run", "tags")}
-        state = " ".join(state_of(files[name]) for name in sorted(last))
+        last = [name_of(stem, of.numbers[stem]) for stem in ("run", "tags") if stem in of.numbers]
+        state = " ".join(state_of(of.files[name]) for name in last)
         if row.log is not None and row.log.state == state:
             return row
         try:
@@ -472,7 +470,11 @@ class Store:
         told = {
             "run_id": manifest.run_id, "recipe_id": manifest.recipe_id, "datum": plain(manifest.info.datum), "robot": manifest.robot,
         }  # fmt: skip
-        tables = {"track": gated.table, "segments": labelled.table, "rejections": track.rejections}
+        tables = {
+            "track": gated.table,
+            "segments": located_segments(labelled.table, manifest.info.datum),
+            "rejections": track.rejections,
+        }
         whole = next((run for run in self.recipes_of(manifest.run_id) if run.recipe_id == manifest.recipe_id), None)
         if whole is not None and settled(whole.manifest):
             return whole.manifest
@@ -490,16 +492,6 @@ def _alike(one: RunJson, other: RunJson) -> bool:
     """Tell whether two documents say the same of a log; what was computed may differ in the last bit on another processor, tags later."""
     bare = RunJson(one.source).findings
     return replace(one, streams={}, findings=bare, tags={}) == replace(other, streams={}, findings=bare, tags={})
-
-
-def _manifests(names: Iterable[str]) -> dict[str, int]:
-    """Return the number of the last manifest of each recipe among the names of a run's files."""
-    found: dict[str, int] = {}
-    for recipe, _, name in (name.partition("/") for name in names):
-        numbered = stem_and_number(name)
-        if numbered and numbered[0] == "manifest":
-            found[recipe] = max(numbered[1], found.get(recipe, 0))
-    return dict(sorted(found.items()))
 
 
 def add_by_hash(runs: dict[str, list[str]], run_id: str) -> None:

@@ -10,6 +10,7 @@ import rasterio
 from rasterio import Affine
 
 from tcpipe.tables.levels import LABELLED_SEGMENTS
+from tcpipe.tables.wkb import line_column
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import missing, paper_layers
@@ -115,7 +116,7 @@ def segment_table(
     rest = {name: np.zeros(count) for name in LABELLED_SEGMENTS.names() if name not in given}
     whole = {c.name for c in LABELLED_SEGMENTS.columns if str(c.dtype).startswith(("int", "uint"))}
     rest = {name: values.astype(np.int64) if name in whole else values for name, values in rest.items()}
-    return LABELLED_SEGMENTS.table(**given, **rest)
+    return LABELLED_SEGMENTS.table(**given, **rest | {"geometry": line_column(start, end)})
 
 
 @dataclass(frozen=True)

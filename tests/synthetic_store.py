@@ -26,6 +26,7 @@ from tcpipe.tables.levels import (
     Track,
     TrackInfo,
 )
+from tcpipe.tables.wkb import line_column
 
 STANDING_WATT = 90.0
 WORLD = World("EPSG:32633", 533_000.0, 5_213_000.0, side_m=40.0)
@@ -86,6 +87,7 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
     for column in LABELLED_SEGMENTS.columns:
         if column.name not in given:
             rest[column.name] = np.zeros(n, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
+    rest["geometry"] = line_column(start, end)
     return LABELLED_SEGMENTS.table(**given, **rest)
 
 

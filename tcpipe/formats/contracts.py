@@ -41,9 +41,8 @@ def _table_schema(table: TableSchema) -> dict[str, Any]:
 
 
 def _column_schema(column: Column) -> dict[str, Any]:
-    kind = (
-        "string" if pa.types.is_string(column.dtype) else "integer" if pa.types.is_integer(column.dtype) else "number"
-    )
+    text = pa.types.is_string(column.dtype) or pa.types.is_binary(column.dtype)
+    kind = "string" if text else "integer" if pa.types.is_integer(column.dtype) else "number"
     schema: dict[str, Any] = {
         "type": [kind, "null"] if column.nullable else kind,
         "description": column.doc,

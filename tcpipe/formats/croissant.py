@@ -167,7 +167,9 @@ def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Jso
         "name": name,
         "description": about,
         "key": {"@id": f"{name}/sample_id"},
-        "field": [_field(name, field, source) for field in columns],
+        "field": [
+            _field(name, field, source) for field in columns if not pa.types.is_binary(field.type)
+        ],  # no such type
     }
 
 

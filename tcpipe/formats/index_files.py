@@ -8,16 +8,16 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import is_text, plain, recast, typed
+from tcpipe.formats.json_files import compact_json, is_text, of_json, parse_json, plain, recast, typed
 from tcpipe.formats.parquet import parquet_of, write_table
 from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.record_files import Sighting
@@ -32,7 +32,7 @@ logger = logging.getLogger("tcpipe")
 RUNS, LOGS = "runs.parquet", "logs.parquet"
 
 _ABOUT = b"tcpipe_index"
-_VERSION = b"2"
+_VERSION = b"3"
 """Of these tables: those of another are made again."""
 
 
@@ -107,7 +107,7 @@ class SeenLog:
 
 def state_of(entry: Entry) -> str:
     """Return what tells a file from one that was written since: name, size, time of writing."""
-    return f"{PurePosixPath(entry.name).name}-{entry.size_bytes}-{entry.modified_ns}"
+    return f"{entry.name.rpartition('/')[2]}-{entry.size_bytes}-{entry.modified_ns}"
 
 
 def facts_of(manifest: Manifest, state: str) -> RunFacts:
@@ -162,22 +162,16 @@ def _escaped(value: Any) -> Any:
 
 
 _TEXT, _TEXTS = pa.string(), pa.list_(pa.string())
+_ROW = "row"
+"""Column of what tcpipe itself reads, as JSON: a tenth of the time that nested columns of 10,000 rows take."""
 _RUN_SCHEMA = pa.schema({
-    "run_id": _TEXT, "recipe_id": _TEXT, "state": _TEXT, "data_model_version": _TEXT, "tcpipe_version": _TEXT, "ingest_key": _TEXT,
-    "robot": _TEXT, "robot_requested": _TEXT, "message_definitions": _TEXT, "tags": pa.map_(_TEXT, _TEXT), "segments": pa.int64(),
-    "driven_m": pa.float64(), "kept_m": pa.float64(), "warnings": _TEXTS, "damage": _TEXTS,
-    "energy_budget": pa.struct({of.name: pa.int64() if of.name == "segments" else pa.float64() for of in fields(EnergyBudget)}),
-    "segments_sha256": _TEXT, "start_ns": pa.int64(), "end_ns": pa.int64(), "proved": _TEXT,
-    "log": pa.struct({
-        "state": _TEXT, "source": pa.struct({"paths": _TEXTS, "sha256": _TEXT, "size_bytes": pa.int64()}), "tags": pa.map_(_TEXT, _TEXT),
-        "sensors": pa.map_(_TEXT, pa.struct({"topic": _TEXT, "type_name": _TEXT, "frame_id": _TEXT})),
-    }),
-    "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT, "sizes": pa.map_(_TEXT, pa.int64()),
+    "run_id": _TEXT, "recipe_id": _TEXT, "data_model_version": _TEXT, "tcpipe_version": _TEXT, "robot": _TEXT,
+    "tags": pa.map_(_TEXT, _TEXT), "segments": pa.int64(), "driven_m": pa.float64(), "kept_m": pa.float64(),
+    "warnings": _TEXTS, "damage": _TEXTS, "start_ns": pa.int64(), "end_ns": pa.int64(),
+    "log": pa.struct({"source": pa.struct({"paths": _TEXTS, "sha256": _TEXT, "size_bytes": pa.int64()})}),
+    "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT, _ROW: _TEXT,
 })  # fmt: skip
-_LOG_SCHEMA = pa.schema({
-    "lineage": _TEXT, "name": _TEXT, "state": _TEXT,
-    "sighting": pa.struct({"log": _TEXTS, "size_and_time": pa.list_(pa.list_(pa.int64())), "sha256": _TEXT}),
-})  # fmt: skip
+_LOG_SCHEMA = pa.schema({"lineage": _TEXT, _ROW: _TEXT})
 
 
 def read_runs(place: Place) -> dict[tuple[str, str], RunFacts]:
@@ -192,12 +186,12 @@ def read_logs(place: Place) -> dict[tuple[str, str], SeenLog]:
 
 def write_runs(place: Place, rows: Iterable[RunFacts]) -> None:
     """Write ``runs.parquet``, unless that cannot be: the next call does without."""
-    _write(place, RUNS, list(rows), _RUN_SCHEMA)
+    _write(place, RUNS, rows, _RUN_SCHEMA)
 
 
 def write_logs(place: Place, rows: Iterable[SeenLog]) -> None:
     """Write ``logs.parquet``, unless that cannot be."""
-    _write(place, LOGS, list(rows), _LOG_SCHEMA)
+    _write(place, LOGS, rows, _LOG_SCHEMA)
 
 
 def _rows(place: Place, name: str, cls: type[T]) -> list[T]:
@@ -205,18 +199,19 @@ def _rows(place: Place, name: str, cls: type[T]) -> list[T]:
         data = place.read(name)
         if data is None:
             return []
-        table = parquet_of(data, place.where(name))
+        table = parquet_of(data, place.where(name), [_ROW])
         if (table.schema.metadata or {}).get(_ABOUT) != _VERSION:
             return []
-        return typed(table.to_pylist(maps_as_pydicts="strict"), list[cls], place.where(name))  # type: ignore[valid-type]
-    except (StoreError, ValueError, pa.ArrowException):
+        return of_json(f"[{','.join(table.column(_ROW).to_pylist())}]", list[cls], place.where(name))  # type: ignore[valid-type]
+    except (StoreError, ValueError, TypeError, KeyError, pa.ArrowException):
         logger.info("%s: the index of the store is not readable; it is made again", place.where(name))
         return []
 
 
-def _write(place: Place, name: str, rows: Sequence[object], schema: pa.Schema) -> None:
-    values = [plain(as_stored(row)) for row in rows]
-    columns = [column_of([row[field.name] for row in values], field.type) for field in schema]
+def _write(place: Place, name: str, rows: Iterable[object], schema: pa.Schema) -> None:
+    texts = [compact_json(as_stored(row)) for row in rows]
+    values = [{**parse_json(text.encode(), name), _ROW: text} for text in texts]
+    columns = [column_of([value[field.name] for value in values], field.type) for field in schema]
     table = pa.table(columns, schema=schema.with_metadata({_ABOUT: _VERSION}))
     with suppress(StoreError), place.workshop() as directory:
         write_table(table, directory / name)

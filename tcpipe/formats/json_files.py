@@ -62,6 +62,11 @@ def is_text(value: object) -> bool:
     return True
 
 
+def compact_json(value: object) -> str:
+    """Return the JSON of a dataclass for `of_json`: whose text `is_text`, and whose numbers are finite."""
+    return msgspec.json.encode(value).decode()
+
+
 def to_json(value: Any) -> str:
     """Return canonical JSON text: sorted keys, two-space indent, final newline; file names that are no text as escapes."""
     text = json.dumps(plain(value), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
@@ -132,6 +137,14 @@ def typed(value: object, cls: type[T], path: Path | str) -> T:
         return msgspec.convert(value, cls, str_keys=True, dec_hook=_from_text)
     except msgspec.ValidationError as error:
         raise StoreError(f"{path}: is not what this version writes: {_in_words(str(error))}") from None
+
+
+def of_json(text: str, cls: type[T], path: Path | str) -> T:
+    """Return JSON text as a dataclass, or what is made of such; as `typed`."""
+    try:
+        return msgspec.json.decode(text, type=cls)
+    except msgspec.DecodeError as error:
+        raise StoreError(f"{path}: is not what this version writes: {error}") from None
 
 
 def _in_words(message: str) -> str:

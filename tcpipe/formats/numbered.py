@@ -35,7 +35,8 @@ def stem_and_number(name: str) -> tuple[str, int] | None:
 def numbers(names: Iterable[str]) -> dict[str, int]:
     """Return, by stem, the highest number among names."""
     found: dict[str, int] = {}
-    for stem, number in filter(None, map(stem_and_number, names)):
+    documents = (stem_and_number(name) for name in names if name.endswith(".json"))
+    for stem, number in filter(None, documents):
         found[stem] = max(number, found.get(stem, 0))
     return found
 

@@ -65,11 +65,11 @@ def _with_a_member(of: pa.DataType) -> pa.DataType:
     return pa.list_(_with_a_member(of.value_type)) if pa.types.is_list(of) else of
 
 
-def parquet_of(data: bytes, where: str) -> pa.Table:
-    """Return the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
+def parquet_of(data: bytes, where: str, columns: list[str]) -> pa.Table:
+    """Return columns of the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
     try:
         with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
-            return file.read(use_threads=False)  # Arrow's threads could outlive a command that ends at once
+            return file.read(columns, use_threads=False)  # Arrow's threads could outlive a command that ends at once
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"{where}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
 

@@ -16,15 +16,14 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, put_directory, put_file, working_directory
 from tcpipe.formats.seals import Checksum, file_checksum
 
 
-@dataclass(frozen=True, slots=True)
-class Entry:
+class Entry(NamedTuple):
     """A file at a place: its name there, its size [byte], and when it was written [ns] by the clock of where it lies."""
 
     name: str
@@ -129,7 +128,7 @@ class DirectoryPlace:
     def entries(self, prefix: str = "") -> list[Entry]:
         """Return the files below ``prefix/``, by name."""
         with _told(self.where(prefix), "read"):
-            return sorted(_walked(self._path(prefix), prefix), key=lambda entry: entry.name)
+            return sorted(_walked(self._path(prefix), prefix))
 
     def folders(self, prefix: str = "") -> list[str]:
         """Return the names of the directories in ``prefix``."""
@@ -193,7 +192,7 @@ class DirectoryPlace:
         clear(self.staging or self.root)
 
     def _path(self, name: str) -> Path:
-        if ".." in PurePosixPath(name).parts or name.startswith("/"):
+        if (".." in name and ".." in PurePosixPath(name).parts) or name.startswith("/"):
             raise StoreError(f"{self.root}: {name!r} is no name of a file in it")
         return self.root / name
 
@@ -203,19 +202,22 @@ class DirectoryPlace:
         return staging
 
 
-def _walked(directory: Path, prefix: str) -> Iterator[Entry]:
-    """Yield the files below a directory, ``prefix/`` before their names; a file that goes meanwhile is none."""
-    with suppress(FileNotFoundError, NotADirectoryError), os.scandir(directory) as found:
-        for entry in found:
-            name = f"{prefix}/{entry.name}" if prefix else entry.name
-            if entry.name.startswith(TEMPORARY_PREFIX):
-                continue
-            if entry.is_dir():
-                yield from _walked(Path(entry), name)
-                continue
-            with suppress(FileNotFoundError):
-                seen = entry.stat()
-                yield Entry(name, seen.st_size, seen.st_mtime_ns)
+def _walked(directory: Path, prefix: str) -> list[Entry]:
+    """Return the files below a directory, ``prefix/`` before their names; a file that goes meanwhile is none."""
+    found, todo = list[Entry](), [(str(directory), f"{prefix}/" if prefix else "")]
+    while todo:
+        path, above = todo.pop()
+        with suppress(FileNotFoundError, NotADirectoryError), os.scandir(path) as there:
+            for entry in there:
+                if entry.name.startswith(TEMPORARY_PREFIX):
+                    continue
+                if entry.is_dir():
+                    todo.append((entry.path, f"{above}{entry.name}/"))
+                    continue
+                with suppress(FileNotFoundError):
+                    seen = entry.stat()
+                    found.append(Entry(above + entry.name, seen.st_size, seen.st_mtime_ns))
+    return found
 
 
 @contextmanager

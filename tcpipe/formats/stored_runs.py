@@ -14,10 +14,25 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.numbered import digest_of, read_as_at
 from tcpipe.formats.parquet import highest, lowest, read_table, write_table
-from tcpipe.formats.place import Place
+from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.run_documents import Manifest, ManifestHead
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
+
+
+@dataclass(frozen=True, slots=True)
+class ListedRun:
+    """What lies in the directory of a run: its files by name there, and the last numbers of its documents."""
+
+    run_id: str
+    place: Place
+    files: Mapping[str, Entry]
+    numbers: Mapping[str, int]
+
+    def manifests(self) -> list[tuple[str, int]]:
+        """Return each recipe with the number of its last manifest."""
+        parted = ((stem.partition("/"), number) for stem, number in self.numbers.items())
+        return sorted((recipe, number) for (recipe, _, stem), number in parted if stem == "manifest")
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,7 @@ from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason, Quality, name_of
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import PLACED_SEGMENTS, Streams
+from tcpipe.tables.segment_columns import GEOMETRY
 from tcpipe.terrain.sampling import Patches
 
 _NEARBY_NS = 5_000_000_000
@@ -246,7 +247,8 @@ def _sample(directory: Path, sample_id: str) -> _Sample:
         )
         raise DatasetError(f"{directory}: no sample {sample_id!r}{hint}")
     try:
-        group = read_row_group(directory / SAMPLES, row // ROWS_PER_GROUP, sample_columns(directory))
+        names = [name for name in sample_columns(directory) if name != GEOMETRY]
+        group = read_row_group(directory / SAMPLES, row // ROWS_PER_GROUP, names)
     except StoreError as error:
         raise DatasetError(*error.problems) from None
     found = group.slice(row % ROWS_PER_GROUP, 1).to_pylist()[0]

@@ -250,7 +250,7 @@ def _judged(
             notes += error.problems
     trouble = _trouble(source, result)
     if trouble is None:
-        return replace(result, notes=notes)
+        return result if notes == result.notes else replace(result, notes=notes)
     told_before = result.known or (trouble.kind == "damaged" and trouble.is_told(store))
     return replace(result, notes=notes, known=told_before, accepted=trouble.is_accepted(store))
 

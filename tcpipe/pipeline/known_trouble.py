@@ -118,7 +118,7 @@ def _known(store: Store) -> list[Trouble]:
 
 def _named(name: str, known: Sequence[Trouble], store: Store) -> list[Trouble]:
     paths = {name, str(Path(name).absolute()), str(Path(name).resolve())}
-    contents = {sighting.sha256 for path in paths for sighting in store.sightings(lineage_of([path]))}
+    contents = {sighting.sha256 for path in paths for sighting in store.sightings(lineage_of((path,)))}
     exact = [
         trouble
         for trouble in known

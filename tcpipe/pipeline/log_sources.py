@@ -7,6 +7,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 from tcpipe.errors import LogError, TcpipeError, plain_line
@@ -112,6 +113,7 @@ def find_sources(
     paths: dict[Path, tuple[Path, str]] = {}
     urls: dict[Path, str] = {}
     problems: dict[str, tuple[str, ...]] = {}
+    folders: dict[Path, Path] = {}
     transient = False
     for number, entry in enumerate(logs):
         try:
@@ -122,7 +124,7 @@ def find_sources(
                     paths.setdefault(path, (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
             else:
                 for path in _logs_at(Path(entry), tables or {}):
-                    paths.setdefault(_real(path), (_as_named(path), _place_in(path, Path(entry))))
+                    paths.setdefault(_real(path, folders), (_as_named(path), _place_in(path, Path(entry))))
         except LogError as error:
             problems[str(entry)] = error.problems
             transient |= is_transient(error)
@@ -164,7 +166,7 @@ def _logs_at(path: Path, tables: Mappings) -> list[Path]:
 def _parts_alone(paths: set[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
     """Yield the files that are parts of a ROS 2 bag, given without the others: what does not change stands in the first part only."""
     bags: dict[Path, frozenset[Path]] = {}
-    for path in sorted(paths):
+    for path in sorted(paths, key=str):
         if path.name.endswith(STORAGE_SUFFIXES) and path.is_file():
             bag = path.parent
             if bag not in bags:
@@ -180,7 +182,8 @@ def in_shard(sources: Sequence[LogSource], shard: tuple[int, int]) -> list[LogSo
     return [source for source in sources if int(digest(source.place), 16) % count == index - 1]
 
 
-def lineage_of(origins: Sequence[str]) -> str:
+@lru_cache(maxsize=1 << 17)
+def lineage_of(origins: tuple[str, ...]) -> str:
     """Return where the sightings of what lies there are remembered; a recording that is ended (``.active`` goes) lies where it did."""
     return f"logs/{record_name(digest([origin.removesuffix(_UNFINISHED) for origin in origins]))}"
 
@@ -199,7 +202,10 @@ def remote_logs(url: str, directory: Path) -> dict[Path, str]:
     """Return stand-ins for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
     place = stand_ins(url, directory, wanted=belongs_to_a_log)
-    return {_real(path): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)}
+    folders: dict[Path, Path] = {}
+    return {
+        _real(path, folders): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)
+    }
 
 
 def with_hashes(sources: Sequence[LogSource], seen: Callable[[str], Sequence[Sighting]]) -> list[LogSource]:
@@ -222,9 +228,13 @@ def in_turns(sources: Sequence[LogSource]) -> list[list[int]]:
     return turns
 
 
-def _real(path: Path) -> Path:
-    """Return where a log really lies; a link that leads nowhere is where it is."""
-    return path.resolve() if path.exists() else path.absolute()
+def _real(path: Path, folders: dict[Path, Path]) -> Path:
+    """Return where a log really lies; a link that leads nowhere is where it is. ``folders`` keeps where folders lie."""
+    if path.is_symlink() or path.name in ("", ".."):
+        return path.resolve() if path.exists() else path.absolute()
+    if path.parent not in folders:
+        folders[path.parent] = path.parent.resolve()
+    return folders[path.parent] / path.name
 
 
 def _as_named(path: Path) -> Path:

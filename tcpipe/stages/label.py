@@ -23,8 +23,9 @@ from tcpipe.stages.label_standing import standing_power_of
 from tcpipe.stages.power_rails import energy_entries, rails_of
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.bits import Quality
-from tcpipe.tables.columns import floats, integers
+from tcpipe.tables.columns import floats, integers, lonlat_deg
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, LabelledSegments, Segments, Streams, with_findings
+from tcpipe.tables.wkb import line_column
 
 
 def label_segments(
@@ -79,6 +80,7 @@ def label_segments(
                 physics_power_watt=np.full(cut.num_rows, np.nan),
                 power_samples=count,
                 quality=bits(flags, cut.num_rows),
+                geometry=line_column(*(lonlat_deg(cut, end) for end in ("start", "end"))),
             )
         )
     table, physics = with_physics(pa.concat_tables(parts).combine_chunks(), standing.watt)

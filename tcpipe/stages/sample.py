@@ -11,7 +11,7 @@ from pyproj import CRS
 
 from tcpipe.recipe import SampleConfig
 from tcpipe.tables.bits import Loss
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import floats, lonlat_deg
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
@@ -57,10 +57,7 @@ def sample_segments(
     PLACED_SEGMENTS.check(segments, more=True)
     crs, chord_m = parse_crs(source.grid.crs, where=f"map {source.name}"), floats(segments, "chord_m")
     projection = Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
-    start, end = (
-        projection.forward(np.stack([floats(segments, f"{name}_{axis}_deg") for axis in ("lon", "lat")], axis=1))
-        for name in ("start", "end")
-    )
+    start, end = (projection.forward(lonlat_deg(segments, name)) for name in ("start", "end"))
     frames = patch_frames(start, end, chord_m)
     corners = footprints(frames, config.patch_m)
     lost_by = np.zeros(segments.num_rows, np.uint32)

@@ -133,6 +133,11 @@ def floats(table: pa.Table, name: str) -> NDArray[np.float64]:
     return values
 
 
+def lonlat_deg(table: pa.Table, end: str) -> NDArray[np.float64]:
+    """Return longitude and latitude of the ``start`` or ``end`` of segments [deg], null as NaN, shape (N, 2)."""
+    return np.stack([floats(table, f"{end}_{axis}_deg") for axis in ("lon", "lat")], axis=1)
+
+
 class FloatColumns(Mapping[str, NDArray[np.float64]]):
     """A table's columns of numbers by name, as `floats` gives them, made when they are asked for: a long log has many nobody asks for."""
 

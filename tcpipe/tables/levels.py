@@ -29,16 +29,15 @@ from tcpipe.errors import TableError
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
-from tcpipe.tables.segment_columns import MOTION_COLUMNS, STANDING_COLUMNS
+from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, POINT_COLUMN, STANDING_COLUMNS
 
-DATA_MODEL_VERSION = "2.0"
+DATA_MODEL_VERSION = "2.1"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
 
-READ_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "1.4", DATA_MODEL_VERSION)
+READ_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "1.4", "2.0", DATA_MODEL_VERSION)
 """Versions that are read as they are; `tcpipe migrate` brings the older ones to the last."""
 
-TABLES_VERSION = "1.4"
-"""Version in which a table last changed."""
+TABLES_VERSION = "2.1"  # in which a table last changed
 
 _METADATA_KEY = b"tcpipe"
 
@@ -392,7 +391,7 @@ LABELLED_SEGMENTS = TableSchema(
     "segments",
     "L5",
     "Segments with the cost of the metre each one covers.",
-    (*_SEGMENT_COLUMNS, *MOTION_COLUMNS, *_LABEL_COLUMNS),
+    (*_SEGMENT_COLUMNS, *MOTION_COLUMNS, *_LABEL_COLUMNS, LINE_COLUMN),
 )
 
 PLACED_SEGMENTS = LABELLED_SEGMENTS.only(
@@ -442,6 +441,7 @@ SAMPLES = TableSchema(
             "1",
             "share of pixels more than 1 m above the smallest, clipped in the tensor",
         ),
+        POINT_COLUMN,
     ),
 )
 
@@ -591,7 +591,7 @@ def with_findings(info: TrackInfo, warnings: tuple[str, ...], facts: RunFacts) -
 def with_metadata(table: pa.Table, metadata: Mapping[str, Any]) -> pa.Table:
     """Return the table with ``metadata`` (JSON values) in its schema, under the key ``tcpipe``."""
     text = json.dumps({"data_model_version": TABLES_VERSION, **metadata}, sort_keys=True)
-    return table.replace_schema_metadata({_METADATA_KEY: text.encode()})
+    return table.replace_schema_metadata({**(table.schema.metadata or {}), _METADATA_KEY: text.encode()})
 
 
 def metadata_of(table: pa.Table) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Columns of a segment that data model 1.3 added: how the robot moved over it, and what it cost above standing."""
+"""Columns that later data models added: how the robot moved over a segment, what it cost above standing, and its geometry."""
 
 from __future__ import annotations
 
@@ -55,3 +55,14 @@ STANDING_COLUMNS = (
     _column("energy_above_standing_joule", "J", "energy_joule less standing_power_watt times duration_s"),
     _column("energy_above_standing_std_joule", "J", "standard deviation of it, likewise"),
 )
+
+GEOMETRY = "geometry"
+"""Tells other tools where a row lies (GeoParquet)."""
+
+
+def _geometry(doc: str, frame: str) -> Column:
+    return Column(GEOMETRY, pa.binary(), "deg", f"{doc}; WKB, longitude first", frame, nullable=True, since="2.1")
+
+
+LINE_COLUMN = _geometry("LineString from start to end; null in a local frame", "gnss_crs")
+POINT_COLUMN = _geometry("Point in the centre of the patch", "WGS 84")

@@ -5,11 +5,13 @@ import json
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+import shapely
 from synthetic_store import box, region_file, small_store
 
 from tcpipe.dataset import open_dataset
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.recipe import DatasetConfig, Recipe
+from tcpipe.store import open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 not_ours = pytest.mark.filterwarnings("ignore")
@@ -113,3 +115,29 @@ def test_polars_and_xarray_see_one_order(built, samples):
     shard = pl.read_parquet(shards(built, "train"))
     decoded = shard["height"].to_numpy().reshape(-1, 40, 40) * 0.0005
     np.testing.assert_allclose(patches.height.values[train], decoded, atol=1e-6)
+
+
+def test_every_file_of_samples_tells_where_its_rows_lie(built, samples):
+    ends = np.array([samples[f"{end}_{axis}_deg"].to_numpy() for end in ("start", "end") for axis in ("lon", "lat")])
+    middle_deg = ends.reshape(2, 2, -1).mean(axis=0).T
+    points = shapely.from_wkb(samples["geometry"].to_pylist())
+    lonlat_deg = np.column_stack([shapely.get_x(points), shapely.get_y(points)])
+    np.testing.assert_allclose(lonlat_deg, middle_deg, rtol=0, atol=1e-7)  # a centimetre
+    for path in (built / "zarr" / "samples.parquet", *sorted((built / "parquet" / "data").glob("*.parquet"))):
+        geo = json.loads(pq.read_schema(path).metadata[b"geo"])
+        column = geo["columns"][geo["primary_column"]]
+        assert (geo["version"], column["encoding"], column["geometry_types"]) == ("1.1.0", "WKB", ["Point"])
+        there = shapely.from_wkb(pq.read_table(path, columns=["geometry"])["geometry"].to_pylist())
+        assert column["bbox"] == shapely.total_bounds(there).tolist()
+
+
+def test_geopandas_reads_samples_and_segments(built, samples):
+    geopandas = pytest.importorskip("geopandas", reason="geopandas is not installed")
+    points = geopandas.read_parquet(built / "zarr" / "samples.parquet")
+    assert points.crs.to_string() == "OGC:CRS84"
+    assert points.geometry.geom_type.unique().tolist() == ["Point"]
+    (path, *_) = (run.file("segments.parquet") for run in open_store(built / "store").runs())
+    lines = geopandas.read_parquet(path)
+    assert lines.geometry.geom_type.unique().tolist() == ["LineString"]
+    metres = lines.geometry.to_crs(lines.estimate_utm_crs()).length
+    np.testing.assert_allclose(metres, lines["chord_m"], rtol=1e-3)  # the scale of a UTM zone

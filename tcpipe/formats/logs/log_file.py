@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import resource
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
@@ -512,25 +513,26 @@ def _logs_below(directory: Path) -> Iterator[Path]:
 
 def _entries(directory: Path) -> list[tuple[Path, bool]]:
     """Return what may be a log in a directory, and whether it is one that has to be looked into; the directory itself where it is a bag."""
-    entries = [(entry, _is_directory(entry)) for entry in sorted(directory.iterdir(), key=lambda entry: entry.name)]
+    with os.scandir(directory) as there:
+        entries = sorted(there, key=lambda entry: entry.name)
     one_bag = is_one_bag(directory)
     found = [(directory, False)] if one_bag else []
-    for entry, is_directory in entries:
+    for entry in entries:
         if entry.name.startswith((".", "~")) or entry.name in _FILE_SYSTEMS_OWN:
             continue
-        if is_directory:
-            found.append((entry, True))
+        if _is_directory(entry):
+            found.append((Path(entry.path), True))
         elif one_bag and entry.name.endswith(STORAGE_SUFFIXES):
             continue
         elif entry.name.lower().endswith(LOG_SUFFIXES) and (entry.is_symlink() or entry.is_file()):
-            found.append((entry, False))
+            found.append((Path(entry.path), False))
     return found
 
 
-def _is_directory(path: Path) -> bool:
-    """Return whether a path is, or leads to, a directory that may be looked at."""
+def _is_directory(entry: os.DirEntry[str]) -> bool:
+    """Return whether an entry is, or leads to, a directory that may be looked at."""
     with suppress(OSError):
-        return path.is_dir()
+        return entry.is_dir()
     return False
 
 

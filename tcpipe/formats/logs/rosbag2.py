@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -128,20 +129,23 @@ def _topic_counts(information: Mapping[str, Any]) -> dict[str, int]:
 
 def storage_files(directory: Path) -> tuple[Path, ...]:
     """Return the .db3 and .mcap files directly in a directory, compressed ones too, by name with numbers in order."""
-    files = [
-        path for path in directory.iterdir() if path.name.endswith(STORAGE_SUFFIXES) and not path.name.startswith(".")
-    ]
-    return tuple(sorted((path for path in files if path.is_file()), key=_natural))
+    return tuple(sorted((directory / name for name in _storage_names(directory)), key=_natural))
+
+
+def _storage_names(directory: Path) -> list[str]:
+    with os.scandir(directory) as there:
+        named = [entry for entry in there if entry.name.endswith(STORAGE_SUFFIXES) and not entry.name.startswith(".")]
+        return [entry.name for entry in named if entry.is_file()]
 
 
 def is_one_bag(directory: Path) -> bool:
     """Return whether a directory is one ROS 2 bag: by metadata.yaml, or by files named after it as the recorder does."""
     if (directory / METADATA).is_file():
         return True
-    files = storage_files(directory)
-    kinds = {path.name.removesuffix(".zstd").rsplit(".", 1)[-1] for path in files}
+    names = _storage_names(directory)
+    kinds = {name.removesuffix(".zstd").rsplit(".", 1)[-1] for name in names}
     named = re.compile(re.escape(directory.name) + r"(_\d+)?\.(db3|mcap)(\.zstd)?")
-    return len(kinds) == 1 and all(named.fullmatch(path.name) for path in files)
+    return len(kinds) == 1 and all(map(named.fullmatch, names))
 
 
 def decompressed_file(path: Path, directory: Path) -> Path:

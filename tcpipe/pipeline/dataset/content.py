@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal
+from tcpipe.formats.geoparquet import located
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
 from tcpipe.formats.robot_files import profiles_of
@@ -34,9 +35,13 @@ from tcpipe.stages.sample import Sampled, metres_lost
 from tcpipe.tables.bits import Loss, name_of
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import SAMPLES
+from tcpipe.tables.wkb import point_column
 from tcpipe.terrain.projection import area_of, parse_crs
 
 logger = logging.getLogger("tcpipe")
+
+_ROWS = 1 << 17
+"""Whose centres are looked for at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,8 +64,16 @@ class SampleTable:
 
     @property
     def schema(self) -> pa.Schema:
-        """The samples' columns."""
-        return pa.schema([*SAMPLES.arrow(), *self.added.schema])
+        """The samples' columns, and where they lie."""
+        bare = pa.schema([*SAMPLES.arrow(), *self.added.schema]).empty_table()
+        pieces = (self._centres_deg(self.patch[first : first + _ROWS]) for first in range(0, len(self), _ROWS))
+        return located(bare, "Point", np.concatenate([np.empty((0, 2)), *pieces])).schema
+
+    def _centres_deg(self, patches: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the centre of patches of ``sampled``, WGS 84 lon, lat [deg], shape (N, 2)."""
+        corners = np.unwrap(self.sampled.footprint_lonlat_deg[patches], axis=1, period=360.0)  # on the date line
+        centres: NDArray[np.float64] = corners.mean(axis=1)
+        return centres
 
     def __len__(self) -> int:
         """Return the number of samples."""
@@ -71,7 +84,11 @@ class SampleTable:
         at = self.patch[rows]
         rows_of_segments = pa.array(self.sampled.kept[at])
         segments = self.segments.take(rows_of_segments)
-        columns: dict[str, Any] = {name: values[at] for name, values in self.sampled.patches.columns().items()}
+        columns: dict[str, Any] = {
+            name: segments.column(name) for name in SAMPLES.names() if name in segments.column_names
+        }
+        columns |= {name: values[at] for name, values in self.sampled.patches.columns().items()}
+        columns["geometry"] = point_column(centres := self._centres_deg(at))
         columns["terrain_name"] = self.class_names[columns["terrain_class"]].tolist()
         if not self.has_terrain:
             of_terrain = (column for column in SAMPLES.columns if column.name.startswith("terrain"))
@@ -81,12 +98,11 @@ class SampleTable:
             split=self.assigned.split[at].tolist(),
             fold=pa.array(self.assigned.fold[at], pa.int8(), mask=self.assigned.fold[at] == NO_FOLD),
             map=[self.map_names[index] for index in self.sampled.map_index[at]],
-            **{name: segments.column(name) for name in segments.column_names if name in SAMPLES.names()},
             **columns,
         )
         for field in self.added.schema:
             table = table.append_column(field, self.added.column(field.name).take(rows_of_segments))
-        return table
+        return located(table, "Point", centres)
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
         """Yield the table in pieces of so many rows; at least one, which may be empty."""

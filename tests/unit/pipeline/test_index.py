@@ -165,13 +165,35 @@ def test_a_store_that_cannot_be_written_is_read_all_the_same(store, monkeypatch)
     assert len(choose_runs(store, Recipe(), robot=None, tags={}).runs) == 3
 
 
-def test_other_tools_read_the_segments_of_all_runs_by_the_index(store):
+COUNTED = [("a", 20), ("b", 20)]
+"""Segments by run, where run c is superseded."""
+
+
+@pytest.fixture
+def superseded(store, monkeypatch):
     store.supersede("c", "b")
     store.keep_index(store.ingestions())
-    runs = pl.read_parquet(store.root / "index" / "runs.parquet").filter(pl.col("superseded_by").is_null())
-    files = [f"{store.root}/{name}" for name in runs["segments_file"]]
-    assert pl.scan_parquet(files).select("run_id").collect()["run_id"].value_counts().sort("run_id").rows() == [
-        ("a", 20),
-        ("b", 20),
-    ]
+    monkeypatch.chdir(store.root)
+    return store
+
+
+def test_polars_and_arrow_read_the_segments_of_all_runs_by_one_line(superseded):
+    files = pl.read_parquet("index/runs.parquet").filter(pl.col("superseded_by").is_null())["segments_file"].to_list()
+    for lines in (pl.scan_parquet(files), pl.concat(map(pl.scan_parquet, files), how="diagonal")):
+        assert lines.group_by("run_id").agg(pl.len()).sort("run_id").collect().rows() == COUNTED
     assert ds.dataset(files).to_table(columns=["power_watt"]).num_rows == 40
+    earlier = pl.read_parquet(files[0]).drop("geometry")
+    earlier.write_parquet("earlier.parquet")
+    mixed = pl.concat(map(pl.scan_parquet, ["earlier.parquet", *files[1:]]), how="diagonal").collect()
+    assert mixed["geometry"].null_count() == earlier.height == 20
+
+
+def test_duckdb_reads_the_segments_of_all_runs_by_one_line(superseded):
+    duckdb = pytest.importorskip("duckdb", reason="duckdb is not installed")
+    with duckdb.connect() as of:
+        of.sql(
+            "SET VARIABLE files = (SELECT list(segments_file) FROM 'index/runs.parquet' WHERE superseded_by IS NULL)"
+        )
+        every = "FROM read_parquet(getvariable('files'), union_by_name=true)"
+        assert of.sql(f"SELECT run_id, count(*) {every} GROUP BY ALL ORDER BY ALL").fetchall() == COUNTED
+        assert of.sql(f"SELECT DISTINCT typeof(geometry) {every}").fetchall() == [("GEOMETRY('OGC:CRS84')",)]

@@ -1,0 +1,35 @@
+"""What a Parquet file says of its geometry."""
+
+import json
+
+import numpy as np
+import pyarrow as pa
+from pyproj import CRS
+
+from tcpipe.formats.geoparquet import located
+from tcpipe.tables.wkb import point_column
+
+POINTS = np.array([[15.5, 47.0], [np.nan, np.nan], [15.25, 47.5]])
+
+
+def told(points, **how):
+    table = pa.table({"geometry": point_column(points)}).replace_schema_metadata({b"tcpipe": b"{}"})
+    metadata = located(table, "Point", points, **how).schema.metadata
+    assert metadata[b"tcpipe"] == b"{}"
+    return json.loads(metadata[b"geo"])
+
+
+def test_the_keys_are_those_of_geoparquet_1_1():
+    column = {"encoding": "WKB", "geometry_types": ["Point"], "bbox": [15.25, 47.0, 15.5, 47.5]}
+    assert told(POINTS) == {"version": "1.1.0", "primary_column": "geometry", "columns": {"geometry": column}}
+
+
+def test_another_crs_is_told_in_full():
+    found = told(POINTS, crs="EPSG:4258")["columns"]["geometry"]["crs"]
+    assert CRS.from_json_dict(found) == CRS.from_epsg(4258)
+    assert found["id"] == {"authority": "EPSG", "code": 4258}
+
+
+def test_nothing_that_lies_somewhere_has_no_bounds():
+    assert "bbox" not in told(POINTS[1:2])["columns"]["geometry"]
+    assert "bbox" not in told(POINTS[:0])["columns"]["geometry"]
