@@ -211,9 +211,9 @@ class Store:
         return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=_differ(rows, known))
 
     def _listed(self, run_id: str | None) -> Iterator[ListedRun]:
-        """Yield the files of each run: one listing."""
+        """Yield the files of each run, perhaps without its streams: one listing."""
         runs, found = self.runs_place, dict[str, dict[str, Entry]]()
-        for entry in runs.entries(run_id or ""):
+        for entry in runs.entries(run_id or "", but=_STREAMS):
             name, _, rest = entry.name.partition("/")
             found.setdefault(name, {})[rest] = entry
         return (ListedRun(name, runs.below(name), files, numbers(files)) for name, files in found.items())

@@ -55,8 +55,11 @@ class Place(Protocol):
     def size(self, name: str) -> int | None:
         """Return how large a file is [byte]; None where there is none."""
 
-    def entries(self, prefix: str = "") -> list[Entry]:
-        """Return the files below ``prefix/``, however deep, by name (from here on); temporaries are none."""
+    def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
+        """Return the files below ``prefix/``, however deep, by name (from here on); temporaries are none.
+
+        What lies in folders called ``but`` may be missing: on disk they are not looked into.
+        """
 
     def folders(self, prefix: str = "") -> list[str]:
         """Return the first parts of all names of more parts below ``prefix/``, sorted: the folders that lie there."""
@@ -125,10 +128,10 @@ class DirectoryPlace:
             return path.stat().st_size if path.is_file() else None
         return None
 
-    def entries(self, prefix: str = "") -> list[Entry]:
-        """Return the files below ``prefix/``, by name."""
+    def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
+        """Return the files below ``prefix/``, by name, without those in folders called ``but``."""
         with _told(self.where(prefix), "read"):
-            return sorted(_walked(self._path(prefix), prefix))
+            return sorted(_walked(self._path(prefix), prefix, but))
 
     def folders(self, prefix: str = "") -> list[str]:
         """Return the names of the directories in ``prefix``."""
@@ -202,7 +205,7 @@ class DirectoryPlace:
         return staging
 
 
-def _walked(directory: Path, prefix: str) -> list[Entry]:
+def _walked(directory: Path, prefix: str, but: str) -> list[Entry]:
     """Return the files below a directory, ``prefix/`` before their names; a file that goes meanwhile is none."""
     found, todo = list[Entry](), [(str(directory), f"{prefix}/" if prefix else "")]
     while todo:
@@ -212,7 +215,7 @@ def _walked(directory: Path, prefix: str) -> list[Entry]:
                 if entry.name.startswith(TEMPORARY_PREFIX):
                     continue
                 if entry.is_dir():
-                    todo.append((entry.path, f"{above}{entry.name}/"))
+                    todo += [(entry.path, f"{above}{entry.name}/")] if entry.name != but else []
                     continue
                 with suppress(FileNotFoundError):
                     seen = entry.stat()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -113,7 +114,7 @@ def find_sources(
     paths: dict[Path, tuple[Path, str]] = {}
     urls: dict[Path, str] = {}
     problems: dict[str, tuple[str, ...]] = {}
-    folders: dict[Path, Path] = {}
+    folders: dict[str, Path] = {}
     transient = False
     for number, entry in enumerate(logs):
         try:
@@ -123,8 +124,9 @@ def find_sources(
                 for path, url in remote.items():
                     paths.setdefault(path, (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
             else:
-                for path in _logs_at(Path(entry), tables or {}):
-                    paths.setdefault(_real(path, folders), (_as_named(path), _place_in(path, Path(entry))))
+                above = Path(entry)
+                for path in _logs_at(above, tables or {}):
+                    paths.setdefault(_real(path, folders), (_as_named(path), _place_in(path, above)))
         except LogError as error:
             problems[str(entry)] = error.problems
             transient |= is_transient(error)
@@ -165,14 +167,15 @@ def _logs_at(path: Path, tables: Mappings) -> list[Path]:
 
 def _parts_alone(paths: set[Path], *, together: bool) -> Iterator[tuple[Path, str]]:
     """Yield the files that are parts of a ROS 2 bag, given without the others: what does not change stands in the first part only."""
-    bags: dict[Path, frozenset[Path]] = {}
-    for path in sorted(paths, key=str):
-        if path.name.endswith(STORAGE_SUFFIXES) and path.is_file():
-            bag = path.parent
-            if bag not in bags:
-                bags[bag] = frozenset(storage_files(bag) if is_one_bag(bag) else ())
-            if path in bags[bag] and len(bags[bag]) > 1 and not (together and bags[bag] <= paths):
-                what = f"{path}: is one of the {len(bags[bag])} parts of the ROS 2 bag {bag}"
+    folders: dict[str, list[Path]] = {}
+    for path in paths:
+        if path.name.endswith(STORAGE_SUFFIXES):
+            folders.setdefault(os.path.dirname(path), []).append(path)  # noqa: PTH120  of thousands
+    for bag, mine in sorted(folders.items()):
+        parts = frozenset(storage_files(Path(bag)) if is_one_bag(Path(bag)) else ())
+        if len(parts) > 1 and not (together and parts <= paths):
+            for path in sorted(parts.intersection(mine)):
+                what = f"{path}: is one of the {len(parts)} parts of the ROS 2 bag {bag}"
                 yield path, f"{what}, and static transforms stand in the first of them only; give the directory"
 
 
@@ -202,7 +205,7 @@ def remote_logs(url: str, directory: Path) -> dict[Path, str]:
     """Return stand-ins for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
     place = stand_ins(url, directory, wanted=belongs_to_a_log)
-    folders: dict[Path, Path] = {}
+    folders: dict[str, Path] = {}
     return {
         _real(path, folders): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)
     }
@@ -228,13 +231,14 @@ def in_turns(sources: Sequence[LogSource]) -> list[list[int]]:
     return turns
 
 
-def _real(path: Path, folders: dict[Path, Path]) -> Path:
+def _real(path: Path, folders: dict[str, Path]) -> Path:
     """Return where a log really lies; a link that leads nowhere is where it is. ``folders`` keeps where folders lie."""
     if path.is_symlink() or path.name in ("", ".."):
         return path.resolve() if path.exists() else path.absolute()
-    if path.parent not in folders:
-        folders[path.parent] = path.parent.resolve()
-    return folders[path.parent] / path.name
+    folder = os.path.dirname(path)  # noqa: PTH120  of thousands
+    if folder not in folders:
+        folders[folder] = path.parent.resolve()
+    return folders[folder] / path.name
 
 
 def _as_named(path: Path) -> Path:
@@ -249,9 +253,18 @@ def _place_in(path: Path, entry: Path) -> str:
 
 
 def _files(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
-    files = [file for path in paths for file in (sorted(path.rglob("*")) if path.is_dir() else [path])]
-    found = [os.stat(file) for file in files if file.is_file()]  # noqa: PTH116
-    return tuple((stat.st_size, stat.st_mtime_ns) for stat in found)
+    return tuple((seen.st_size, seen.st_mtime_ns) for path in paths for seen in _seen(path))
+
+
+def _seen(path: Path) -> list[os.stat_result]:
+    """Return what the file system has of a file, or of all files below a directory; nothing of what cannot be looked at."""
+    try:
+        seen = os.stat(path)  # noqa: PTH116
+    except OSError:
+        return []
+    if stat.S_ISDIR(seen.st_mode):
+        return [file.stat() for file in sorted(path.rglob("*")) if file.is_file()]
+    return [seen] if stat.S_ISREG(seen.st_mode) else []
 
 
 def is_there(sighting: Sighting) -> bool:

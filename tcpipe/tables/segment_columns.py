@@ -61,7 +61,7 @@ GEOMETRY = "geometry"
 
 
 def _geometry(doc: str, frame: str) -> Column:
-    return Column(GEOMETRY, pa.binary(), "deg", f"{doc}; WKB, longitude first", frame, nullable=True, since="2.1")
+    return Column(GEOMETRY, pa.binary(), "", f"{doc}; WKB, longitude first", frame, nullable=True, since="2.1")
 
 
 LINE_COLUMN = _geometry("LineString from start to end; null in a local frame", "gnss_crs")
