@@ -216,7 +216,7 @@ class Store:
         for entry in runs.entries(run_id or "", but=_STREAMS):
             name, _, rest = entry.name.partition("/")
             found.setdefault(name, {})[rest] = entry
-        return (ListedRun(name, runs.below(name), files, numbers(files)) for name, files in found.items())
+        return (ListedRun(runs, name, files, numbers(files)) for name, files in found.items())
 
     def _ingestion(
         self, of: ListedRun, recipe_id: str, number: int, row: RunFacts | None
@@ -225,7 +225,7 @@ class Store:
 
         ``row`` is what the index has of it.
         """
-        place, name = of.place.below(recipe_id), name_of("manifest", number)
+        place, name = of.runs.below(f"{of.run_id}/{recipe_id}"), name_of("manifest", number)
         state = state_of(of.files[f"{recipe_id}/{name}"])
         if row is None or row.state != state:
             where = place.where(name)

@@ -217,9 +217,11 @@ def _walked(directory: Path, prefix: str, but: str) -> list[Entry]:
                 if entry.is_dir():
                     todo += [(entry.path, f"{above}{entry.name}/")] if entry.name != but else []
                     continue
-                with suppress(FileNotFoundError):
+                try:
                     seen = entry.stat()
-                    found.append(Entry(above + entry.name, seen.st_size, seen.st_mtime_ns))
+                except FileNotFoundError:
+                    continue
+                found.append(Entry(above + entry.name, seen.st_size, seen.st_mtime_ns))
     return found
 
 

@@ -24,8 +24,8 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
 class ListedRun:
     """What lies in the directory of a run: its files by name there, and the last numbers of its documents."""
 
+    runs: Place
     run_id: str
-    place: Place
     files: Mapping[str, Entry]
     numbers: Mapping[str, int]
 
