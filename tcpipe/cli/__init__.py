@@ -26,8 +26,10 @@ from tcpipe.cli.init import init
 from tcpipe.cli.inspect import inspect
 from tcpipe.cli.migrate import migrate
 from tcpipe.cli.output import say_failure
+from tcpipe.cli.overlay import overlay
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
+from tcpipe.cli.preflight import preflight
 from tcpipe.cli.process import Ended, prepare_process
 from tcpipe.cli.prune import prune
 from tcpipe.cli.report import report
@@ -68,6 +70,7 @@ for command in (
     demo,
     init,
     inspect,
+    preflight,
     ingest,
     status,
     accept,
@@ -81,6 +84,7 @@ for command in (
     cost_map,
     plan_path,
     report,
+    overlay,
     export,
     explain,
     verify,

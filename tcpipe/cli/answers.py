@@ -28,6 +28,8 @@ def answers() -> dict[str, type]:
     from tcpipe.pipeline.known_trouble import Accepted
     from tcpipe.pipeline.log_inspection import InspectedLog
     from tcpipe.pipeline.maps import AddedMap
+    from tcpipe.pipeline.overlay import Overlay
+    from tcpipe.pipeline.preflight import Preflight
     from tcpipe.pipeline.table_proposal import InspectedTables
     from tcpipe.pipeline.verify import Verified
     from tcpipe.planning.cost_map import CostMapCard, CostMapResult
@@ -61,8 +63,10 @@ def answers() -> dict[str, type]:
         "inspect-run.answer": InspectedRun,
         "inspect-store.answer": InspectedStore,
         "inspect-tables.answer": InspectedTables,
+        "overlay.answer": Overlay,
         "plan-path.answer": PlanResult,
         "predict-path.answer": PathResult,
+        "preflight.answer": Preflight,
         "reproduce.answer": Reproduction,
         "simulate.answer": SimulatedSite,
         "train.answer": TrainResult,

@@ -87,7 +87,7 @@ def _key_of_values(values: Mapping[str, Json]) -> str:
     return digest({name: values.get(name) for name in names if values.get(name) or name not in _OWN_TABLES})
 
 
-def read_key(recipe: Recipe, robot: str | None, *, definitions: str) -> str:
+def read_key(recipe: Recipe | IngestSections, robot: str | None, *, definitions: str) -> str:
     """Return the hash (hex) of what rules the streams beside the log: the read section, the robot asked for, the definitions given."""
     own = {name: values for name in _OWN_TABLES if (values := getattr(recipe, name))}
     return digest({"read": recipe.read, "robot": robot, "definitions": definitions, **own})

@@ -35,6 +35,9 @@ TRANSFORMS = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
 
 _MEASURED_TWISTS = (ODOMETRY, TWIST_WITH_COVARIANCE_STAMPED, TWIST_STAMPED)
 
+OVERLAY = "/tcpipe/"
+"""Topics below it are what `tcpipe overlay` made of a log: they play no role, lest a run is made of another's results."""
+
 ROLE_TYPES: dict[str, tuple[str, ...]] = {
     "gnss": (NAV_SAT_FIX, NMEA_SENTENCE),
     "imu": (IMU,),
@@ -293,6 +296,8 @@ def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> boo
         why = f"it cannot be read: {topic.problem}"
     elif topic.message_count == 0:
         why = "it has no messages"
+    elif topic.name.startswith(OVERLAY):
+        why = "tcpipe made it of another log (tcpipe overlay): ingest that one"
     if why is not None:
         decided.left_out[topic.name] = why
     return why is None

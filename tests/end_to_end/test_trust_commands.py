@@ -6,11 +6,17 @@ import signal
 import subprocess
 import time
 
+import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from installed_command import COMMAND, plain_lines, tcpipe
+from mcap.reader import make_reader
+from pyproj import Geod
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tcpipe.simulation import simulate
+
+GEOD = Geod(ellps="WGS84")
 
 
 @pytest.fixture(scope="module")
@@ -72,6 +78,95 @@ def test_a_sample_is_traced_to_its_log_and_made_again_bit_for_bit(work, ids):
     facts, gnss = found["facts"], found["facts"]["messages"]["gnss"]
     assert facts["sample"]["start_ns"] <= gnss["first_ns"] <= gnss["last_ns"] < facts["sample"]["end_ns"]
     assert facts["log"]["paths"][0].endswith(".mcap")
+
+
+def test_an_overlay_lies_on_its_logs_clock_and_on_its_segments(work):
+    (run,) = (work / "tcpipe-store" / "runs").iterdir()
+    (log,) = (work / "site" / "logs").glob("*.mcap")
+    done = tcpipe("overlay", run, "over.mcap", cwd=work)
+    assert done.returncode == 0, done.stderr
+    whole = (work / "over.mcap").read_bytes()
+    assert tcpipe("overlay", run, "over.mcap", cwd=work).returncode == 0
+    assert (work / "over.mcap").read_bytes() == whole, "it is not the same again"
+    read = messages_of(work / "over.mcap", "/tcpipe/fix", "/tcpipe/segment", "/tcpipe/segments")
+    segments = [message for _, message in read["/tcpipe/segment"]]
+    table = pq.read_table(next(run.glob("*/*/segments.parquet")))
+    assert [message.segment_id for message in segments] == table["segment_id"].to_pylist()
+    assert [message.energy_joule for message in segments] == table["energy_joule"].to_pylist()
+    # A segment is a chord of one metre, and the track passes its start when the message says so.
+    ((_, drawn),) = read["/tcpipe/segments"]
+    lines = {
+        of["properties"]["segment_id"]: of["geometry"]["coordinates"]
+        for of in json.loads(drawn.geojson)["features"]
+        if "segment_id" in of["properties"]
+    }
+    fixes = np.array([(at, fix.longitude, fix.latitude) for at, fix in read["/tcpipe/fix"]])
+    for begin, message in read["/tcpipe/segment"]:
+        (lon, lat), end = lines[message.segment_id]
+        assert GEOD.line_length(*zip((lon, lat), end, strict=True)) == pytest.approx(1.0, abs=0.001)
+        assert message.power_watt == pytest.approx(message.energy_joule / message.duration_s)
+        near = [np.interp(begin, fixes[:, 0], fixes[:, at]) for at in (1, 2)]
+        assert GEOD.inv(lon, lat, *near)[2] < 0.02
+    # What was measured at a stamp is played when the recorder received what was measured then.
+    (recorded,) = messages_of(log, "/a200_0000/sensors/gps_0/fix").values()
+    delays_ns = np.array([[at, at - stamp_ns(fix)] for at, fix in recorded])
+    ours_ns = np.array([[at, at - stamp_ns(fix)] for at, fix in read["/tcpipe/fix"]])
+    apart_ns = ours_ns[:, 1] - np.interp(ours_ns[:, 0], *delays_ns.T)
+    assert np.abs(apart_ns).max() < 0.05e9
+    plain_lines(tcpipe("overlay", run, log, cwd=work), 2)  # a recording is never replaced
+    assert "is there, and no overlay" in tcpipe("overlay", run, log, cwd=work).stderr
+    made_of_itself = tcpipe("ingest", "over.mcap", "--store", "another", cwd=work)
+    assert made_of_itself.returncode == 1
+    assert "tcpipe made it of another log" in made_of_itself.stderr + made_of_itself.stdout
+
+
+def test_a_preflight_promises_what_ingesting_gives(work):
+    (log,) = (work / "site" / "logs").glob("*.mcap")
+    (made,) = (work / "tcpipe-store" / "runs").glob("*/*/manifest-1.json")
+    manifest = json.loads(made.read_text())
+    done = tcpipe("preflight", log, "--json", "--quiet", cwd=work)
+    found = json.loads(done.stdout)
+    promise, label = found["promise"], manifest["info"]["findings"]["facts"]["label"]
+    assert done.returncode == 3  # half a minute is too short for a prediction
+    assert [line[:7] for line in found["mend"]] == ["the log"]
+    assert promise["segments"] == manifest["counts"]["segments"] == 10
+    assert promise["segments_per_hour"] == pytest.approx(36000 / promise["span_s"])
+    assert promise["ledger_m"] == pytest.approx(manifest["ledger_m"])
+    assert promise["relative_std_median"] == pytest.approx(label["relative_std_median"])
+    sensors = (
+        "sensors/gps_0/fix",
+        "sensors/imu_0/data",
+        "platform/odom",
+        "zed/zed_node/odom",
+        "platform/mcu/status/power",
+    )
+    names = [f"/a200_0000/{name}" for name in (*sensors, "platform/cmd_vel", "tf_static")]
+    assert found["record"] == f"ros2 bag record -s mcap -o drive {' '.join(names)}"
+    # Without fixes and power nothing could be trained on, and it says so before the day in the field.
+    (work / "blind.toml").write_text(f"[read]\nignore_topics = {json.dumps([names[0], names[4]])}\n")
+    blind = json.loads(tcpipe("preflight", log, "--json", "-q", "--recipe", "blind.toml", cwd=work).stdout)
+    assert (set(blind["missing"]), blind["exit_code"]) == ({"gnss", "power"}, 3)
+    assert blind["promise"]["relative_std_median"]["energy"] is None
+    assert names[0] not in blind["record"].split()
+    (work / "blind.toml").unlink()
+
+
+def messages_of(path, *topics):
+    """The log times and messages of topics, all without any, by mcap's reader and what the file says of its types."""
+    store, found = get_typestore(Stores.EMPTY), {}
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file).iter_messages(topics or None):
+            for name, fields in get_types_from_msg(schema.data.decode(), schema.name).items():
+                if name not in store.types:
+                    store.register({name: fields})
+            found.setdefault(channel.topic, []).append(
+                (message.log_time, store.deserialize_cdr(message.data, schema.name))
+            )
+    return found
+
+
+def stamp_ns(message):
+    return message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
 
 
 def test_diff_names_cause_and_effect(work):

@@ -52,6 +52,8 @@ class MessageStream:
     constants: Mapping[str, Any] = field(default_factory=dict)
     publish_time_ns: NDArray[np.int64] | None = None
     latched: bool = False
+    definition: str = ""
+    """Text of a type that neither rosbags nor `DEFINITIONS` knows."""
 
 
 def write_mcap(
@@ -61,20 +63,22 @@ def write_mcap(
     encoding: Encoding = "cdr",
     compression: McapCompression = "zstd",
 ) -> None:
-    """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 messages in MCAP (ros1)."""
-    store, version = _typestore(encoding), 1 if encoding == "ros1" else 2
+    """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 messages in MCAP (ros1); streams of one topic share its channel."""
+    version = 1 if encoding == "ros1" else 2
     codec = {"zstd": CompressionType.ZSTD, "lz4": CompressionType.LZ4, "none": CompressionType.NONE}
     with atomic_file(path) as temporary, temporary.open("wb") as out:
         writer = McapWriter(out, chunk_size=_CHUNK_BYTES, compression=codec[compression], enable_data_crcs=True)
         writer.start(profile=f"ros{version}", library="tcpipe")
-        channels = []
+        channels: dict[str, int] = {}
         for stream in streams:
-            text = store.generate_msgdef(stream.type_name, ros_version=version)[0]
+            if stream.topic in channels:
+                continue
+            text = _store_of(stream, encoding).generate_msgdef(stream.type_name, ros_version=version)[0]
             name = stream.type_name if version == 2 else stream.type_name.replace("/msg/", "/")
             schema = writer.register_schema(name, f"ros{version}msg", text.encode())
-            channels.append(writer.register_channel(stream.topic, encoding, schema))
+            channels[stream.topic] = writer.register_channel(stream.topic, encoding, schema)
         for index, row, payload, log_time, publish_time in _in_log_order(streams, encoding):
-            writer.add_message(channels[index], log_time, payload, publish_time, row)
+            writer.add_message(channels[streams[index].topic], log_time, payload, publish_time, row)
         writer.finish()  # type: ignore[no-untyped-call]
 
 
@@ -125,7 +129,7 @@ def _in_log_order(streams: Sequence[MessageStream], encoding: Encoding) -> list[
 
 def _payloads(stream: MessageStream, encoding: Encoding) -> NDArray[np.uint8]:
     """Return the serialised messages, one a row."""
-    store = _typestore(encoding)
+    store = _store_of(stream, encoding)
     encode: Callable[[object, str], Any] = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
     count = stream.log_time_ns.size
     if not count:
@@ -236,6 +240,14 @@ def _elements(store: Typestore, argument: Any, value: Any) -> Any:
         return list(value or [])
     dtype = {"octet": "uint8", "char": "uint8"}.get(inner[0], inner[0])
     return np.zeros(length, dtype) if value is None else np.asarray(value, dtype)
+
+
+def _store_of(stream: MessageStream, encoding: Encoding) -> Typestore:
+    """Return the types, with that of the stream among them."""
+    store = _typestore(encoding)
+    if stream.definition and stream.type_name not in store.types:
+        store.register(get_types_from_msg(stream.definition, stream.type_name))
+    return store
 
 
 @functools.cache

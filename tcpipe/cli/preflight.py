@@ -1,0 +1,37 @@
+"""``tcpipe preflight``: what a minute of recording promises."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from tcpipe.cli.options import LOG, json_option, msgdef_option, quiet_option, recipe_option
+
+
+@click.command(short_help="What a minute of recording promises")
+@click.argument("log", type=LOG, metavar="LOG")
+@click.option("--robot", metavar="NAME", help="Robot profile.")
+@recipe_option
+@msgdef_option
+@json_option
+@quiet_option
+def preflight(
+    log: str, *, robot: str | None, recipe: str | None, msgdef: str | None, as_json: bool, quiet: bool
+) -> int:
+    """Predict from LOG, a minute or more as it will be driven, what a day of such recording gives, and say what to mend before.
+
+    Segments an hour, where the metres go, the deviations of labels, topics that are missing or too slow, clocks, and the command that
+    records what is needed. Nothing is written.
+
+    Exit codes: 0 ready; 3 something is to be mended; 1 nothing would come of it.
+    """
+    from tcpipe.cli.output import progress, ruling_recipe, say_result
+    from tcpipe.pipeline.preflight import preflight as run
+
+    with progress("preflight", 1, quiet=quiet):
+        found = run(
+            log, recipe=ruling_recipe(recipe)[0], robot=robot, message_definitions=Path(msgdef) if msgdef else None
+        )
+    say_result(found, as_json=as_json)
+    return found.exit_code

@@ -1,0 +1,31 @@
+"""What wins lost metres back, by the entry of the ledger that has them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from tcpipe.tables.bits import DropReason, Loss, name_of
+
+REMEDIES: Mapping[str, str] = {
+    name_of(reason): text
+    for reason, text in {
+        DropReason.GAP: "a sensor is silent or positions too uncertain: the run's warnings and 'tcpipe inspect --full' say which and when",
+        DropReason.STANDING: "nothing: standing tells the standing power, and costs time only",
+        DropReason.STUCK: "nothing: wheels that spin in place tell no metre's cost; mind such ground when planning",
+        DropReason.TURNING_IN_PLACE: "drive wide turns instead of turning on the spot, and longer legs between them",
+        DropReason.REVERSING: "drive forwards",
+        DropReason.ACCELERATING: "hold one speed over long legs: each start, stop and commanded change costs two seconds",
+        DropReason.BELOW_LIMIT: "command full speed; if that was its limit, set gate.max_velocity_mps, or gate.require_full_speed = false",
+        Loss.CURVED: "drive straighter lines: a metre whose arc is 2 % longer than its chord is no segment",
+        Loss.LEFTOVER: "drive longer steady legs: each ends with up to a metre that is no whole segment",
+        Loss.OUTSIDE_MAP: "a map that reaches two metres beyond what is driven",
+        Loss.NODATA: "a map without holes there, or sample.min_valid_fraction below 1",
+        Loss.NOT_TRAVERSABLE: "look at the terrain raster and its class table: the robot drove where they say it cannot",
+        Loss.POSITION_UNCERTAIN: "RTK corrections and the antenna's place ([read.placement]); or a larger sample.max_position_std_m",
+        Loss.SPLIT_BUFFER: "fewer and larger regions: what lies near their borders goes to no split",
+        Loss.NO_POWER: "record the power topic over the whole drive",
+        Loss.SPLIT_EXCLUDED: "nothing: a region says so",
+        Loss.RECORDED_TWICE: "nothing: another run holds the same drive",
+    }.items()
+}  # fmt: skip
+"""By entry, in words."""

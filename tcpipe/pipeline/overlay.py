@@ -1,0 +1,273 @@
+"""A run as a log of its own, to lie beside the recording in a viewer: track, segments, gates and refusals on the recorder's clock.
+
+ROS 2 messages in MCAP: Foxglove, Rerun and PlotJuggler all read them (ADR 96). The fields of the messages are the tables' columns.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from tcpipe.errors import LogError, StoreError, UsageError, plain_lines
+from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
+from tcpipe.formats.parquet import read_table
+from tcpipe.formats.recipe_toml import read_key
+from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.geometry.rotation import quat_from_rpy
+from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
+from tcpipe.store import Store, run_at
+from tcpipe.tables.arrays import numbers, text_column, texts
+from tcpipe.tables.bits import DropReason, Quality, name_of
+
+GEOJSON = "foxglove_msgs/msg/GeoJSON"
+_FRAME = "tcpipe_enu"
+_SEGMENT_COLOUR, _DROPPED_COLOUR = "#1a9850", "#d73027"
+_DIAGONAL_KNOWN = 2
+_ROWS_A_VERTEX = 20
+"""Dropped stretches are drawn with a vertex a second."""
+
+_LABELS = (
+    "power_watt", "power_std_watt", "velocity_mps", "velocity_std_mps", "duration_s", "duration_std_s", "energy_joule", "energy_std_joule",
+)  # fmt: skip
+_ROS_TYPES = {
+    pa.float64(): "float64", pa.int64(): "int64", pa.int32(): "int32", pa.int16(): "int16", pa.uint32(): "uint32", pa.string(): "string",
+}  # fmt: skip
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class Overlay:
+    """The file that was written."""
+
+    path: str
+    run_id: str
+    recipe_id: str
+    messages: Mapping[str, int]
+    """By topic."""
+    start_ns: int | None
+    """Log time of the first message; None without any."""
+    end_ns: int | None
+
+    def __str__(self) -> str:
+        """Return the file and its topics, a line each."""
+        said = (f"{count:>9} messages  {topic}" for topic, count in self.messages.items())
+        return plain_lines((f"{self.path}: run {self.run_id} under recipe {self.recipe_id}, on its log's clock", *said))
+
+
+def overlay(path: Path | str, out: Path) -> Overlay:
+    """Write what became of a run as an MCAP of ROS 2 messages, whole or not at all; the same run gives the same bytes.
+
+    Parameters
+    ----------
+    path
+        A run of a store, here or in a bucket; where it was ingested under several recipes, one of them.
+    out
+        The file.
+
+    Raises
+    ------
+    UsageError
+        The path is no run, or one under several recipes, or ``out`` is there and no overlay: a recording is never replaced.
+    StoreError
+        A file of the run is not as it was written, or its streams, which know the recorder's clock, were made otherwise or are gone.
+
+    """
+    found = run_at(path)
+    if found is None:
+        raise UsageError(f"{path}: is no run of a store; give STORE/runs/RUN, as 'tcpipe inspect STORE' lists them")
+    store, runs = found
+    if len(runs) > 1:
+        names = ", ".join(run.recipe_id for run in runs)
+        raise UsageError(f"{path}: was ingested under several recipes; give one of them: {path}/… {names}")
+    _refuse_others(out)
+    streams = list(_streams(store, runs[0]))
+    write_mcap(out, streams)
+    count: dict[str, int] = {}
+    for stream in streams:
+        count[stream.topic] = count.get(stream.topic, 0) + len(stream.log_time_ns)
+    times = np.concatenate([stream.log_time_ns for stream in streams])
+    ends = (int(times.min()), int(times.max())) if len(times) else (None, None)
+    return Overlay(str(out), runs[0].run_id, runs[0].recipe_id, count, *ends)
+
+
+def _refuse_others(out: Path) -> None:
+    mine = not out.exists()
+    with suppress(LogError):
+        if not mine:
+            with open_log(out) as log:
+                mine = all(name.startswith(OVERLAY) for name in log.topics)
+    if not mine:
+        raise UsageError(f"{out}: is there, and no overlay; give another name")
+
+
+def _streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]:
+    """Yield every topic's messages."""
+    clock = _recorder_clock(store, run)
+    track, segments, refused = run.track(), run.segments(), run.rejections()
+    rows = _named(track.table, "dropped_by", DropReason, "reasons", "kept")
+    cut = _named(segments, "quality", Quality, "quality_names", "clean")
+    times = clock(_column(rows, "stamp_ns"), _column(rows, "epoch"))
+    if track.info.datum is not None:
+        yield _fixes(rows, times)
+        if len(times):
+            geojson = json.dumps(
+                {"type": "FeatureCollection", "features": [*_dropped_lines(rows), *_segment_lines(cut)]}
+            )
+            yield MessageStream(
+                f"{OVERLAY}segments", GEOJSON, times[:1], {}, {"geojson": geojson}, definition="string geojson\n"
+            )
+    yield _poses(rows, times)
+    yield from _messages("track", "stamp_ns", rows, times)
+    yield from _gates(texts(rows.column("reasons")), times)
+    yield from _messages("segment", "start_ns", cut, clock(_column(cut, "start_ns"), _column(cut, "epoch")))
+    yield from _messages("refused", "stamp_ns", refused, clock(_column(refused, "stamp_ns"), None))
+
+
+class _Clock:
+    """When the recorder received what was measured at a time, by the messages of one role; in between the delay is interpolated."""
+
+    def __init__(self, rows: pa.Table) -> None:
+        self._epoch, stamps = _column(rows, "epoch"), _column(rows, "stamp_ns")
+        self._stamp_ns, self._behind_ns = stamps, (_column(rows, "log_time_ns") - stamps).astype(np.float64)
+
+    def __call__(self, stamp_ns: Ints, epoch: Ints | None) -> Ints:
+        """Return the log time of each stamp [ns]; without epochs a stamp is of the first that holds it."""
+        if epoch is None:
+            epoch = self._epoch_of(stamp_ns)
+        times = stamp_ns.copy()
+        for number in np.unique(epoch):
+            mine, known = epoch == number, self._epoch == number
+            known = known if known.any() else np.ones_like(known)
+            begin = self._stamp_ns[known][0]  # differences are exact in float64, times since 1970 are not
+            at, of = (stamp_ns[mine] - begin).astype(np.float64), (self._stamp_ns[known] - begin).astype(np.float64)
+            times[mine] += np.rint(np.interp(at, of, self._behind_ns[known])).astype(np.int64)
+        return times
+
+    def _epoch_of(self, stamp_ns: Ints) -> Ints:
+        epoch = np.full(len(stamp_ns), self._epoch.max(initial=0))
+        for number in np.unique(self._epoch)[::-1]:
+            inside = self._stamp_ns[self._epoch == number]
+            epoch[(stamp_ns >= inside[0]) & (stamp_ns <= inside[-1])] = number
+        return epoch
+
+
+def _recorder_clock(store: Store, run: RunDirectory) -> _Clock:
+    """Return the clock of a run's log; `StoreError` where its streams are not those that the run was made from."""
+    manifest, known = run.manifest, store.run_json(run.run_id)
+    key = read_key(manifest.recipe, manifest.robot_requested, definitions=manifest.message_definitions)
+    if known is None or known.streams_key != f"{key}-{manifest.tcpipe_version}" or not known.streams:
+        raise StoreError(f"{run.where}: the streams it was made from are gone or were read anew; ingest the log again")
+    columns = ["stamp_ns", "log_time_ns", "epoch"]
+    tables = (read_table(path, columns) for path in store.stream_files(run.run_id, known).values())
+    return _Clock(max(tables, key=lambda table: table.num_rows))
+
+
+def _column(table: pa.Table, name: str) -> NDArray[Any]:
+    return numbers(table.column(name))
+
+
+def _named(table: pa.Table, column: str, flags: type[DropReason | Quality], name: str, none: str) -> pa.Table:
+    """Return the table with the names of its bits as a text column."""
+    bits = _column(table, column)
+    told = {
+        int(value): ", ".join(name_of(bit) for bit in flags if int(value) & bit) or none for value in np.unique(bits)
+    }
+    return table.append_column(name, text_column([told[int(value)] for value in bits]))
+
+
+def _header(stamp_ns: Ints) -> dict[str, NDArray[Any]]:
+    return {"header.stamp.sec": stamp_ns // 10**9, "header.stamp.nanosec": stamp_ns % 10**9}
+
+
+def _fixes(rows: pa.Table, times: Ints) -> MessageStream:
+    """Return the track as NavSatFix, in the datum of the log's own fixes, its variances beside."""
+    columns = _header(_column(rows, "stamp_ns"))
+    columns |= {
+        name: _column(rows, f"{name[:3]}_{unit}")
+        for name, unit in (("longitude", "deg"), ("latitude", "deg"), ("altitude", "m"))
+    }
+    covariance = np.zeros((len(times), 9))
+    covariance[:, ::4] = np.stack([_column(rows, f"{axis}_std_m") for axis in "xyz"], axis=-1) ** 2
+    constants = {"header.frame_id": "base_link", "position_covariance_type": _DIAGONAL_KNOWN}
+    return MessageStream(f"{OVERLAY}fix", NAV_SAT_FIX, times, columns | {"position_covariance": covariance}, constants)
+
+
+def _poses(rows: pa.Table, times: Ints) -> MessageStream:
+    columns = _header(_column(rows, "stamp_ns"))
+    columns |= {f"pose.position.{axis}": _column(rows, f"{axis}_m") for axis in "xyz"}
+    quat = quat_from_rpy(*(_column(rows, f"{name}_rad") for name in ("roll", "pitch", "yaw")))
+    columns |= {f"pose.orientation.{axis}": quat[:, at] for at, axis in enumerate("xyzw")}
+    return MessageStream(f"{OVERLAY}pose", POSE_STAMPED, times, columns, {"header.frame_id": _FRAME})
+
+
+def _gates(reasons: NDArray[np.str_], times: Ints) -> Iterator[MessageStream]:
+    """Yield why rows are not used, a message where that changes."""
+    changes = np.flatnonzero(np.append(True, reasons[1:] != reasons[:-1])[: len(reasons)])
+    for reason in np.unique(reasons):
+        at = times[changes[reasons[changes] == reason]]
+        yield MessageStream(f"{OVERLAY}gate", "std_msgs/msg/String", at, {}, {"data": str(reason)})
+
+
+def _messages(name: str, stamp: str, table: pa.Table, times: Ints) -> Iterator[MessageStream]:
+    """Yield the rows of a table as messages of a type of their own: a field a column, null as NaN; rows of equally long texts together."""
+    kinds = {field.name: _ROS_TYPES[field.type] for field in table.schema}
+    definition = "std_msgs/Header header\n" + "".join(f"{kind} {of}\n" for of, kind in kinds.items())
+    columns = _header(_column(table, stamp))
+    lengths = np.zeros((len(times), 0), np.int64)
+    for of, kind in kinds.items():
+        if kind == "string":
+            columns[of] = np.char.encode(texts(table.column(of)), "utf-8") if len(times) else np.empty(0, "S1")
+            lengths = np.column_stack([lengths, np.char.str_len(columns[of])])
+        else:
+            columns[of] = _column(table, of)
+    for length in np.unique(lengths, axis=0) if len(times) else lengths[:1]:
+        rows = (lengths == length).all(axis=-1)
+        sizes = iter(length.tolist())
+        alike = {
+            of: values[rows].astype(f"S{next(sizes)}") if values.dtype.kind == "S" else values[rows]
+            for of, values in columns.items()
+        }
+        constants = {"header.frame_id": _FRAME}
+        yield MessageStream(
+            f"{OVERLAY}{name}", f"tcpipe_msgs/msg/{name.title()}", times[rows], alike, constants, definition=definition
+        )
+
+
+def _line(lonlat: Sequence[Sequence[float]], colour: str, properties: Mapping[str, Any]) -> dict[str, Any]:
+    geometry = {"type": "LineString", "coordinates": lonlat}
+    return {"type": "Feature", "geometry": geometry, "properties": {**properties, "style": {"color": colour}}}
+
+
+def _segment_lines(segments: pa.Table) -> Iterator[dict[str, Any]]:
+    """Yield a GeoJSON line a segment, with its labels and quality."""
+    for row in segments.select(["segment_id", *_ENDS, *_LABELS, "quality_names"]).to_pylist():
+        lonlat = [row.pop(name) for name in _ENDS]
+        yield _line([lonlat[:2], lonlat[2:]], _SEGMENT_COLOUR, {"name": row["segment_id"], **row})
+
+
+_ENDS = ("start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg")
+
+
+def _dropped_lines(rows: pa.Table) -> Iterator[dict[str, Any]]:
+    """Yield a GeoJSON line for each stretch of one gate, and why."""
+    reasons, bits, epoch = texts(rows.column("reasons")), _column(rows, "dropped_by"), _column(rows, "epoch")
+    lonlat = np.stack([_column(rows, "lon_deg"), _column(rows, "lat_deg")], axis=-1)
+    breaks = np.flatnonzero((np.diff(bits.astype(np.int64)) != 0) | (np.diff(epoch) != 0)) + 1
+    for part in np.split(np.arange(len(bits)), breaks):
+        if len(part) > 1 and bits[part[0]]:
+            vertices = np.append(part[:-1:_ROWS_A_VERTEX], part[-1])
+            yield _line(
+                lonlat[vertices].tolist(),
+                _DROPPED_COLOUR,
+                {"name": str(reasons[part[0]]), "gate": str(reasons[part[0]])},
+            )
