@@ -3,7 +3,8 @@
 ::
 
     dataset.json  croissant.json  samples.parquet  report.html
-    overview.png                                             the map, small and grey: the report's background
+    overview.png  relief.png  classes.png                    the map, small, as the report shows it
+    drive-next.geojson                                       where to drive for what is thin
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
     data/<split>-00000-of-00001.parquet                      --format parquet: the same layers, a row a sample
 """
@@ -44,6 +45,9 @@ PATCHES = "patches.zarr"
 SHARDS = "data"
 REPORT = "report.html"
 OVERVIEW = "overview.png"
+RELIEF = "relief.png"
+CLASSES = "classes.png"
+DRIVE_NEXT = "drive-next.geojson"
 
 CHUNK_ROWS = 256
 """Patches that are decoded together."""

@@ -44,15 +44,12 @@ def report(path: Path | str) -> list[Page]:
     """
     stored = is_store(path) or inside_store(path) is not None
     if is_url(path) and not stored:
-        (page,) = report(here(path))
+        (page,) = _of_dataset(here(path), None)
         if page.changed:
             open_place(path).put(_PAGE, Path(page.path).read_bytes())
         return [replace(page, path=f"{str(path).rstrip('/')}/{_PAGE}")]
     if not is_url(path) and (Path(path) / "dataset.json").is_file():
-        path = Path(path)
-        fits = read_current_card(path).physics
-        said = tuple(physics_in_words(robot, fit) for robot, fit in fits.items())
-        return [_write(DirectoryPlace(path), dataset_report(path), said)]
+        return _of_dataset(Path(path), Path(path).absolute().parent)
     store = Store(path)
     found = (store, store.runs()) if is_store(path) else run_at(path)
     if found is None or not found[1]:
@@ -60,6 +57,12 @@ def report(path: Path | str) -> list[Page]:
         what = "is no dataset, run or store with runs" if there else "there is no such directory"
         raise UsageError(f"{path}: {what}; give a dataset, a run of a store, or a store")
     return [_write(run.place, run_report(found[0], run), _physics_of(run)) for run in found[1]]
+
+
+def _of_dataset(path: Path, beside: Path | None) -> list[Page]:
+    fits = read_current_card(path).physics
+    said = tuple(physics_in_words(robot, fit) for robot, fit in fits.items())
+    return [_write(DirectoryPlace(path), dataset_report(path, beside), said)]
 
 
 def _physics_of(run: RunDirectory) -> tuple[str, ...]:

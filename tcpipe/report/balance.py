@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from tcpipe.balance.cells import SLOPE_NAMES
 from tcpipe.formats.dataset_card import Balance, CellRow
-from tcpipe.report.page import Section
+from tcpipe.report.page import Section, Shaded
 
 _UNITS = {"watt": "W", "mps": "m/s", "s": "s", "joule": "J"}
 
@@ -21,7 +21,7 @@ def _by_class(balance: Balance) -> Section:
     text = (
         f"Samples, and in brackets how many independent ones they are worth: neighbours are alike ({_alike(balance)}). "
         f"{sum(cell['rare'] for cell in cells)} of {len(cells)} cells are worth fewer than {balance.enough_effective:g} and marked "
-        "with *; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them; open it in a GIS."
+        "with * and a dashed border; – is ground of the map that nobody drove. drive-next.geojson holds where to drive for them."
     )
     header, rows = _table(cells, "class", [(cell["class"] or "any",) for cell in cells])
     return Section("Balance of class and slope", text, header=header, rows=rows)
@@ -32,15 +32,22 @@ def _by_speed(balance: Balance) -> Section:
     keys = [(cell["class"] or "any", cell["speed_mps"]) for cell in cells]
     header, rows = _table(cells, "class, speed [m/s]", keys)
     return Section(
-        "Balance of class, slope and speed", "The same by the velocity that is the label.", header=header, rows=rows
+        "Balance of class, slope and speed",
+        "The same by the velocity that is the label.",
+        header=header,
+        rows=rows,
+        folded=True,
     )
 
 
-def _table(cells: Sequence[CellRow], name: str, keys: Sequence[tuple[str, ...]]) -> tuple[list[str], list[list[str]]]:
+def _table(
+    cells: Sequence[CellRow], name: str, keys: Sequence[tuple[str, ...]]
+) -> tuple[list[str], list[list[str | Shaded]]]:
     """Return header and rows: one row a key, in order of appearance, one column a range of slope."""
     seen = {cell["slope"] for cell in cells}
     slopes = [slope for slope in SLOPE_NAMES if slope in seen]
-    texts = {(key, cell["slope"]): _cell_text(cell) for key, cell in zip(keys, cells, strict=True)}
+    most = max((sum(cell["samples"].values()) for cell in cells), default=0)
+    texts = {(key, cell["slope"]): _shaded(cell, most) for key, cell in zip(keys, cells, strict=True)}
     return [name, *slopes], [
         [", ".join(key), *(texts.get((key, slope), "") for slope in slopes)] for key in _in_order(keys)
     ]
@@ -57,12 +64,11 @@ def _lower_end(speeds: str) -> tuple[float, bool]:
     return float(words[-1] if words[0] == "above" else words[0]), words[0] == "above"
 
 
-def _cell_text(row: CellRow) -> str:
+def _shaded(row: CellRow, most: int) -> Shaded:
     count = sum(row["samples"].values())
-    if not count:
-        return "–"
     worth = "" if row["effective"] is None else f" ({row['effective']:.0f})"
-    return f"{count}{worth}{'*' if row['rare'] else ''}"
+    text = f"{count}{worth}{'*' if row['rare'] else ''}" if count else "–"
+    return Shaded(text, (count / max(most, 1)) ** 0.5, alarm=row["rare"])
 
 
 def _alike(balance: Balance) -> str:

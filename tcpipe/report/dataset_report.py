@@ -1,71 +1,67 @@
-"""The page of a dataset: the split on the map, what the patches look like, what was learned and lost."""
+"""The page of a dataset: what it holds, metre by metre, what was learned and lost, and what to do next."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
-from pyproj import Transformer
 
-from tcpipe.formats.dataset_card import DatasetCard, MapSource, RunSource
-from tcpipe.formats.dataset_files import OVERVIEW, open_patches, read_current_card, read_samples, rows_in_files
-from tcpipe.formats.geojson import PolygonGeometry
+from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_card import DatasetCard, RunSource
+from tcpipe.formats.dataset_files import read_current_card, read_samples
+from tcpipe.formats.json_files import Json
+from tcpipe.formats.store_mark import MARK
 from tcpipe.report.balance import balance_sections
-from tcpipe.report.colours import SPLIT_COLOURS
-from tcpipe.report.error_budget import budget_sections
-from tcpipe.report.figures import (
-    against_slope,
-    histograms,
-    patch_gallery,
-    path_on_map,
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, class_colour
+from tcpipe.report.dataset_map import map_plots
+from tcpipe.report.dataset_patches import patches_shown
+from tcpipe.report.dataset_samples import (
+    COLUMNS,
+    MOST_SAMPLES,
+    QUALITY_WORDS,
+    SamplesShown,
+    first_starts_ns,
+    floats,
+    nearest_train_m,
+    samples_shown,
 )
-from tcpipe.report.overview import Bounds, joint_bounds_m, read_overview
-from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.dataset_verdict import verdict
+from tcpipe.report.error_budget import budget_sections
+from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
-from tcpipe.report.plots import waterfall
+from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
 from tcpipe.report.quality import quality_sections
 from tcpipe.tables.bits import Quality, name_of
 
-_GALLERY = 10
-
-_COLUMNS = (
-    "split",
-    "start_lon_deg",
-    "start_lat_deg",
-    "terrain_class",
-    "terrain_name",
-    "slope_rad",
-    "power_watt",
-    "velocity_mps",
-    "duration_s",
-    "energy_joule",
-    "quality",
-)
+_PAGE = "report.html"
 
 
-def dataset_report(directory: Path) -> str:
-    """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model."""
-    card, samples = read_current_card(directory), read_samples(directory, _COLUMNS)
-    driven = sum(card.ledger_m.values())
-    splits = {split: card.splits[split] for split in SPLIT_COLOURS}
+def dataset_report(directory: Path, beside: Path | None = None) -> str:
+    """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
+
+    ``beside`` is the directory in which the dataset lies, or will lie: the page leads to runs of stores that lie there too.
+    Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
+    """
+    card, samples = read_current_card(directory), read_samples(directory, COLUMNS)
+    shown = samples_shown(card, samples)
+    plots, lost = map_plots(directory, card, shown)
+    try:
+        patches = patches_shown(directory, card, samples, shown.row_of)
+    except DatasetError as error:
+        patches, lost = None, [*lost, f"no patch is shown: {error.problems[0]}"]
+    hrefs = {} if beside is None else _run_pages(beside, card)
     return render_page(
         title=f"Dataset {card.name}",
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
-        numbers=[
-            Number(f"{card.samples}", "samples"),
-            *(Number(f"{count}", split) for split, count in splits.items()),
-            Number(f"{len(card.runs)}", "runs"),
-            Number(f"{driven:.0f} m", "driven"),
-            *([] if card.doubtful is None else [Number(f"{100 * card.doubtful.share:.1f} %", "doubtful samples")]),
-        ],
+        verdict=verdict(card, lost),
+        numbers=_numbers(card),
         warnings=[*card.problems, *card.warnings],
         sections=[
-            _split_section(directory, card, samples),
-            _gallery_section(directory, card, samples),
-            *_label_sections(card, samples),
+            _map_section(shown, plots),
+            *([] if patches is None else [_GALLERY]),
+            *_label_sections(samples),
             *quality_sections(_quality_counts(samples), "samples"),
             *_finding_sections(card),
             *physics_sections(dict(card.physics)),
@@ -77,109 +73,83 @@ def dataset_report(directory: Path) -> str:
             ),
             *_removal_sections(card),
             *balance_sections(card.balance),
-            _audit_section(card),
-            *_table_sections(card),
+            _audit_section(card, samples, shown),
+            *_table_sections(card, hrefs),
+            _provenance(card),
         ],
+        script="dataset.js" if samples.num_rows else "",
+        data=_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs),
     )
 
 
-def _floats(samples: pa.Table, name: str) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = samples.column(name).to_numpy(zero_copy_only=False).astype(float)
-    return values
+_GALLERY = Section(
+    "Patches",
+    "Some of every split, class and slope. Travel is to the right; a click chooses the sample on the map.",
+    controls="gallery.html",
+)
 
 
-def _split_section(directory: Path, card: DatasetCard, samples: pa.Table) -> Section:
-    crs = card.maps[0].crs
-    x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(grid.crs, _bounds_m(grid)) for grid in card.maps])
-    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, crs, always_xy=True)
-    region_to_map = Transformer.from_crs("EPSG:4326", crs, always_xy=True)
-    x, y = to_map.transform(_floats(samples, "start_lon_deg"), _floats(samples, "start_lat_deg"))
-    outlines = [np.column_stack(region_to_map.transform(ring[:, 0], ring[:, 1])) for ring in _rings(card.split.region)]
-    svg = path_on_map(
-        np.asarray(x),
-        np.asarray(y),
-        samples.column("split").to_numpy(zero_copy_only=False),
-        SPLIT_COLOURS,
-        backdrop=read_overview(directory / OVERVIEW),
-        extent_m=(x_min_m, x_max_m, y_min_m, y_max_m),
-        outlines_m=outlines,
-        labels=("easting [m]", "northing [m]"),
-    )
-    text = "Where each sample begins, on the map; dashed: the split's region. Samples in the buffer are in no split."
-    return Section("The split on the map", text, svg)
-
-
-def _bounds_m(grid: MapSource) -> Bounds:
-    width_m, height_m = grid.cols * grid.pitch_m, grid.rows * grid.pitch_m
-    return grid.x_min_m, grid.y_max_m - height_m, grid.x_min_m + width_m, grid.y_max_m
-
-
-def _rings(region: Mapping[str, PolygonGeometry] | None) -> list[NDArray[np.float64]]:
-    """Return every ring of every polygon of the region, lon and lat, each of shape (M, 2)."""
-    rings = []
-    for geometry in (region or {}).values():
-        polygons = (geometry.coordinates,) if geometry.type == "Polygon" else geometry.coordinates
-        rings += [np.array(ring, dtype=float)[:, :2] for polygon in polygons for ring in polygon]
-    return rings
-
-
-def _gallery_section(directory: Path, card: DatasetCard, samples: pa.Table) -> Section:
-    chosen = _spread(samples)
-    files = open_patches(directory, card)
-    splits = samples.column("split").to_numpy(zero_copy_only=False)
-    place = np.empty(samples.num_rows, dtype=np.int64)  # where each row of samples lies in the files
-    for name, rows in rows_in_files(card, splits).items():
-        place[splits == name] = rows
-    stacks: dict[str, list[NDArray[np.generic]]] = {layer: [] for layer in files.layers}
-    for row in chosen:
-        piece = int(np.searchsorted(files.starts, place[row], side="right")) - 1
-        pixels = files.read(piece, list(stacks))
-        for layer, stack in stacks.items():
-            stack.append(pixels[layer][place[row] - files.starts[piece]])
-    titles = [
-        f"{samples.column('terrain_name')[row].as_py() or 'sample'}\n"
-        f"{np.degrees(samples.column('slope_rad')[row].as_py()):+.0f}°  {samples.column('power_watt')[row].as_py():.0f} W\n"
-        f"{samples.column('velocity_mps')[row].as_py():.2f} m/s"
-        for row in chosen
-    ]
-    text = "Travel is to the right; height is above each patch's own minimum. Above: class, slope, power, velocity."
-    svg = patch_gallery({layer: np.stack(stack) for layer, stack in stacks.items()}, titles)
-    return Section("Patches", text, svg)
-
-
-def _spread(samples: pa.Table) -> list[int]:
-    """Return rows spread over classes and slopes: the same dataset shows the same ones."""
-    names = samples.column("terrain_name").to_pylist()
-    slope = _floats(samples, "slope_rad")
-    by_class: dict[str | None, list[int]] = {}
-    for row in np.argsort(slope, kind="stable").tolist():
-        by_class.setdefault(names[row], []).append(row)
-    share = max(1, _GALLERY // len(by_class))
-    chosen = [
-        rows[int(position)]
-        for _, rows in sorted(by_class.items(), key=lambda item: str(item[0]))
-        for position in np.unique(np.linspace(0, len(rows) - 1, share).astype(int))
-    ]
-    return chosen[:_GALLERY]
-
-
-def _label_sections(card: DatasetCard, samples: pa.Table) -> list[Section]:
-    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
-    ids = np.nan_to_num(_floats(samples, "terrain_class")).astype(int)
-    names = {entry.id: entry.name for entry in card.classes}
-    series = {"power w [W]": _floats(samples, "power_watt"), "velocity v [m/s]": _floats(samples, "velocity_mps")}
+def _numbers(card: DatasetCard) -> list[Number]:
     return [
-        Section(
-            "Power and velocity against slope",
-            "What the model has to learn, and how far class and slope alone explain it.",
-            against_slope(_floats(samples, "slope_rad"), series, ids, names),
-        ),
-        Section(
-            "Labels",
-            "One value a sample.",
-            histograms({label: _floats(samples, name) for label, name in labels.items()}, of_what="samples"),
-        ),
+        Number(f"{card.samples}", "samples"),
+        *(Number(f"{card.splits[split]}", split) for split in SPLIT_COLOURS),
+        Number(f"{len(card.runs)}", "runs"),
+        Number(f"{sum(card.ledger_m.values()):.0f} m", "driven"),
+        *([] if card.doubtful is None else [Number(f"{100 * card.doubtful.share:.1f} %", "doubtful samples")]),
     ]
+
+
+def _map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
+    text = "Where each sample lies; dashed: the split's region. The buffer is in no split. A box in the plot chooses on the map."
+    if shown.cell_m is not None:
+        text += (
+            f" There are more than {MOST_SAMPLES} samples: a point is the mean of one split and class in a square of "
+            f"{shown.cell_m:.1f} m, and its quality any flag of any of them."
+        )
+    elif not len(shown.xy_m):
+        return Section("The samples on the map", "There is none.")
+    return Section("The samples on the map", text, controls="dataset.html", plots=plots)
+
+
+def _data(
+    card: DatasetCard, samples: pa.Table, shown: SamplesShown, *, patches: Json, drawn: Plot, hrefs: Mapping[str, str]
+) -> Json:
+    names = [renderer.name or "" for renderer in drawn.figure.renderers]
+    return {
+        "count": card.samples,
+        "samples": shown.json,
+        "patches": patches,
+        "ground": [name.removeprefix("layer ") for name in names if name.startswith("layer ")],
+        "empty": [] if len(shown.leaks_m) else ["leaks"],
+        "classes": [{"id": of.id, "name": of.name, "colour": class_colour(of.id)} for of in card.classes],
+        "splits": [{"name": name, "colour": SPLIT_COLOURS[name], "count": card.splits[name]} for name in SPLIT_COLOURS],
+        "runs": [
+            {"id": run.run_id, "first_ns": str(first), "href": hrefs.get(run.run_id)}
+            for run, first in zip(card.runs, first_starts_ns(card, samples), strict=True)
+        ],
+        "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
+        "colours": list(CLASS_COLOURS),
+        "unknown": FAINT,
+        "clean": KEPT,
+        "flagged": DROPPED,
+    }
+
+
+def _run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
+    """Return where each run's page lies from the dataset's, for runs of a store that lies ``beside`` it."""
+    stores = sorted(mark.parent for mark in beside.glob(f"*/{MARK}"))
+    return {
+        run.run_id: f"../{place.relative_to(beside).as_posix()}/{_PAGE}"
+        for run in card.runs
+        for store in stores
+        if (place := store / "runs" / run.run_id / run.recipe_id).is_dir()
+    }
+
+
+def _label_sections(samples: pa.Table) -> list[Section]:
+    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
+    drawn = [histogram(name, floats(samples, name), label=label, of_what="samples") for label, name in labels.items()]
+    return [Section("Labels", "One value a sample.", plots=drawn)] if samples.num_rows else []
 
 
 def _quality_counts(samples: pa.Table) -> dict[str, int]:
@@ -187,7 +157,33 @@ def _quality_counts(samples: pa.Table) -> dict[str, int]:
     return {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}
 
 
-def _audit_section(card: DatasetCard) -> Section:
+def _apart(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
+    """Yield how far what tests lies from what trains, where every sample is shown and both are there."""
+    split = samples.column("split").to_numpy(zero_copy_only=False).astype(np.str_)
+    if shown.cell_m is not None:
+        return
+    apart_m, _ = nearest_train_m(shown.xy_m, split)
+    there = [name for name in ("test", "unseen") if np.isfinite(apart_m[split == name]).any()]
+    if not there:
+        return
+    plot = new_plot(
+        "apart",
+        alt="Share of held-out samples whose nearest train sample is no further than this; the table below has the counts.",
+        axes=("middle to nearest train middle [m]", "share of samples"),
+        legend={name: SPLIT_COLOURS[name] for name in there},
+        height_px=240,
+        tools="save",
+    )
+    for name in there:
+        sorted_m = np.sort(apart_m[split == name])
+        kept = np.unique(np.linspace(0, len(sorted_m) - 1, 400).astype(int))
+        plot.figure.step(
+            sorted_m[kept], (kept + 1) / len(sorted_m), mode="after", color=SPLIT_COLOURS[name], line_width=2
+        )
+    yield plot
+
+
+def _audit_section(card: DatasetCard, samples: pa.Table, shown: SamplesShown) -> Section:
     rows = [
         (
             part.split,
@@ -209,7 +205,8 @@ def _audit_section(card: DatasetCard) -> Section:
         "nearest train",
         "median",
     )
-    return Section("Leakage audit", "How much of what tests has been seen in training.", header=header, rows=rows)
+    text = "How much of what tests has been seen in training. On the map: colour by the way to the nearest train metre, or tick its lines."
+    return Section("Leakage audit", text, header=header, rows=rows, plots=list(_apart(samples, shown)))
 
 
 def _finding_sections(card: DatasetCard) -> list[Section]:
@@ -246,15 +243,52 @@ def _largest(metres: Mapping[str, float]) -> list[tuple[str, float]]:
     return sorted(((n, m) for n, m in metres.items() if m >= 0.5), key=lambda item: (-item[1], item[0]))[:3]
 
 
-def _table_sections(card: DatasetCard) -> list[Section]:
+def _table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section]:
     sections = []
     if card.terrain:
         names = sorted({name for counts in card.terrain.values() for name in counts})
         rows = [(name, *(card.terrain[split].get(name, 0) for split in SPLIT_COLOURS)) for name in names]
         sections.append(Section("Samples by class", header=("class", *SPLIT_COLOURS), rows=rows))
-    runs = [(run.run_id, run.robot, run.recipe_id, _floor(run)) for run in card.runs]
-    sections.append(Section("Runs", header=("run", "robot", "recipe", "noise floor of E"), rows=runs, figures_from=3))
+    runs = [
+        (
+            Link(run.run_id, hrefs[run.run_id]) if run.run_id in hrefs else run.run_id,
+            run.robot,
+            ", ".join(run.logs),
+            f"{run.samples}",
+            _floor(run),
+        )
+        for run in card.runs
+    ]
+    text = "Each leads to the run's own page, once 'tcpipe report STORE' has written it." if hrefs else ""
+    header = ("run", "robot", "log", "samples", "noise floor of E")
+    sections.append(Section("Runs", text, header=header, rows=runs, figures_from=3))
     return sections
+
+
+def _provenance(card: DatasetCard) -> Section:
+    """Return what the dataset is made from: enough to make it again."""
+    rows = [
+        ("made by", f"tcpipe {card.tcpipe_version}, data model {card.data_model_version}, {card.format} format"),
+        ("inputs", card.inputs),
+        ("recipe of ingest", ", ".join(sorted({run.recipe_id for run in card.runs}))),
+        (
+            "split",
+            f"held out by {card.split.holdout}, test fraction {card.split.test_fraction:g}, seed {card.split.seed}",
+        ),
+        ("patches", f"{card.patch_m:g} m, {card.patch_px} px: {', '.join(card.layers)}"),
+        *(
+            (
+                f"map {grid.name}",
+                f"{grid.cols} × {grid.rows} px of {1000 * grid.pitch_m:.0f} mm, {grid.crs}, sha256 {grid.sha256 or 'unknown'}",
+            )
+            for grid in card.maps
+        ),
+        *((f"log of {run.run_id}", f"sha256 {run.sha256}") for run in card.runs),
+        ("licence", card.licence or "none given"),
+        ("creator", card.creator or "none given"),
+    ]
+    text = "The same inputs make the same dataset; its recipe and every file's checksum stand in dataset.json."
+    return Section("Provenance", text, header=("what", "is"), rows=rows, folded=True)
 
 
 def _floor(run: RunSource) -> str:

@@ -10,14 +10,12 @@ from typing import Any, TypeVar
 import matplotlib as mpl
 import numpy as np
 from matplotlib.backends.backend_svg import FigureCanvasSVG
-from matplotlib.colors import Colormap, ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, INK, KEPT
+from tcpipe.report.colours import DROPPED, FAINT, INK, KEPT
 
 Array = NDArray[np.float64]
-Stored = NDArray[np.uint8] | NDArray[np.uint16] | NDArray[np.float32]
 S = TypeVar("S", bound=np.generic)
 
 _MAX_POINTS = 4000
@@ -141,7 +139,7 @@ def ledger_bars(ledger_m: Mapping[str, float]) -> str:
     return out[0]
 
 
-def histograms(values: Mapping[str, Array], *, of_what: str = "segments") -> str:
+def histograms(values: Mapping[str, Array]) -> str:
     """Draw one histogram a label."""
     with figure_svg(8.2, 2.1) as (figure, out):
         for axes, (label, data) in zip(np.atleast_1d(figure.subplots(1, len(values))), values.items(), strict=True):
@@ -149,53 +147,5 @@ def histograms(values: Mapping[str, Array], *, of_what: str = "segments") -> str
             if len(finite):
                 axes.hist(finite, bins=min(40, max(5, int(np.sqrt(len(finite))))), color="#2a6fb0")
             axes.set_xlabel(label)
-        figure.axes[0].set_ylabel(of_what)
+        figure.axes[0].set_ylabel("segments")
     return out[0]
-
-
-def against_slope(
-    slope_rad: Array, series: Mapping[str, Array], class_ids: NDArray[np.int64], class_names: Mapping[int, str]
-) -> str:
-    """Draw each series against the slope, coloured by terrain class as in the patches; id 0 is unknown."""
-    with figure_svg(8.2, 2.9) as (figure, out):
-        panels = np.atleast_1d(figure.subplots(1, len(series)))
-        for axes, (label, data) in zip(panels, series.items(), strict=True):
-            for number in np.unique(class_ids).tolist():
-                mask = class_ids == number
-                name, colour = class_names.get(number, "unknown"), CLASS_COLOURS[(number - 1) % len(CLASS_COLOURS)]
-                x, y = _thin(np.degrees(slope_rad[mask])), _thin(data[mask])
-                axes.plot(x, y, ".", ms=3, alpha=0.7, color=colour, label=name)
-            axes.set_xlabel("slope along travel [deg]")
-            axes.set_ylabel(label)
-        panels[-1].legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    return out[0]
-
-
-def patch_gallery(layers: Mapping[str, Stored], titles: Sequence[str]) -> str:
-    """Draw patches: one column a sample, one row a layer (N, S, S); travel is to the right.
-
-    Orthophotos share one contrast, classes one colour each; a height patch spans its own relief.
-    """
-    with figure_svg(8.2, 1.05 * len(layers) + 0.5) as (figure, out):
-        panels = figure.subplots(len(layers), len(titles), squeeze=False)
-        for row, (name, stack) in zip(panels, layers.items(), strict=True):
-            look = _layer_look(name, stack)
-            for axes, pixels in zip(row, stack, strict=True):
-                axes.imshow(pixels, interpolation="nearest", **look)
-                axes.set_xticks([])
-                axes.set_yticks([])
-                axes.spines[:].set_visible(False)
-            row[0].set_ylabel(name)
-        for axes, title in zip(panels[0], titles, strict=True):
-            axes.set_title(title, fontsize=6.5)
-    return out[0]
-
-
-def _layer_look(name: str, stack: Stored) -> dict[str, str | float | Colormap]:
-    if name.startswith("ortho"):
-        low, high = np.percentile(stack, (1, 99))
-        return {"cmap": "gray", "vmin": low, "vmax": max(high, low + 1)}
-    if name == "terrain":
-        colours = ("#ffffff", *CLASS_COLOURS)
-        return {"cmap": ListedColormap(colours), "vmin": -0.5, "vmax": len(colours) - 0.5}
-    return {"cmap": "cividis"}

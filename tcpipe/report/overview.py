@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from pyproj import Transformer
 from tcpipe.formats.atomic import atomic_file
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.seals import picture_text, seal_of
-from tcpipe.report.colours import CLASS_COLOURS
-from tcpipe.terrain.layers import Pixels
+from tcpipe.report.pictures import class_picture
+from tcpipe.terrain.layers import COLOURS, Pixels
 
 _SIDE_PX = 900
 _TINT = 0.35
@@ -44,25 +44,50 @@ def joint_bounds_m(places: Sequence[tuple[str, Bounds]]) -> Bounds:
     return float(low[0]), float(low[1]), float(high[2]), float(high[3])
 
 
-def maps_overview(sources: Sequence[MapFile]) -> NDArray[np.uint8]:
-    """Return one picture of all maps over their joint bounds, grey as `map_overview`; the first rules where they overlap."""
+def ortho_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return the orthophoto in colour, shape (R, C, 3), where the map has it so; else the `map_overview`."""
+    level, step = _level(source)
+    if not set(COLOURS) <= set(level.layers):
+        return map_overview(source)
+    return np.stack([_thinned(level, layer, step) for layer in COLOURS], axis=-1).astype(np.uint8)
+
+
+def relief_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return a shaded relief, shape (R, C)."""
+    level, step = _level(source)
+    return _shaded(_thinned(level, "height", step), step * level.grid.pitch_m)
+
+
+def class_overview(source: MapFile) -> NDArray[np.uint8]:
+    """Return the terrain classes in their colours, shape (R, C, 3); white without a terrain layer."""
+    level, step = _level(source)
+    if "terrain" not in level.layers:
+        return np.full((*relief_overview(source).shape, 3), 255, np.uint8)
+    return class_picture(_thinned(level, "terrain", step).astype(np.int64))
+
+
+def maps_overview(
+    sources: Sequence[MapFile], look: Callable[[MapFile], NDArray[np.uint8]] = ortho_overview
+) -> NDArray[np.uint8]:
+    """Return one picture of all maps over their joint bounds, each by ``look``; the first rules where they overlap."""
     if len(sources) == 1:
-        return map_overview(sources[0])
+        return look(sources[0])
     crs = sources[0].grid.crs
     x_min_m, y_min_m, x_max_m, y_max_m = joint_bounds_m([(each.grid.crs, each.grid.bounds_m) for each in sources])
     step_m = max(x_max_m - x_min_m, y_max_m - y_min_m) / _SIDE_PX
     x_m, y_m = np.meshgrid(
         np.arange(x_min_m + step_m / 2, x_max_m, step_m), np.arange(y_max_m - step_m / 2, y_min_m, -step_m)
     )
-    whole = np.full(x_m.shape, 255, np.uint8)
+    whole = np.full((*x_m.shape, 3), 255, np.uint8)
     for each in reversed(sources):
-        picture, (left, bottom, right, top) = map_overview(each), each.grid.bounds_m
+        picture, (left, bottom, right, top) = look(each), each.grid.bounds_m
         to_map = Transformer.from_crs(crs, each.grid.crs, always_xy=True)
         x, y = (x_m, y_m) if each.grid.crs == crs else to_map.transform(x_m, y_m)
         col = np.floor((x - left) / (right - left) * picture.shape[1]).astype(np.int64)
         row = np.floor((top - y) / (top - bottom) * picture.shape[0]).astype(np.int64)
         inside = (col >= 0) & (col < picture.shape[1]) & (row >= 0) & (row < picture.shape[0])
-        whole[inside] = picture[row[inside], col[inside]]
+        pixels = picture[row[inside], col[inside]]
+        whole[inside] = pixels if picture.ndim == 3 else pixels[:, None]
     return whole
 
 
@@ -75,9 +100,7 @@ def quick_look(source: MapFile) -> NDArray[np.uint8]:
         pixels = _thinned(level, layer, step)
         missing |= ~level.layers[layer].has_data(pixels)
         if layer == "terrain":
-            index = (pixels.astype(np.int64) - 1) % len(CLASS_COLOURS)
-            tints = np.array([[int(colour[n : n + 2], 16) for n in (1, 3, 5)] for colour in CLASS_COLOURS])
-            picture = ((1.0 - _TINT) * picture + _TINT * tints[index]).astype(np.uint8)
+            picture = ((1.0 - _TINT) * picture + _TINT * class_picture(pixels.astype(np.int64))).astype(np.uint8)
     return np.where(missing[..., None], np.uint8(255), picture)
 
 
@@ -131,9 +154,3 @@ def write_quick_look(picture: Path, look: NDArray[np.uint8], seal: str) -> None:
 def shows_map(picture: Path, map_path: Path) -> bool:
     """Return whether a picture is the quick look of the map at ``map_path``; `StoreError` if that cannot be read."""
     return picture_text(picture, _SHOWS) == seal_of(map_path)
-
-
-def read_overview(path: Path) -> NDArray[np.uint8]:
-    """Read what `write_overview` wrote, shape (R, C)."""
-    grey: NDArray[np.uint8] = (matplotlib.image.imread(path)[..., 0] * 255).astype(np.uint8)
-    return grey

@@ -52,8 +52,6 @@ _EDGE_STEP_DEG = 1e-4
 _DECIMALS = 8
 """Of a degree: a millimetre."""
 
-DRIVE_NEXT = "drive-next.geojson"
-
 _USED = tuple(name for name in SPLITS if name != "buffer")
 
 Floats = NDArray[np.float64]

@@ -20,8 +20,11 @@ from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding, Shard
 from tcpipe.formats.dataset_files import (
     CARD,
+    CLASSES,
     CROISSANT,
+    DRIVE_NEXT,
     OVERVIEW,
+    RELIEF,
     REPORT,
     SAMPLES,
     SHARDS,
@@ -35,6 +38,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import digest, write_json
+from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.place import DirectoryPlace, Place
@@ -46,7 +50,7 @@ from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
-from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, DRIVE_NEXT, measure_balance
+from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.card import (
     CARD_COLUMNS,
     VELOCITY_COLUMN,
@@ -62,7 +66,7 @@ from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.pipeline.dataset.splitting import empty_splits
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
-from tcpipe.report.overview import maps_overview, write_overview
+from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.regions import Regions
@@ -229,6 +233,7 @@ def build_dataset(
                 pixels=pixels,
                 jobs=jobs,
                 cluster=cluster,
+                beside=place.absolute().parent if isinstance(place, Path) else None,
             )
         result = _result(place, "done", known, problems)
     if not dry_run:
@@ -370,6 +375,7 @@ def _build(
     pixels: Place,
     jobs: int,
     cluster: str | None,
+    beside: Path | None,
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
     waiting = directory / _SPOOL
@@ -381,7 +387,7 @@ def _build(
             write(piece)
     shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
     shutil.rmtree(waiting)
-    write_overview(directory / OVERVIEW, maps_overview(content.sources))
+    _write_overviews(directory, content.sources)
     balance, drive_next = measure_balance(
         read_samples(directory, BALANCE_COLUMNS),
         content.samples.centres_xy_m(),
@@ -408,8 +414,18 @@ def _build(
         checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},
     )
     write_sealed(directory / CARD, card)
-    write_text(directory / REPORT, sealed_page(dataset_report(directory)))
+    write_text(directory / REPORT, sealed_page(dataset_report(directory, beside)))
     return card
+
+
+def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
+    """Write what the page shows of the maps: photograph (or relief), relief and classes, as far as there are any."""
+    write_overview(directory / OVERVIEW, maps_overview(sources))
+    layers = {layer for source in sources for layer in source.layers}
+    if "ortho" in layers:
+        write_overview(directory / RELIEF, maps_overview(sources, relief_overview))
+    if "terrain" in layers:
+        write_overview(directory / CLASSES, maps_overview(sources, class_overview))
 
 
 def _write_patches(

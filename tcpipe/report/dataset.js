@@ -1,0 +1,222 @@
+"use strict";
+// The dataset's page: samples on the map and in the plot, one of them in words with its patch, and the gallery.
+page.ready.then(async () => {
+  const told = page.data;
+  const at = (id) => document.getElementById(id);
+  const make = (tag, text = "", more = {}) => Object.assign(document.createElement(tag), { textContent: text }, more);
+
+  async function unpack({ columns, data }) {
+    const raw = Uint8Array.from(atob(data), (c) => c.charCodeAt(0));
+    const buffer = await new Response(new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+    const whole = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array };
+    return Object.fromEntries(columns.map(({ name, kind, at: first, bytes, low, step }) => {
+      const part = buffer.slice(first, first + bytes);
+      if (kind in whole) return [name, new whole[kind](part)];
+      const halves = new Uint16Array(part);
+      if (kind === "steps") return [name, Float64Array.from(halves, (n) => low + step * n)];
+      const count = kind === "half" ? halves.length : halves.length / 2;
+      const bits = new Uint32Array(count);
+      for (let i = 0; i < count; i++) bits[i] = ((halves[i] << 16) | (kind === "half" ? 0 : halves[count + i])) >>> 0;
+      return [name, new Float32Array(bits.buffer)];
+    }));
+  }
+
+  const below = [at("chosen"), at("stepping")];
+  at("chosen").closest("section").append(...below);
+
+  const c = await unpack(told.samples.packed);
+  const n = c.x.length;
+  const source = page.model("samples").data_source;
+  const kinds = {
+    split: ["split"], class: ["terrain class"], quality: ["quality"], run: ["run"],
+    power: ["power w", "W", 0], velocity: ["velocity v", "m/s", 2], duration: ["time T", "s", 2], energy: ["energy E", "J", 0],
+    slope: ["slope along travel", "°", 1], turn: ["turn", "°", 1], residual: ["w beyond physics", "W", 0],
+    apart: ["way to the nearest train metre", "m", 2],
+  };
+  const label = (name) => kinds[name][0] + (kinds[name][1] ? ` [${kinds[name][1]}]` : "");
+  const classes = new Map(told.classes.map((one) => [one.id, one]));
+  const ramp = ["#00224e", "#2a3f6d", "#575d6d", "#7d7c78", "#a59c74", "#d2c060", "#fee838"];
+  const shades = Array.from({ length: 64 }, (_, i) => {
+    const place = (i / 63) * (ramp.length - 1), low = Math.min(Math.floor(place), ramp.length - 2), share = place - low;
+    const part = (k) => Math.round(parseInt(ramp[low].slice(k, k + 2), 16) * (1 - share) + parseInt(ramp[low + 1].slice(k, k + 2), 16) * share);
+    return `rgb(${part(1)},${part(3)},${part(5)})`;
+  });
+  const digits = (value, name) => Number.isFinite(value) ? `${value.toFixed(kinds[name][2])} ${kinds[name][1]}` : "none";
+
+  function coloured(name) {
+    const legend = [];
+    let fill;
+    if (name === "split") {
+      fill = Array.from(c.split, (s) => told.splits[s].colour);
+      told.splits.forEach((s) => s.count && legend.push([`${s.name} (${s.count})`, s.colour]));
+    } else if (name === "class") {
+      const colour = (id) => classes.get(id)?.colour ?? told.unknown;
+      fill = Array.from(c.class, colour);
+      [...new Set(c.class)].sort((a, b) => a - b).forEach((id) => legend.push([classes.get(id)?.name ?? "unknown", colour(id)]));
+    } else if (name === "quality") {
+      fill = Array.from(c.quality, (q) => (q ? told.flagged : told.clean));
+      legend.push(["clean", told.clean], ["carries a flag", told.flagged]);
+    } else if (name === "run") {
+      fill = Array.from(c.run, (r) => told.colours[r % told.colours.length]);
+      told.runs.slice(0, 12).forEach((r, i) => legend.push([r.id, told.colours[i % told.colours.length]]));
+    } else {
+      const known = Float32Array.from(c[name]).filter(Number.isFinite).sort();
+      const low = known[Math.floor(0.02 * (known.length - 1))], high = known[Math.ceil(0.98 * (known.length - 1))];
+      fill = Array.from(c[name], (v) => Number.isFinite(v)
+        ? shades[Math.max(0, Math.min(63, Math.floor(63 * (v - low) / ((high - low) || 1))))] : told.unknown);
+      legend.push([low, high]);
+    }
+    const scale = at("scale");
+    scale.replaceChildren();
+    scale.className = "controls legend";
+    if (typeof legend[0]?.[0] === "number") {
+      const bar = make("span", "", { className: "ramp" });
+      bar.style.background = `linear-gradient(to right, ${ramp.join()})`;
+      scale.append(make("span", `${label(name)}: ${digits(legend[0][0], name)}`), bar, make("span", `${digits(legend[0][1], name)} (98 of 100 lie between)`));
+    } else {
+      for (const [text, colour] of legend) {
+        const dot = make("i");
+        dot.style.background = colour;
+        const entry = make("span");
+        entry.append(dot, text);
+        scale.append(entry);
+      }
+    }
+    return fill;
+  }
+
+  function fillSelect(select, names, text = (name) => name) {
+    select.append(...names.map((name) => make("option", text(name), { value: name })));
+  }
+  const there = (names) => names.filter((name) => name in c && (name !== "apart" || c.apart.some(Number.isFinite)));
+  fillSelect(at("colour"), there(Object.keys(kinds)), (name) => kinds[name][0]);
+  fillSelect(at("across"), there(["slope", "velocity", "turn", "residual"]), (name) => kinds[name][0]);
+  fillSelect(at("up"), there(["power", "energy", "velocity"]), (name) => kinds[name][0]);
+  const layers = told.ground.map((name) => page.model(`layer ${name}`));
+  fillSelect(at("ground"), [...told.ground, "none"]);
+  at("ground").onchange = () => layers.forEach((layer, i) => { layer.visible = told.ground[i] === at("ground").value; });
+  for (const [id, name] of [["next", "drive next"], ["leaks", "leaks"]]) {
+    const drawn = page.model(name);
+    at(id).onchange = () => { drawn.visible = at(id).checked; };
+    at(id).disabled = drawn === null || (told.empty ?? []).includes(name);
+  }
+  const brush = page.model("brush");
+  const plotted = () => ({ across: Float64Array.from(c[at("across").value]), up: Float64Array.from(c[at("up").value]) });
+  const replot = () => {
+    source.data = { ...source.data, ...plotted() };
+    brush.below[0].axis_label = label(at("across").value);
+    brush.left[0].axis_label = label(at("up").value);
+  };
+  source.data = { x: c.x, y: c.y, fill: coloured("split"), ...plotted() };
+  at("colour").onchange = () => { source.data = { ...source.data, fill: coloured(at("colour").value) }; };
+  at("across").onchange = at("up").onchange = replot;
+
+  // One sample in words.
+  const sheets = told.patches;
+  const cell = new Map((sheets?.rows ?? []).map((row, i) => [row, i]));
+  function patch(layer, i, side) {
+    const shown = make("span", "", { className: "patch", role: "img", ariaLabel: `${layer.name} patch` });
+    const scale = side / sheets.px;
+    shown.style.cssText = `width:${side}px;height:${side}px;background-image:url(${layer.uri});background-size:${sheets.across * side}px auto;`
+      + `background-position:${-(i % sheets.across) * sheets.px * scale}px ${-Math.floor(i / sheets.across) * sheets.px * scale}px`;
+    return shown;
+  }
+  const start = (i) => BigInt(told.runs[c.run[i]].first_ns) + BigInt(c.after_s[i]) * 1000000000n + BigInt(c.after_ns[i]);
+  const idOf = (i) => told.samples.ids ? told.samples.ids[i] : `${told.runs[c.run[i]].id}-${start(i)}`;
+  function pairs(rows) {
+    const list = make("dl");
+    for (const [name, value] of rows) {
+      const shown = make("dd");
+      shown.append(value);
+      list.append(make("dt", name), shown);
+    }
+    return list;
+  }
+  function inWords(i) {
+    const flags = told.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words);
+    const rows = ["power", "velocity", "duration", "energy"].map((name) => {
+      const std = c[`${name}_std`]?.[i];
+      return [kinds[name][0], Number.isFinite(std) ? `${c[name][i].toFixed(kinds[name][2] + 1)} ± ${std.toPrecision(2)} ${kinds[name][1]}` : digits(c[name][i], name)];
+    });
+    rows.push(["slope", digits(c.slope[i], "slope")], ["turn", digits(c.turn[i], "turn")]);
+    if (c.residual) rows.push(["beyond physics", digits(c.residual[i], "residual")]);
+    rows.push(["ground", classes.get(c.class[i])?.name ?? "unknown"], ["split", told.splits[c.split[i]].name]);
+    if (Number.isFinite(c.apart[i])) rows.push(["nearest train", digits(c.apart[i], "apart")]);
+    rows.push(["quality", flags.length ? flags.join("; ") : "clean"]);
+    if (told.samples.cell_m !== null) return [[`mean of ${c.count[i]} samples`, ""], ...rows];
+    const run = told.runs[c.run[i]];
+    rows.push(["run", run.href ? make("a", run.id, { href: run.href }) : run.id]);
+    rows.push(["time", `${new Date(Number(start(i) / 1000000n)).toISOString().replace("T", " ").replace("Z", "")} UTC`]);
+    rows.push(["where from", make("code", `tcpipe explain '${idOf(i).replaceAll("'", "'\\''")}' --dataset DIR`)]);
+    return rows;
+  }
+  function show(chosen) {
+    const box = at("chosen");
+    box.replaceChildren();
+    if (!chosen.length) {
+      box.append(make("p", "Click a point on the map, or draw a box in the plot: what it holds stands here."));
+      return;
+    }
+    const i = chosen[0];
+    at("row").value = i + 1;
+    const left = make("div"), right = make("div");
+    if (chosen.length > 1) {
+      const mean = (name) => { const known = chosen.map((k) => c[name][k]).filter(Number.isFinite); return known.reduce((a, b) => a + b, 0) / known.length; };
+      const by = told.splits.map((s, k) => [s.name, chosen.filter((j) => c.split[j] === k).length]).filter(([, count]) => count);
+      left.append(make("b", `${chosen.length} chosen`), pairs([
+        ...["power", "velocity", "energy", "slope"].map((name) => [`mean ${kinds[name][0]}`, digits(mean(name), name)]),
+        ["splits", by.map(([name, count]) => `${name} ${count}`).join(", ")],
+        ["flagged", `${chosen.filter((j) => c.quality[j]).length}`]]), make("p", "The first of them:"));
+    }
+    left.append(pairs(inWords(i)));
+    if (sheets && cell.has(i)) {
+      const room = make("div", "", { className: "patches" });
+      for (const layer of sheets.layers) {
+        const figure = make("figure");
+        figure.append(patch(layer, cell.get(i), 96), make("figcaption", layer.name));
+        room.append(figure);
+      }
+      right.append(room, make("p", "Travel is to the right; height is over the patch's own range.", { className: "note" }));
+    } else if (sheets) {
+      right.append(make("p", `The page carries ${sheets.rows.length} of ${told.count} patches, and this one is not among them.`, { className: "note" }));
+    }
+    box.append(left, right);
+  }
+  const choose = (rows) => { source.selected.indices = rows; };
+  source.selected.change.connect(() => show(source.selected.indices));
+  const step = (by) => { const i = ((source.selected.indices[0] ?? -by) + by + n) % n; if (n) choose([i]); };
+  at("before").onclick = () => step(-1);
+  at("after").onclick = () => step(1);
+  at("clear").onclick = () => choose([]);
+  at("row").max = n;
+  at("row").onchange = () => { const i = at("row").valueAsNumber - 1; if (i >= 0 && i < n) choose([i]); };
+  show([]);
+
+  // The gallery.
+  const gallery = at("gallery");
+  if (gallery && sheets) {
+    let most = 60;
+    const named = (id) => classes.get(id)?.name ?? "unknown";
+    fillSelect(at("gallery-class"), [...new Set(sheets.rows.map((i) => named(c.class[i])))].sort());
+    fillSelect(at("gallery-split"), told.splits.map((s) => s.name).filter((name) => sheets.rows.some((i) => told.splits[c.split[i]].name === name)));
+    fillSelect(at("gallery-layer"), sheets.layers.map((layer) => layer.name));
+    at("gallery-layer").value = (sheets.layers.find((layer) => layer.name === "ortho") ?? sheets.layers[0]).name;
+    const draw = () => {
+      const [kind, split] = [at("gallery-class").value, at("gallery-split").value];
+      const layer = sheets.layers.find((one) => one.name === at("gallery-layer").value);
+      const rows = sheets.rows.filter((i) => (!kind || named(c.class[i]) === kind) && (!split || told.splits[c.split[i]].name === split));
+      gallery.replaceChildren(...rows.slice(0, most).map((i) => {
+        const button = make("button", "", { type: "button" });
+        button.append(patch(layer, cell.get(i), 92), `${named(c.class[i])} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${told.splits[c.split[i]].name}`);
+        button.onclick = () => { choose([i]); at("chosen").scrollIntoView({ block: "nearest" }); };
+        return button;
+      }));
+      at("gallery-count").textContent = `${Math.min(rows.length, most)} of ${rows.length} patches`;
+      at("gallery-more").hidden = rows.length <= most;
+    };
+    for (const id of ["gallery-class", "gallery-split", "gallery-layer"]) at(id).onchange = draw;
+    at("gallery-more").onclick = () => { most += 120; draw(); };
+    draw();
+  }
+  document.documentElement.dataset.ready = "yes";
+});

@@ -1,0 +1,195 @@
+"""The samples inside a dataset's page: columns that can be clicked, or their means over small cells where there are too many."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+from pyproj import Transformer
+from scipy.spatial import cKDTree
+
+from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.json_files import Json
+from tcpipe.report.packed import Column, packed
+from tcpipe.splits.assignment import SPLITS
+from tcpipe.tables.bits import Quality
+
+MOST_SAMPLES = 100_000
+"""Samples that can each be clicked; more are means over cells."""
+
+_LABELS = {"power": "power_watt", "velocity": "velocity_mps", "duration": "duration_s", "energy": "energy_joule"}
+_STD = {
+    "power": "power_std_watt",
+    "velocity": "velocity_std_mps",
+    "duration": "duration_std_s",
+    "energy": "energy_std_joule",
+}
+COLUMNS = (
+    *("sample_id", "split", "run_id", "start_ns", "start_lon_deg", "start_lat_deg", "end_lon_deg", "end_lat_deg"),
+    *("terrain_class", "terrain_name", "slope_rad", "turn_rad", "physics_power_watt", "quality"),
+    *_LABELS.values(),
+    *_STD.values(),
+)
+"""Of samples.parquet that the page needs."""
+
+QUALITY_WORDS = {
+    Quality.LOW_POWER_RATE: "power was sampled too slowly",
+    Quality.NEAR_GAP: "a gap in the data is less than a chord away",
+    Quality.HIGH_SLIP: "wheels and ground differ by more than 20 %",
+    Quality.WEAK_GNSS: "position is uncertain",
+    Quality.CURVED: "the path bends",
+    Quality.MEAN_POWER_DIFFERS: "mean power and energy over time differ by more than 5 %",
+    Quality.NO_COMMAND: "no command topic: full speed is not proved",
+    Quality.VOLTAGE_OUT_OF_RANGE: "voltage leaves the robot's range",
+    Quality.CLOCK_DOUBTFUL: "a clock is doubtful",
+    Quality.PHYSICS_OUTLIER: "power is far from what physics predicts",
+    Quality.NOT_AT_LIMIT: "commanded below full speed",
+    Quality.SENSORS_DISAGREE: "sensors disagree",
+}
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class SamplesShown:
+    """What the page holds: a row a sample, or one a cell.
+
+    ``xy_m`` are middles in the first map's plane, (N, 2); ``leaks_m`` are pairs of a held-out middle and the nearest train
+    one that lie within a patch's diagonal, (L, 2, 2); ``row_of`` is where each sample of the table went, (T,).
+    """
+
+    xy_m: Floats
+    leaks_m: Floats
+    row_of: Ints
+    cell_m: float | None
+    json: Json
+
+
+def floats(table: pa.Table, name: str) -> Floats:
+    """Return a column as floats; null is NaN."""
+    values: Floats = table.column(name).to_numpy(zero_copy_only=False).astype(float)
+    return values
+
+
+def middles_m(card: DatasetCard, table: pa.Table) -> Floats:
+    """Return the middle of every sample's chord in the first map's plane [m], shape (N, 2)."""
+    to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
+    lon, lat = (0.5 * (floats(table, f"start_{a}_deg") + floats(table, f"end_{a}_deg")) for a in ("lon", "lat"))
+    return np.column_stack(to_map.transform(lon, lat)).reshape(-1, 2)
+
+
+def nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints]:
+    """Return how far the nearest middle of a train sample lies from every held-out one [m], NaN elsewhere, and its row, shape (N,)."""
+    apart, nearest = np.full(len(xy_m), np.nan), np.zeros(len(xy_m), np.int64)
+    held, train = np.flatnonzero(np.isin(split, ("test", "unseen"))), np.flatnonzero(split == "train")
+    if len(held) and len(train):
+        apart[held], found = cKDTree(xy_m[train]).query(xy_m[held])
+        nearest[held] = train[found]
+    return apart, nearest
+
+
+def samples_shown(card: DatasetCard, table: pa.Table) -> SamplesShown:
+    """Return what the page holds of the samples."""
+    xy_m = middles_m(card, table)
+    split = table.column("split").to_numpy(zero_copy_only=False).astype(np.str_)
+    apart_m, nearest = nearest_train_m(xy_m, split)
+    values = _values(card, table, apart_m) | {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
+    near = np.flatnonzero(apart_m < np.sqrt(2.0) * card.patch_m)[:MOST_SAMPLES]
+    leaks_m = np.stack([xy_m[near], xy_m[nearest[near]]], axis=1).reshape(-1, 2, 2)
+    cell_m, row_of = None, np.arange(table.num_rows)
+    keys = {"split": _split_numbers(split), "class": np.nan_to_num(floats(table, "terrain_class")).astype(np.int64)}
+    keys |= {"quality": table.column("quality").to_numpy().astype(np.int64), "run": _run_numbers(card, table)}
+    if table.num_rows > MOST_SAMPLES:
+        values, keys, row_of, cell_m = _in_cells(values, keys)
+        xy_m = np.column_stack([values["x"], values["y"]])
+    columns: dict[str, Column] = {"x": ("steps", values["x"]), "y": ("steps", values["y"])}
+    columns |= {name: ("f32", values[name]) for name in _LABELS}
+    columns |= {name: ("half", part) for name, part in values.items() if name not in {*columns, "count"}}
+    columns |= {"split": ("u8", keys["split"]), "class": ("u8", keys["class"]), "quality": ("u16", keys["quality"])}
+    columns |= {"run": ("u16", keys["run"]), "count": ("u32", values["count"])}
+    if cell_m is None:
+        columns |= _starts(card, table)
+    told: dict[str, Json] = {"packed": packed(columns), "cell_m": cell_m, "ids": _ids_if_odd(table)}
+    return SamplesShown(xy_m, leaks_m, row_of, cell_m, told)
+
+
+def _values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[str, Floats]:
+    found = {name: floats(table, column) for name, column in _LABELS.items()}
+    found |= {f"{name}_std": floats(table, column) for name, column in _STD.items()}
+    found["slope"] = np.degrees(floats(table, "slope_rad"))
+    found["turn"] = np.degrees(floats(table, "turn_rad"))
+    if card.physics:
+        found["residual"] = found["power"] - floats(table, "physics_power_watt")
+    return found | {"apart": apart_m}
+
+
+def _split_numbers(split: NDArray[np.str_]) -> Ints:
+    numbers = np.zeros(len(split), np.int64)
+    for number, name in enumerate(SPLITS):
+        numbers[split == name] = number
+    return numbers
+
+
+def _run_numbers(card: DatasetCard, table: pa.Table) -> Ints:
+    known = pa.array([run.run_id for run in card.runs], pa.string())
+    encoded = pc.index_in(table.column("run_id").combine_chunks(), value_set=known)
+    numbers: Ints = encoded.fill_null(0).to_numpy().astype(np.int64)
+    return numbers
+
+
+def first_starts_ns(card: DatasetCard, table: pa.Table) -> list[int]:
+    """Return when each run's first sample begins [ns]; 0 where it has none."""
+    runs, starts = _run_numbers(card, table), table.column("start_ns").to_numpy()
+    first = np.full(len(card.runs), np.iinfo(np.int64).max)
+    np.minimum.at(first, runs, starts)
+    return [int(stamp) if stamp != np.iinfo(np.int64).max else 0 for stamp in first]
+
+
+def _starts(card: DatasetCard, table: pa.Table) -> Mapping[str, Column]:
+    after = (
+        table.column("start_ns").to_numpy()
+        - np.array(first_starts_ns(card, table), np.int64)[_run_numbers(card, table)]
+    )
+    return {"after_s": ("u32", after // 10**9), "after_ns": ("u32", after % 10**9)}
+
+
+def _ids_if_odd(table: pa.Table) -> Sequence[str] | None:
+    """Return the ids where they are not the run's and the start's, which the page puts together itself; None for too many."""
+    if table.num_rows > MOST_SAMPLES:
+        return None
+    ids = table.column("sample_id").to_pylist()
+    made = zip(table.column("run_id").to_pylist(), table.column("start_ns").to_pylist(), strict=True)
+    return None if ids == [f"{run}-{start}" for run, start in made] else ids
+
+
+def _in_cells(
+    values: Mapping[str, Floats], keys: Mapping[str, Ints]
+) -> tuple[dict[str, Floats], dict[str, Ints], Ints, float]:
+    """Return means over square cells, one row for each split and class in a cell, each sample's row, and the cells' side [m]."""
+    x, y = values["x"] - values["x"].min(), values["y"] - values["y"].min()
+    cell_m = 1.0
+    while True:
+        place = (np.floor(x / cell_m) * 4e6 + np.floor(y / cell_m)).astype(np.int64)
+        _, group = np.unique((place * 4 + keys["split"]) * 256 + keys["class"], return_inverse=True)
+        if group.max(initial=0) < MOST_SAMPLES:
+            break
+        cell_m *= np.sqrt(2.0)
+    size = int(group.max(initial=-1)) + 1
+    count = np.bincount(group, minlength=size).astype(float)
+    means = {}
+    for name, part in values.items():
+        known = np.isfinite(part)
+        with np.errstate(invalid="ignore"):
+            means[name] = np.bincount(group[known], part[known], size) / np.bincount(group[known], minlength=size)
+    whole = {name: np.zeros(size, np.int64) for name in keys}
+    for name, numbers in keys.items():
+        if name == "quality":
+            np.bitwise_or.at(whole[name], group, numbers)
+        else:
+            whole[name][group] = numbers
+    return means | {"count": count}, whole, group.astype(np.int64), float(cell_m)
