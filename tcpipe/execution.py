@@ -12,8 +12,8 @@ import os
 import re
 import signal
 import threading
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from tcpipe import __version__
-from tcpipe.errors import UsageError
+from tcpipe.errors import TcpipeError, UsageError
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -179,7 +179,9 @@ class _Saying(logging.Handler):
 
 
 _ANSWER_S = 10
-"""So long a scheduler has to answer, and to have a worker."""
+"""So long a scheduler has to answer."""
+_ALONE_S = 300
+"""So long it may be without a worker."""
 _ADDRESS = re.compile(r"(tcp|tls)://[^/]+:\d+")
 _AHEAD = 2
 """Tasks that a worker is handed at once: the next waits beside it."""
@@ -187,7 +189,7 @@ _AHEAD = 2
 
 def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str) -> Generator[Outcome[R]]:
     """Run the tasks on a cluster's workers; one that is killed has its task run again on another, three times."""
-    from distributed import KilledWorker, as_completed  # noqa: PLC0415  most calls stay on this machine
+    from distributed import KilledWorker  # noqa: PLC0415  most calls stay on this machine
 
     with _client(address) as client:
         level, todo = logger.getEffectiveLevel(), iter(range(len(tasks)))
@@ -199,30 +201,45 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
             }
 
         running = submit(_AHEAD * _workers(client, address))
-        ended = as_completed(running, loop=client.loop)
-        for future in ended:
-            index = running.pop(future)
-            try:
-                said, result = future.result()
-            except KilledWorker:
-                yield Outcome(index, None, died=True)
-            except ModuleNotFoundError as error:
-                raise UsageError(
-                    f"{address}: a worker lacks {error.name}; install there what is installed here"
-                ) from None
-            except RuntimeError as error:
-                if "deserialization" not in str(error):
-                    raise
-                raise UsageError(
-                    f"{address}: the scheduler lacks tcpipe; install there what is installed here"
-                ) from None
-            else:
-                for record in said:
-                    logger.log(*record)
-                yield Outcome(index, result)
-            new = submit(1)
-            running |= new
-            ended.update(new)
+        while running:
+            for future in _ended(client, running, address):
+                index = running.pop(future)
+                try:
+                    said, result = future.result()
+                except KilledWorker:
+                    yield Outcome(index, None, died=True)
+                except ModuleNotFoundError as error:
+                    raise UsageError(
+                        f"{address}: a worker lacks {error.name}; install there what is installed here"
+                    ) from None
+                except RuntimeError as error:
+                    if "deserialization" not in str(error):
+                        raise
+                    raise UsageError(
+                        f"{address}: the scheduler lacks tcpipe; install there what is installed here"
+                    ) from None
+                else:
+                    for record in said:
+                        logger.log(*record)
+                    yield Outcome(index, result)
+                running |= submit(1)
+
+
+def _ended(client: Client, running: Iterable[Any], address: str) -> Sequence[Any]:
+    """Return the tasks that have ended, when the first has; `TcpipeError` where the scheduler goes, or workers stay away."""
+    from distributed import wait as wait_for  # noqa: PLC0415  as above
+
+    said, alone_s = False, 0.0
+    while alone_s < _ALONE_S:
+        try:
+            with client.as_current():
+                return list(wait_for(list(running), timeout=_ANSWER_S, return_when=FIRST_COMPLETED).done)
+        except TimeoutError:
+            alone_s = 0.0 if client.nthreads() else alone_s + _ANSWER_S
+        if alone_s and not said:
+            logger.warning("%s: has no workers any more; waiting for one", address)
+            said = True
+    raise TcpipeError(f"{address}: has had no workers for {_ALONE_S} s; start some, and run the same command again")
 
 
 @contextmanager
@@ -233,19 +250,40 @@ def _client(address: str) -> Iterator[Client]:
         raise UsageError("dask not installed, wanted for --cluster: pip install 'tcpipe[cluster]'") from None
     if not _ADDRESS.fullmatch(address):
         raise UsageError(f"{address!r}: no address of a Dask scheduler; wanted tcp://host:port or tls://host:port")
+    with _silent("distributed", "distributed.client"):
+        try:
+            client = Client(address, timeout=_ANSWER_S, set_as_default=False)
+        except (OSError, ValueError) as error:
+            reason = str(error).partition("\n")[0] or type(error).__name__
+            raise UsageError(f"{address}: no Dask scheduler answers ({reason}); start one: dask scheduler") from None
+        try:
+            with client:
+                yield client
+        except (OSError, CancelledError):
+            raise TcpipeError(f"{address}: the scheduler is gone; start it, and run the same command again") from None
+
+
+@contextmanager
+def _silent(*names: str) -> Iterator[None]:
+    """Silence loggers, which tell a lost connection by a traceback."""
+    levels = {name: logging.getLogger(name).level for name in names}
     try:
-        client = Client(address, timeout=_ANSWER_S, set_as_default=False)
-    except (OSError, ValueError) as error:
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise UsageError(f"{address}: no Dask scheduler answers ({reason}); start one: dask scheduler") from None
-    with client:
-        yield client
+        for name in names:
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+        yield
+    finally:
+        for name, level in levels.items():
+            logging.getLogger(name).setLevel(level)
 
 
 def _workers(client: Client, address: str) -> int:
     """Return the number of workers; `UsageError` where there is none, or one runs tasks as threads of one process."""
     try:
-        client.wait_for_workers(1, timeout=_ANSWER_S)
+        with suppress(TimeoutError):
+            client.wait_for_workers(1, timeout=_ANSWER_S)
+        if not client.nthreads():  # a cluster may be starting
+            logger.warning("%s: has no workers yet; waiting for one", address)
+        client.wait_for_workers(1, timeout=_ALONE_S)
     except TimeoutError:
         raise UsageError(
             f"{address}: the scheduler has no workers; start some: dask worker {address} --nthreads 1"

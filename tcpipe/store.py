@@ -12,6 +12,7 @@
       runs/<run_id>/streams/<digest>/<role>.parquet
       runs/<run_id>/<recipe_id>/manifest-<n>.json   what became of it; files and checksums of the tables
       runs/<run_id>/<recipe_id>/<digest>/           track.parquet, segments.parquet, rejections.parquet
+      spool/                                        pixels on their way into a dataset, while a cluster builds it
       index/                                        runs.parquet, logs.parquet: what the documents say, made again at will
 
 Of numbered documents the highest holds. A ``<digest>`` names the content of what lies in it.
@@ -92,6 +93,9 @@ logger = logging.getLogger("tcpipe")
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _STREAMS = "streams"
 
+SPOOL = "spool"
+"""Where segments and pixels of a dataset wait until it is written, in its directory or, for a cluster, in the store; it goes in the end."""
+
 _BUCKETS = ("s3://", "gs://", "az://")
 
 _NAME_HEX = 8
@@ -171,7 +175,8 @@ class Store:
         told = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", below(prefix, checksums)
         data = to_json(sealed(MapDocument(*told))).encode()
         same = free and after > 0 and maps.read(name_of(name, after)) == data
-        if not same and not (free and maps.put_new(name_of(name, after + 1), data)):
+        new = name_of(name, after + 1)
+        if not same and not (free and maps.put_new(new, data)) and maps.read(new) != data:
             raise StoreError(f"map {name}: another process has written it meanwhile, and it stays; look at it first")
 
     def runs(self) -> list[RunDirectory]:
@@ -508,7 +513,7 @@ def is_named_after(run_id: str, sha256: str) -> bool:
 def is_store(path: Path | str) -> bool:
     """Tell whether a place is a store; `UsageError` if it is one of an earlier layout."""
     place = open_place(path)
-    if place.size(MARK) is not None:
+    if place.read(MARK) is not None:  # not its size: only what is asked for with a body is refused with a reason
         return True
     if is_outdated(place):
         raise UsageError(

@@ -13,21 +13,29 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from distributed import Client
+
 from tcpipe.formats.json_files import read_json
+
+_LONGEST_S = 300.0
+"""A machine that others use takes its time to start a process."""
 
 
 @dataclass(slots=True)
 class DaskCluster:
-    """A scheduler's address and file, and its workers."""
+    """A scheduler's address, file and process, and its workers."""
 
     address: str
     file: Path
+    scheduler: subprocess.Popen[bytes]
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start_worker(self, *, threads: int = 1) -> None:
         """Start one more worker."""
         how = ("--nthreads", str(threads), "--no-dashboard", "--local-directory", str(self.file.parent))
         self.workers.append(_started("worker", "--scheduler-file", str(self.file), *how))
+        with Client(self.address, set_as_default=False) as client:
+            client.wait_for_workers(sum(worker.poll() is None for worker in self.workers), timeout=_LONGEST_S)
 
 
 def _started(*arguments: str) -> subprocess.Popen[bytes]:
@@ -44,12 +52,12 @@ def dask_cluster(directory: Path, *, workers: int = 2) -> Iterator[DaskCluster]:
         local = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
         scheduler = _started("scheduler", *local)
         stack.callback(_ended, scheduler)
-        end = time.monotonic() + 60
-        while not file.exists():
+        end = time.monotonic() + _LONGEST_S
+        while not file.exists() or not file.read_bytes().endswith(b"}"):
             assert scheduler.poll() is None
             assert time.monotonic() < end
             time.sleep(0.05)
-        cluster = DaskCluster(read_json(file)["address"], file)
+        cluster = DaskCluster(read_json(file)["address"], file, scheduler)
         stack.callback(lambda: [_ended(worker) for worker in cluster.workers])
         for _ in range(workers):
             cluster.start_worker()

@@ -1,6 +1,7 @@
 """An object store in a directory, over HTTP: as much of S3 as a place takes, without authentication."""
 
 import re
+import socket
 import threading
 import zlib
 from collections.abc import Iterator
@@ -11,8 +12,9 @@ from pathlib import Path
 from urllib.parse import parse_qs, unquote, urlsplit
 from xml.sax.saxutils import escape, unescape
 
-FORBIDDEN = "forbidden"
-"""The bucket that nobody may read."""
+FORBIDDEN, SKEWED = "forbidden", "skewed"
+"""The bucket that nobody may read, and one that says that the clock is wrong."""
+_DENIALS = {FORBIDDEN: "AccessDenied", SKEWED: "RequestTimeTooSkewed"}
 
 READ_ONLY = "read-only"
 OVERWRITING = "overwriting"
@@ -20,10 +22,14 @@ OVERWRITING = "overwriting"
 
 
 class Fetched(list[str]):
-    """The objects fetched so far, one a request, and their bytes; the next ``cuts`` answers with an object break off in the middle."""
+    """The objects fetched so far, one a request, and their bytes.
+
+    The next ``cuts`` answers with an object break off in the middle; the next ``lost`` objects are written, and nobody is told.
+    """
 
     sent_bytes = 0
     cuts = 0
+    lost = 0
 
 
 class _Server(ThreadingHTTPServer):
@@ -57,6 +63,11 @@ class _Handler(BaseHTTPRequestHandler):
                 new = path.with_name(f".{threading.get_ident()}")
                 new.write_bytes(data)
                 new.rename(path)
+        if self.server.fetched.lost:
+            self.server.fetched.lost -= 1
+            self.close_connection = True
+            self.connection.shutdown(socket.SHUT_RDWR)
+            return
         self._send(*((200, b"") if allowed else (412, b"<Error><Code>PreconditionFailed</Code></Error>")))
 
     def do_DELETE(self) -> None:
@@ -75,8 +86,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer(self, *, with_body: bool) -> None:
         parts = urlsplit(self.path)
         bucket, _, name = unquote(parts.path).lstrip("/").partition("/")
-        if bucket == FORBIDDEN:
-            self._send(403, b"<Error><Code>AccessDenied</Code></Error>")
+        if bucket in _DENIALS:
+            self._send(403, f"<Error><Code>{_DENIALS[bucket]}</Code></Error>".encode(), with_body=with_body)
         elif not name and with_body:
             self._list(self.server.root / bucket, parse_qs(parts.query))
         elif (self.server.root / bucket / name).is_file():

@@ -30,7 +30,7 @@ from tcpipe.cli.overlay import overlay
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
 from tcpipe.cli.preflight import preflight
-from tcpipe.cli.process import Ended, prepare_process
+from tcpipe.cli.process import Ended, ended_in_time, prepare_process
 from tcpipe.cli.prune import prune
 from tcpipe.cli.report import report
 from tcpipe.cli.reproduce import reproduce
@@ -99,6 +99,11 @@ for command in (
 def main() -> None:
     """Run the command line: errors become plain lines and exit codes, never a traceback (unless ``--debug``)."""
     prepare_process()
+    _run()
+
+
+@ended_in_time()
+def _run() -> NoReturn:
     try:
         _refuse_empty(sys.argv[1:])
         code = cli.main(prog_name="tcpipe", standalone_mode=False)

@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import os
+import select
 import signal
 import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+_LATEST_S = 4.0
+"""So long a process has to end in order: a library that waits for a network or computes lets no signal through to Python."""
 
 
 class Ended(BaseException):
@@ -28,6 +36,34 @@ def prepare_process() -> None:
         if signal.getsignal(number) is not signal.SIG_IGN:  # nohup
             signal.signal(number, _end)
     sys.unraisablehook = _raise_again
+
+
+@contextmanager
+def ended_in_time() -> Iterator[None]:
+    """Have a signal that asks this process to end do so, whatever library it is in; what it leaves then, the next call removes."""
+    heard, said = os.pipe()
+    os.set_blocking(said, False)
+    before = signal.set_wakeup_fd(said, warn_on_full_buffer=False)
+    threading.Thread(target=_watch, args=(heard,), daemon=True).start()
+    try:
+        yield
+    finally:
+        signal.set_wakeup_fd(before)
+        os.close(said)
+
+
+def _watch(heard: int) -> None:
+    """Wait for a signal, and then for the other end to be closed, but not too long."""
+    end, ending, left_s = 0.0, 0, None
+    while select.select([heard], [], [], left_s)[0]:
+        if not (told := os.read(heard, 1)):
+            os.close(heard)
+            return
+        if not ending and told[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            end, ending = time.monotonic() + _LATEST_S, told[0]
+        left_s = max(0.0, end - time.monotonic()) if ending else None
+    os.write(2, f"tcpipe: {Ended(ending)}; nothing is half-written; run the same command again\n".encode())
+    os._exit(128 + ending)
 
 
 def _end(number: int, _: object) -> None:

@@ -7,12 +7,14 @@ whether there is something to do in it, clears it first (`clear`). What a kill t
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import errno
 import fcntl
 import os
 import re
 import shutil
+import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
@@ -123,6 +125,28 @@ def working_directory(staging: Path) -> Iterator[Path]:
         yield directory
 
 
+@contextmanager
+def scratch_directory() -> Iterator[Path]:
+    """Yield an empty directory of this user in the system's own (``TMPDIR``); what killed processes left there goes first."""
+    parent, prefix = Path(tempfile.gettempdir()), f"tcpipe-{os.getuid()}-"
+    for left in parent.glob(f"{prefix}*"):
+        _claimed(left, lambda left=left: shutil.rmtree(left))  # type: ignore[misc]
+    directory, lock = _locked_directory(parent, prefix, mode=0o700)
+    try:
+        yield directory
+    finally:
+        shutil.rmtree(directory, ignore_errors=True)
+        os.close(lock)
+
+
+def lasting_scratch() -> Path:
+    """Return a `scratch_directory` that goes when this process ends."""
+    context = scratch_directory()
+    directory = context.__enter__()
+    atexit.register(context.__exit__, None, None, None)
+    return directory
+
+
 def put_directory(directory: Path, path: Path) -> None:
     """Put a directory, from a `working_directory` of the same file system, to its place by one rename; what is there goes."""
     with _told(path), _parents_of(path) as place:
@@ -221,11 +245,11 @@ def _holder_beside(place: Path) -> Iterator[Path]:
             os.close(lock)
 
 
-def _locked_directory(parent: Path, prefix: str) -> tuple[Path, int]:
+def _locked_directory(parent: Path, prefix: str, mode: int = 0o777) -> tuple[Path, int]:
     while True:
         holder = parent / f"{prefix}{uuid.uuid4().hex[:8]}"
         try:
-            holder.mkdir()
+            holder.mkdir(mode)
             with suppress(FileNotFoundError):  # another process took it for abandoned before it was locked
                 lock = os.open(holder, os.O_RDONLY)
                 with suppress(OSError):  # a file system without locks

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
@@ -14,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tcpipe.errors import StoreError
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.content_cache import cached
 from tcpipe.formats.object_storage import connected, is_url, told
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
@@ -137,7 +137,7 @@ class BucketPlace:
 
     def workshop(self) -> AbstractContextManager[Path]:
         """Return a context: a temporary directory of this machine."""
-        return _temporary_directory()
+        return scratch_directory()
 
     def put_files(self, prefix: str, directory: Path) -> None:
         """Upload the files of a directory, several at once."""
@@ -217,9 +217,3 @@ def _gone(where: str) -> Iterator[None]:
         yield
     except FileNotFoundError:
         raise StoreError(f"{where}: is gone") from None
-
-
-@contextmanager
-def _temporary_directory() -> Iterator[Path]:
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
-        yield Path(directory)

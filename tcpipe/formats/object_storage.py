@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import os
 import re
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
 from tcpipe.errors import LogError, TcpipeError
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.logs.log_part import no_room
 
 if TYPE_CHECKING:
@@ -40,6 +40,13 @@ _RETRIES: dict[str, Any] = {
 _DENIED = ("169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden")
 """What is said where credentials are not set (a cloud machine's own are asked for, in vain), or wrong."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
+_REFUSED = {
+    "RequestTimeTooSkewed": "this machine's clock is not the store's; set it",
+    "SignatureDoesNotMatch": "the secret key that is set is not that of the access key",
+    "InvalidAccessKeyId": "the store does not know the access key that is set",
+    "ExpiredToken": "the credentials that are set have expired",
+}
+"""Codes of denial that say more than that it is one."""
 _CREDENTIALS = {
     "s3": "AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_SKIP_SIGNATURE=true for what is public; AWS_REGION; AWS_ENDPOINT_URL",
     "gs": "GOOGLE_APPLICATION_CREDENTIALS, or GOOGLE_SKIP_SIGNATURE=true for what is public",
@@ -121,9 +128,9 @@ def laid_out(
     LogError
         There is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the path.
     """
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
-        laid = _laid_out(url, Path(directory), wanted)
-        place = _place_of(url, Path(directory))
+    with scratch_directory() as directory:
+        laid = _laid_out(url, directory, wanted)
+        place = _place_of(url, directory)
         try:
             for path, stored in laid.items():
                 if not path.name.lower().endswith(by_range):
@@ -189,10 +196,13 @@ def _reason(url: str, error: Exception, code: str | None, what: str) -> str:
     denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in reason for of in _DENIED)
     if code == "NoSuchBucket":
         return "there is no such bucket"
-    if denied and code == "AccessDenied" and what == "written":
+    if denied and code in _REFUSED:
+        return _REFUSED[code]
+    if denied and code == "AccessDenied" and (what == "written" or os.environ.get("AWS_ACCESS_KEY_ID")):
         return "the credentials that are set do not allow it"
     if denied and scheme in _CREDENTIALS:
-        return f"the store wants credentials; set {_CREDENTIALS[scheme]}"
+        clock = "" if code or "403" not in reason else "; a clock that is wrong is answered in the same way"
+        return f"the store wants credentials; set {_CREDENTIALS[scheme]}{clock}"
     return no_room(error) or reason
 
 

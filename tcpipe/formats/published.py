@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -20,6 +19,7 @@ from pathlib import Path
 import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.atomic import lasting_scratch, scratch_directory
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.content_cache import cached, is_cached
 from tcpipe.formats.json_files import parse_json, typed
@@ -114,8 +114,8 @@ def anew(url: str) -> Iterator[Path]:
         It cannot be read.
     """
     place = open_place(url)
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as held:
-        root = Path(held, *(part for part in url.split("/") if part not in ("", "..")))
+    with scratch_directory() as held:
+        root = held.joinpath(*(part for part in url.split("/") if part not in ("", "..")))
         root.mkdir(parents=True)
 
         def bring(name: str) -> None:
@@ -200,15 +200,15 @@ def _brought(
 
 
 @cache
-def _kept(url: str, card: bytes) -> tempfile.TemporaryDirectory[str]:
+def _kept(url: str, card: bytes) -> Path:
     """Return a directory for a card at a URL, which goes when the process ends."""
     del url, card
-    return tempfile.TemporaryDirectory(prefix="tcpipe-")
+    return lasting_scratch()
 
 
 def _directory_of(url: str, card: bytes) -> Path:
     """Return where a copy lies: so that lines about its files show where they are from."""
-    path = Path(_kept(url, card).name, *(part for part in url.split("/") if part not in ("", "..")))
+    path = _kept(url, card).joinpath(*(part for part in url.split("/") if part not in ("", "..")))
     path.mkdir(parents=True, exist_ok=True)
     return path
 
@@ -244,8 +244,8 @@ def published(url: str, card: str) -> Iterator[Path]:
     """
     place = open_place(url)
     refuse_others(place, card)
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as held:
-        directory = Path(held, url.rstrip("/").rpartition("/")[2])
+    with scratch_directory() as held:
+        directory = held / (url.rstrip("/").rpartition("/")[2])
         directory.mkdir()
         yield directory
         document = (directory / card).read_bytes()
@@ -255,14 +255,20 @@ def published(url: str, card: str) -> Iterator[Path]:
                 f"{url}: another one writes something else there since ({CLAIM}); wait for it, or give another place; "
                 "if it was killed, remove what lies there"
             )
-        if place.read(card) is not None:
-            place.delete(CLAIM)
-            raise StoreError(f"{url}: another one has written it meanwhile; what lies in a bucket is not replaced")
-        (directory / card).rename(Path(held, card))
-        place.put_files("", directory)
-        if not place.put_new(card, document) and place.read(card) != document:
-            raise StoreError(f"{url}: another one has written it meanwhile; what lies in a bucket is not replaced")
+        there = place.read(card)
+        if there is None:
+            (directory / card).rename(held / card)
+            place.put_files("", directory)
+            there = document if place.put_new(card, document) else place.read(card)
         place.delete(CLAIM)
+        if there != document:
+            raise StoreError(f"{url}: another one has written it meanwhile; what lies in a bucket is not replaced")
+
+
+def settle(url: str) -> None:
+    """Remove the claim of a killed call whose card is there."""
+    if open_place(url).size(CLAIM) is not None:
+        open_place(url).delete(CLAIM)
 
 
 def refuse_others(place: Place, card: str) -> None:
@@ -271,6 +277,7 @@ def refuse_others(place: Place, card: str) -> None:
     if names and not names & {card, CLAIM}:
         raise UsageError(f"{place.where()}: holds {min(names)} and no {card}; it is left alone; give another place")
     if card in names:
+        settle(place.where())
         raise UsageError(
             f"{place.where()}: is there already; what lies in a bucket is not replaced: give another place"
         )

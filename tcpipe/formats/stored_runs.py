@@ -14,7 +14,7 @@ from tcpipe.errors import StoreError
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.numbered import digest_of, read_as_at
 from tcpipe.formats.parquet import highest, lowest, read_table, write_table
-from tcpipe.formats.place import Entry, Place
+from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.run_documents import Manifest, ManifestHead
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
@@ -159,6 +159,9 @@ def local_file(place: Place, name: str, wanted: Checksum) -> Path:
     """Return a file on this machine, proved; `StoreError` if it is not as it was written."""
     path = place.local(name, wanted)
     wrong = wrong_checksum(place.where(name), file_checksum(path) if path.is_file() else None, wanted)
+    if wrong and not isinstance(place, DirectoryPlace):  # the copy in the cache; a new one is proved when it is made
+        path.unlink(missing_ok=True)
+        return place.local(name, wanted)
     if wrong:
         raise StoreError(f"{wrong}; 'tcpipe verify {place.where()}' tells what else is not as it was written")
     return path

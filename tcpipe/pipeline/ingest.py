@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
@@ -16,6 +15,7 @@ from typing import Literal, TypeVar
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
@@ -137,7 +137,7 @@ def ingest(
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
     with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store):
-        found = find_sources(logs, as_one=as_one, staging=Path(staging), tables=ruling.tables)
+        found = find_sources(logs, as_one=as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(store, create=True)
@@ -284,10 +284,10 @@ def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestR
         logger.error("%s", error)  # noqa: TRY400  one line
 
 
-def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[str]:
+def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[Path]:
     """Return a temporary directory, where a log is named by its URL."""
     remote = any(is_url(log) for log in logs)
-    return tempfile.TemporaryDirectory(prefix="tcpipe-") if remote else nullcontext("")
+    return scratch_directory() if remote else nullcontext(Path())
 
 
 def _as_path(value: str | Path | None) -> Path | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 from tcpipe.errors import StoreError, TcpipeError, UsageError
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.logs.joined import opened
 from tcpipe.formats.logs.log_file import logs_below
@@ -152,8 +152,8 @@ def _at_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> InspectedDat
         from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
 
         return _dataset(here_by_range(url, by_range=is_shard)[0], url)
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as directory:
-        urls = list(remote_logs(url, Path(directory) / "logs").values())
+    with scratch_directory() as directory:
+        urls = list(remote_logs(url, directory / "logs").values())
     return _logs_at(urls, url, ask)
 
 

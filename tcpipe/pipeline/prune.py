@@ -21,7 +21,7 @@ from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.calls import in_bytes
 from tcpipe.pipeline.verify_store import strangers_in
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store, open_store
+from tcpipe.store import SPOOL, Store, open_store
 
 _CONTENT = re.compile(r"(?:^|/)[0-9a-f]{16}/")
 """In the name of a file: a directory that is named after its content."""
@@ -108,9 +108,11 @@ def prune(
         removed.append(Leftover("left by a killed call", str(path), _size(DirectoryPlace(path))))
         if not dry_run:
             clear(path.parent)
-    for place, entries in _replaced(opened, min_age_s):
-        removed += [Leftover("no document names it", place.where(of.name), of.size_bytes) for of in entries]
-        for entry in entries if not dry_run else ():
+    for what, place, entries, why in (*_spooled(opened, min_age_s), *_replaced(opened, min_age_s)):
+        (removed if why is None else kept).extend(
+            Leftover(what, place.where(of.name), of.size_bytes, why) for of in entries
+        )
+        for entry in entries if why is None and not dry_run else ():
             place.delete(entry.name)
     if removed and not dry_run:
         opened.keep_index(opened.ingestions())
@@ -179,28 +181,46 @@ def _temporaries(store: Store, min_age_s: float) -> Iterator[Path]:
             yield path
 
 
-def _replaced(store: Store, min_age_s: float) -> Iterator[tuple[Place, list[Entry]]]:
+_Unnamed = tuple[str, Place, list[Entry], str | None]
+"""Files that no document names: what they are, where they lie, and why they stay, if they do."""
+
+
+def _spooled(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
+    """Yield what builds left that were killed while a cluster's workers sampled for them, if it is old enough."""
+    before_ns = time.time_ns() - int(min_age_s * 1e9)
+    for name in store.place.folders(SPOOL):
+        place = store.place.below(f"{SPOOL}/{name}")
+        entries = place.entries()
+        if all(entry.modified_ns < before_ns for entry in entries):
+            yield "left by a killed build", place, entries, None
+
+
+def _replaced(store: Store, min_age_s: float) -> Iterator[_Unnamed]:
     """Yield, by run and for the maps, documents of earlier numbers and files that none of the last documents names, if they are old enough.
 
-    Files of one directory go together: its content is put there together.
+    Files of one directory go together: its content is put there together. Where a document cannot be read they stay.
     """
     before_ns = time.time_ns() - int(min_age_s * 1e9)
     for place in (store.place.below("maps"), *(store.runs_place.below(run_id) for run_id in store.run_ids())):
         entries = place.entries()
         last, documents = numbers(entry.name for entry in entries), set[str]()
-        named = set[str]()
+        named, unread = set[str](), None
         for entry in entries:
             if (of := stem_and_number(entry.name)) is not None:
                 documents.add(entry.name)
                 if of[1] == last[of[0]]:
-                    named |= {entry.name, *_named_by(place, entry.name)}
+                    try:
+                        named |= {entry.name, *_named_by(place, entry.name)}
+                    except StoreError as error:
+                        unread = error.problems[0]
         young = {_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
         content = (entry for entry in entries if entry.name in documents or _CONTENT.search(entry.name))
-        yield place, [of for of in content if of.name not in named and _folder(of.name) not in young]
+        over = [of for of in content if of.name not in named and _folder(of.name) not in young]
+        yield "no document names it", place, over, unread
 
 
 def _named_by(place: Place, name: str) -> Iterator[str]:
-    """Yield the files that a document names; `StoreError` where it is not as it was written: then nothing can be told to be left over."""
+    """Yield the files that a document names; `StoreError` where it is not as it was written."""
     found, folder = read_sealed_at(place, name), name.rpartition("/")[0]
     for key in ("checksums", "streams"):
         listed = found.get(key)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tempfile
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +12,7 @@ from typing import Literal, get_args
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError, plain_lines
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.places import local_output
@@ -131,8 +131,8 @@ def status(
     known, definitions = known_runs(opened, force=force), definitions_key(message_definitions)
     if not create:
         opened.keep_index(known.runs)
-    with tempfile.TemporaryDirectory(prefix="tcpipe-") as staging:
-        found = find_sources(given, as_one=as_one, staging=Path(staging), tables=ruling.tables)
+    with scratch_directory() as staging:
+        found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
     mine = found.sources if shard is None else in_shard(found.sources, shard)
     passing = _failed_for_now(calls)
     groups: dict[tuple[State, str], list[IngestTask]] = {}

@@ -28,7 +28,7 @@ from tcpipe.formats.store_mark import MARK
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.report.overview import shows_map
-from tcpipe.store import Store
+from tcpipe.store import SPOOL, Store
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, READ_VERSIONS, REJECTIONS, STREAMS
 
@@ -49,7 +49,9 @@ def verify_store(store: Store) -> Iterator[Finding]:
         if name != MARK:
             yield _stranger(place, name)
     for name in place.folders():
-        if name not in ("records", "maps", "runs", _INDEX):
+        if name == SPOOL:
+            yield f"{place.where(name)}: is of a build that goes on, or was killed; 'tcpipe prune' removes what is old"
+        elif name not in ("records", "maps", "runs", _INDEX):
             yield _stranger(place, name)
     for entry in place.entries("records"):
         yield broken_seal_in(place.read(entry.name), place.where(entry.name)) or ("records", 1)

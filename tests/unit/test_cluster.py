@@ -2,6 +2,7 @@
 
 import logging
 import os
+import time
 from collections.abc import Iterator
 from contextlib import closing
 
@@ -13,7 +14,7 @@ from dask_cluster import DaskCluster, dask_cluster, die_once, where
 
 import tcpipe
 from tcpipe import execution
-from tcpipe.errors import UsageError
+from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.execution import run_all
 
 
@@ -76,6 +77,26 @@ def test_a_scheduler_that_is_not_there_is_one_line(monkeypatch):
 
 
 def test_a_scheduler_without_workers_is_one_line(tmp_path, monkeypatch):
-    monkeypatch.setattr(execution, "_ANSWER_S", 1)
+    monkeypatch.setattr(execution, "_ALONE_S", 1)
     with dask_cluster(tmp_path, workers=0) as lonely, pytest.raises(UsageError, match="the scheduler has no workers"):
         list(run_all(where, [1], jobs=1, cluster=lonely.address))
+
+
+def test_workers_that_stay_away_and_a_scheduler_that_goes_are_one_line(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
+    with dask_cluster(tmp_path, workers=1) as brief:
+        with closing(run_all(time.sleep, [0, 600], jobs=1, cluster=brief.address)) as outcomes:
+            next(outcomes)
+            with monkeypatch.context() as patch:
+                patch.setattr(execution, "_ANSWER_S", 1)
+                patch.setattr(execution, "_ALONE_S", 1)
+                brief.workers[0].kill()
+                with pytest.raises(TcpipeError, match="has had no workers for 1 s; start some"):
+                    next(outcomes)
+        assert "has no workers any more; waiting for one" in caplog.text
+        brief.start_worker()
+        with closing(run_all(time.sleep, [0, 600], jobs=1, cluster=brief.address)) as outcomes:
+            next(outcomes)
+            brief.scheduler.kill()
+            with pytest.raises(TcpipeError, match="the scheduler is gone; start it, and run the same command again"):
+                next(outcomes)

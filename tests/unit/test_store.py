@@ -216,12 +216,48 @@ def test_a_table_in_a_bucket_is_fetched_once_and_proved(tmp_path, monkeypatch):
         for _ in range(2):
             assert counted(store) == [10]
         assert sum(name.endswith("segments.parquet") for name in fetched) == 1
+        for copy in filter(Path.is_file, (tmp_path / "cache").rglob("*")):
+            copy.write_bytes(b"x" * copy.stat().st_size)
+        assert counted(store) == [10], "what is damaged here is fetched anew"
         (path,) = (tmp_path / "served").rglob("segments.parquet")
         path.write_bytes(b"x" * path.stat().st_size)
         shutil.rmtree(tmp_path / "cache")
         with pytest.raises(StoreError, match=r"s3://tests/store/runs/north/.*/segments.parquet: its sha256 is"):
             store.runs()[0].segments()
         assert any("segments.parquet: its sha256 is" in problem for problem in verify("s3://tests/store").problems)
+
+
+def test_a_map_whose_answer_is_lost_is_there_and_one_that_another_adds_first_stays(tmp_path, monkeypatch):
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        store = open_store("s3://tests/store", create=True)
+
+        def add(text):
+            with store.new_map("site") as directory:
+                directory.mkdir()
+                (directory / "tile").write_text(text)
+                fetched.lost = 3
+
+        add("mine")
+        assert store.maps() == ["site"]
+        with pytest.raises(StoreError, match="another process has written it meanwhile"):
+            add("another's")
+
+
+@pytest.mark.parametrize("name", ["store.json", "manifest-1.json", "run-1.json", "track.parquet"])
+def test_a_file_of_no_bytes_is_named_and_nothing_is_made_of_it(tmp_path, name):
+    store = open_store(tmp_path / "store", create=True)
+    put(store)
+    next(store.root.rglob(name)).write_bytes(b"")
+    assert any(name in problem for problem in verify(store.root).problems)
+    if name == "store.json":
+        with pytest.raises(StoreError, match=r"store\.json: "):
+            open_store(store.root)
+    elif name != "run-1.json":
+        assert store.runs() == []
+        put(store)
+        assert counted(store) == [10]
 
 
 def test_paths_lead_to_runs_and_recipes(root):

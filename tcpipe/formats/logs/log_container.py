@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import tempfile
 from contextlib import ExitStack
 from pathlib import Path
 
 from tcpipe.errors import LogError
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.logs import bag_records, mcap_records, sqlite_file
 from tcpipe.formats.logs.bag_file import BagPart
 from tcpipe.formats.logs.fetched_file import FetchedFile
@@ -35,7 +35,7 @@ def open_part(path: Path, name: str, stack: ExitStack, fetched: FetchedFile | No
     if fetched is not None and not magic.startswith((mcap_records.MAGIC, bag_records.MAGIC)):
         fetched.whole()
     if magic.startswith(ZSTD_MAGIC):
-        path = decompressed_file(path, Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="tcpipe-"))))
+        path = decompressed_file(path, stack.enter_context(scratch_directory()))
         magic = _magic(path, None)
     part: LogPart
     if magic.startswith(mcap_records.MAGIC) or _tail(path, len(mcap_records.MAGIC)) == mcap_records.MAGIC:

@@ -10,9 +10,8 @@ import itertools
 import mmap
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -20,6 +19,7 @@ from urllib.parse import quote
 import numpy as np
 
 from tcpipe.errors import LogError
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.logs.log_part import (
     MAX_CHANNELS,
     Bounds,
@@ -69,7 +69,7 @@ class SqlitePart:
         self.name = name
         self.damage: dict[Damage, None] = {}
         self.outline = ""
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch: ExitStack | None = None
         self._table: _MessageTable | None = None
         self._broken = ""
         self._cut = False
@@ -102,7 +102,7 @@ class SqlitePart:
         if self._table:
             self._table.close()
         if self._scratch:
-            self._scratch.cleanup()
+            self._scratch.close()
 
     @property
     def unchecked(self) -> str:
@@ -142,8 +142,8 @@ class SqlitePart:
         journal = path.with_name(path.name + "-wal")
         if size >= wanted and not (journal.exists() and journal.stat().st_size):
             return sqlite3.connect(f"file:{quote(str(path.absolute()))}?mode=ro&immutable=1", uri=True)
-        self._scratch = tempfile.TemporaryDirectory(prefix="tcpipe-")
-        copy = Path(self._scratch.name, path.name)
+        self._scratch = ExitStack()
+        copy = self._scratch.enter_context(scratch_directory()) / path.name
         shutil.copyfile(path, copy)
         if size >= wanted:
             shutil.copyfile(journal, copy.with_name(journal.name))

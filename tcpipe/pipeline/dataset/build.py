@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import shutil
+import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -43,7 +44,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.places import local_output
-from tcpipe.formats.published import has_card, here_by_range, published
+from tcpipe.formats.published import has_card, here_by_range, published, settle
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.record_files import Call, DatasetMade, record_name
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
@@ -70,14 +71,11 @@ from tcpipe.report.overview import class_overview, maps_overview, relief_overvie
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.regions import Regions
-from tcpipe.store import Store, open_store
+from tcpipe.store import SPOOL, Store, open_store
 from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 
 logger = logging.getLogger("tcpipe")
-
-_SPOOL = "spool"
-"""Where segments and pixels wait until the dataset is written; it goes in the end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,6 +286,7 @@ def _card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     open_place(url).check()
     if not has_card(url):
         return None, False
+    settle(url)
     card = read_card(here_by_range(url, by_range=lambda _: True)[0])
     return card, card.data_model_version in READ_VERSIONS
 
@@ -354,9 +353,9 @@ def _card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 def _waiting_place(directory: Path, store: Store, inputs: str, *, cluster: str | None) -> Iterator[Place]:
     """Yield where pixels wait: in the directory that is made, or, where workers elsewhere write them, in the store, which they see."""
     if cluster is None:
-        yield DirectoryPlace(directory / _SPOOL / "pixels")
+        yield DirectoryPlace(directory / SPOOL / "pixels")
         return
-    place = store.place.below(f"{_SPOOL}/{inputs}")
+    place = store.place.below(f"{SPOOL}/{inputs}-{uuid.uuid4().hex[:8]}")
     try:
         yield place
     finally:
@@ -378,7 +377,7 @@ def _build(
     beside: Path | None,
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
-    waiting = directory / _SPOOL
+    waiting = directory / SPOOL
     waiting.mkdir()
     content = gather_content(waiting, inputs, recipe, regions, earlier, spool_place=pixels, jobs=jobs, cluster=cluster)
     logger.info("writing %d samples", len(content.samples))

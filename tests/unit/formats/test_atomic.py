@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import pytest
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.atomic import atomic_directory, atomic_file, clear_beside, left_beside
+from tcpipe.formats.atomic import atomic_directory, atomic_file, clear_beside, left_beside, scratch_directory
 
 
 class _Cut(Exception):  # noqa: N818
@@ -220,3 +221,15 @@ def test_clearing_leaves_what_lives_and_what_is_not_ours(tmp_path: Path) -> None
         assert left_beside(tmp_path / "d-e") == []
     assert sorted(path.name for path in tmp_path.iterdir()) == [".tmp-mine", "d-e"]
     clear_beside(tmp_path / "nowhere" / "x")
+
+
+def test_scratch_of_the_killed_goes_and_of_the_living_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    left = tmp_path / f"tcpipe-{os.getuid()}-0123abcd"
+    left.mkdir()
+    (left / "copy.mcap").touch()
+    (tmp_path / "tcpipe-cache").mkdir()
+    with scratch_directory() as one, scratch_directory() as other:
+        assert {path.name for path in tmp_path.iterdir()} == {one.name, other.name, "tcpipe-cache"}
+        assert one.stat().st_mode & 0o077 == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["tcpipe-cache"]

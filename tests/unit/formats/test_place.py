@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from object_gateway import gateway, in_environment  # noqa: F401  a fixture
-from storage_server import FORBIDDEN, READ_ONLY, object_store
+from storage_server import FORBIDDEN, READ_ONLY, SKEWED, object_store
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.bucket import open_place
@@ -116,6 +116,12 @@ def test_a_bucket_that_cannot_be_used_is_one_line(served: Path, monkeypatch: pyt
         open_place("s3://nowhere/x").check()
     with pytest.raises(StoreError, match="wants credentials; set AWS_ACCESS_KEY_ID"):
         open_place(f"s3://{FORBIDDEN}/x").check()
+    with pytest.raises(
+        StoreError, match=r"skewed/x: it cannot be read \(this machine's clock is not the store's; set it\)$"
+    ):
+        open_place(f"s3://{SKEWED}/x").check()
+    with pytest.raises(StoreError, match=r"wants credentials; .*; a clock that is wrong is answered in the same way"):
+        open_place(f"s3://{SKEWED}/x").size("a")
     open_place(f"s3://{READ_ONLY}").check()
     with pytest.raises(
         StoreError, match=r"read-only/x/a: it cannot be written \(the credentials that are set do not allow it\)"
@@ -126,6 +132,17 @@ def test_a_bucket_that_cannot_be_used_is_one_line(served: Path, monkeypatch: pyt
     with pytest.raises(StoreError, match="cannot be read"):
         open_place("s3://tests/x").check()
     assert time.monotonic() - began < 10
+
+
+def test_what_is_written_counts_also_where_the_answer_is_lost(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "tests").mkdir()
+    with object_store(tmp_path) as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        place = open_place("s3://tests")
+        for name, put in (("a", place.put), ("b", place.put_new)):
+            fetched.lost = 2
+            put(name, b"data")
+            assert (place.read(name), fetched.lost) == (b"data", 0)
 
 
 def test_a_copy_that_is_not_what_it_should_be_is_no_copy(served: Path) -> None:

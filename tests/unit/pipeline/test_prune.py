@@ -13,7 +13,7 @@ from tcpipe.formats.record_files import DatasetMade
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import open_store
+from tcpipe.store import SPOOL, open_store
 
 OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
 
@@ -131,3 +131,28 @@ def test_earlier_generations_go_when_they_are_old_and_the_last_stays(store):
     assert gone == {"manifest-1.json", "segments.parquet"} | {"track.parquet", "rejections.parquet"}
     assert [run.segments().num_rows for run in store.recipes_of("c")] == [15]
     assert verify(store.root).problems == ()
+
+
+def test_pixels_of_a_killed_build_go_when_they_are_old(store):
+    name = f"{SPOOL}/0123-abcdef01/7.arrow"
+    store.place.put(name, b"pixels")
+    assert verify(store.root).problems == (
+        f"{store.root / SPOOL}: is of a build that goes on, or was killed; 'tcpipe prune' removes what is old",
+    )
+    prune(store=store.root, recipe=Recipe())
+    assert store.place.read(name) == b"pixels"
+    assert name in {each.path.removeprefix(f"{store.root}/") for each in prune(store=store.root, min_age_s=0.0).removed}
+    assert not (store.root / SPOOL).exists()
+
+
+def test_a_document_that_cannot_be_read_keeps_what_lies_beside_it_and_stops_nothing_else(store):
+    for run_id in ("a", "c"):
+        add_run(store, run_id, segments(run_id, *lanes(np.array([2.0]), -10.0, 5.0)), recipe=OLD)
+    damaged = store.root / "runs" / "c" / old_recipe(store) / "manifest-2.json"
+    damaged.write_bytes(b"")
+    found = prune(store=store.root, recipe=OLD, min_age_s=0.0)
+    assert {"manifest-1.json", "segments.parquet"} <= {each.path.rpartition("/")[2] for each in found.removed}
+    assert not any("/runs/c/" in each.path for each in found.removed)
+    assert {each.stays for each in found.kept} == {
+        next(problem for problem in verify(store.root).problems if str(damaged) in problem)
+    }

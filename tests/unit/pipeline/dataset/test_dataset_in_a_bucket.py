@@ -4,6 +4,7 @@ import json
 import shutil
 
 import numpy as np
+import obstore
 import pytest
 from storage_server import object_store
 from synthetic_store import small_store
@@ -115,6 +116,54 @@ def test_who_comes_second_finds_it_done_and_mixes_nothing(bucket):
     with pytest.raises(StoreError, match="another one has written it meanwhile"):
         put_two()
     assert files(bucket[0] / "x") == {"c.json": b"theirs", "data": b"theirs"}
+
+
+class _Killed(BaseException):
+    pass
+
+
+def test_killed_at_any_request_nobody_sees_half_and_the_next_call_completes(bucket, monkeypatch):
+    place, left = bucket[0] / "x", [0]
+
+    def killing(act):
+        def acts(*args, **how):
+            if not left[0]:
+                raise _Killed
+            left[0] -= 1
+            return act(*args, **how)
+
+        return acts
+
+    for name in ("put", "delete"):
+        monkeypatch.setattr(obstore, name, killing(getattr(obstore, name)))
+    for steps in range(100):
+        left[0] = steps
+        try:
+            with published("s3://sets/x", "c.json") as directory:
+                write(directory, "mine")
+            break
+        except _Killed:
+            assert not (place / "c.json").exists() or (place / "data").read_text() == "mine"
+        except UsageError:  # it is there already, as a caller who looks first finds
+            break
+    assert steps >= 3
+    assert files(place) == {"c.json": b"mine", "data": b"mine"}
+
+
+def test_who_comes_second_with_the_same_finds_it_done(bucket):
+    with published("s3://sets/x", "c.json") as mine:
+        write(mine, "same")
+        with published("s3://sets/x", "c.json") as theirs:
+            write(theirs, "same")
+    assert files(bucket[0] / "x") == {"c.json": b"same", "data": b"same"}
+
+
+def test_the_claim_of_a_build_that_was_killed_at_its_end_goes_with_the_next(made, bucket):
+    put(made, bucket)
+    claim = bucket[0] / "by name" / "ds" / CLAIM
+    claim.write_bytes(claim.with_name("dataset.json").read_bytes())
+    assert build_dataset(URL, store=made / "store", recipe=Recipe()).status == "unchanged"
+    assert not claim.exists()
 
 
 @pytest.mark.parametrize("kind", ["zarr", "parquet"])

@@ -1,0 +1,42 @@
+"""A process that is asked to end ends, whatever library holds its one thread."""
+
+import os
+import signal
+import threading
+
+import pytest
+
+from tcpipe.cli import process
+from tcpipe.cli.process import ended_in_time
+
+
+@pytest.fixture
+def ended(monkeypatch):
+    """An event, and the exit codes by which the process would have ended."""
+    event, codes = threading.Event(), []
+    monkeypatch.setattr(process, "_LATEST_S", 0.05)
+    monkeypatch.setattr(os, "_exit", lambda code: (codes.append(code), event.set()))
+    before = signal.signal(signal.SIGTERM, lambda *_: None)  # as a library that lets no exception through
+    yield event, codes
+    signal.signal(signal.SIGTERM, before)
+
+
+def test_who_does_not_end_is_ended(ended, capfd):
+    event, codes = ended
+    with ended_in_time():
+        signal.raise_signal(signal.SIGTERM)
+        assert event.wait(60)
+    assert codes == [128 + signal.SIGTERM]
+    assert capfd.readouterr().err == ("tcpipe: ended by SIGTERM; nothing is half-written; run the same command again\n")
+
+
+def test_who_ends_in_time_and_other_signals_are_left_alone(ended):
+    event, codes = ended
+    before = signal.signal(signal.SIGALRM, lambda *_: None)
+    with ended_in_time():
+        signal.raise_signal(signal.SIGALRM)
+        assert not event.wait(0.2)
+        signal.raise_signal(signal.SIGTERM)
+    signal.signal(signal.SIGALRM, before)
+    assert not event.wait(0.2)
+    assert codes == []
