@@ -3,6 +3,7 @@
 import json
 import shutil
 import sys
+import tarfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -12,6 +13,7 @@ from pkgutil import walk_packages
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from fault_children import INPUTS, command
+from fault_services import BUCKET
 
 import tcpipe
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
@@ -27,12 +29,18 @@ FROM, TO = "15.434471784,47.069643821", "15.434788601,47.069732605"
 
 @dataclass(frozen=True)
 class Case:
-    """One call, what was called before it, and which inputs it wants: ``log``, ``world`` (rasters and a store), ``model``."""
+    """One call, what was called before it, and which inputs it wants: ``log``, ``world`` (rasters and a store), ``model``, ``old`` store.
+
+    What it writes lies in its directory, or below ``url``; a Dask cluster does its work where it wants ``cluster``.
+    """
 
     name: str
     run: Run
     before: tuple[Run, ...] = ()
     wants: frozenset[str] = frozenset()
+    url: str = ""
+    beside: Run | None = None
+    """What else is done at the same time where two things are; None: the same."""
 
 
 def _as_command(run: Run) -> Run:
@@ -78,7 +86,19 @@ def _directory(name: str, **files: str) -> Run:
 _RUN = command("ingest", LOG, "--quiet")
 _BUILD = ("build-dataset", *STORE, "--split", f"{INPUTS}/region.geojson", "--quiet")
 _MAP = ("add-map", "site", *LAYERS, "--quiet")
-_LOG, _WORLD, _MODEL = (frozenset({name}) for name in ("log", "world", "model"))
+_LOG, _WORLD, _MODEL, _OLD = (frozenset({name}) for name in ("log", "world", "model", "old"))
+_CLUSTER = frozenset({"cluster"})
+
+URL = f"s3://{BUCKET}/a case"
+"""Where cases in a bucket write."""
+_THERE = ("--store", f"{URL}/store", "--quiet")
+_RUN_THERE = command("ingest", LOG, *_THERE)
+_OTHER_THERE = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", *_THERE)
+_PRUNE_THERE = command("prune", "--store", f"{URL}/store")
+_BUILD_THERE = command("build-dataset", f"{URL}/dataset", *_BUILD[1:])
+_OTHER_RUN = command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q")
+_PRUNE = command("prune")
+_MIGRATE = ("migrate", f"{INPUTS}/old/store")
 
 CASES = (
     Case("a file", _file("one", "1")),
@@ -92,6 +112,19 @@ CASES = (
     Case("ingest", _RUN, wants=_LOG),
     Case("ingest --force", command("ingest", LOG, "--force", "--quiet"), (_RUN,), _LOG),
     Case("ingest by another recipe", command("ingest", LOG, "--recipe", f"{INPUTS}/other.toml", "-q"), (_RUN,), _LOG),
+    Case("ingest beside build-dataset", _RUN, wants=_LOG | _WORLD, beside=command(*_BUILD)),
+    Case("ingest beside prune", _OTHER_RUN, (_RUN,), _LOG, beside=_PRUNE),
+    Case("prune", _PRUNE, (_OTHER_RUN, _RUN), _LOG),
+    Case("migrate elsewhere", command(*_MIGRATE, "tcpipe-store"), wants=_OLD),
+    Case("ingest into a bucket", _RUN_THERE, wants=_LOG, url=URL),
+    Case("ingest --force there", command("ingest", LOG, "--force", *_THERE), (_RUN_THERE,), _LOG, URL),
+    Case("ingest there beside prune", _OTHER_THERE, (_RUN_THERE,), _LOG, URL, _PRUNE_THERE),
+    Case("add-map there", command(*_MAP[:-1], *_THERE), wants=_WORLD, url=URL),
+    Case("build-dataset there", _BUILD_THERE, wants=_WORLD, url=URL),
+    Case("prune there", _PRUNE_THERE, (_OTHER_THERE, _RUN_THERE), _LOG, URL),
+    Case("migrate into a bucket", command(*_MIGRATE, f"{URL}/store"), wants=_OLD, url=URL),
+    Case("ingest on a cluster", _RUN_THERE, wants=_LOG | _CLUSTER, url=URL),
+    Case("build-dataset on a cluster", _BUILD_THERE, wants=_WORLD | _CLUSTER, url=URL),
     Case("ingest --tag", command("ingest", LOG, "--tag", "load=12", "--quiet"), (_RUN,), _LOG),
     Case("ingest --jobs 2", command("ingest", f"{INPUTS}/logs", "--jobs", "2", "--quiet"), wants=_LOG),
     Case("accept", command("accept", CUT), (command("ingest", CUT, "--quiet"),), _LOG),
@@ -132,6 +165,10 @@ def make_inputs(place: Path, wanted: set[str]) -> None:
         _make_world(place)
     if "model" in wanted:
         _make_model(place)
+    if "old" in wanted:
+        (place / "old").mkdir()
+        with tarfile.open(Path(__file__).parents[1] / "tests" / "data" / "store-1.4.tar.xz") as archive:
+            archive.extractall(place / "old", filter="data")
 
 
 def _make_logs(place: Path) -> None:

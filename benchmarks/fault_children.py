@@ -1,7 +1,8 @@
 """One call in a forked child, broken at a chosen step or moment, and what it left on disk.
 
 A step is a moment at which Python is about to change the disk: it opens a file to write (or a directory, to lock or sync it), makes,
-renames or removes something. An audit hook counts them, so every state that a kill can leave between two of them is met once.
+renames or removes something. An audit hook counts them, so every state that a kill can leave between two of them is met once. Of a call
+that writes to a bucket a step is the moment before, and the one after, each request that changes something there.
 """
 
 import atexit
@@ -9,15 +10,19 @@ import errno
 import hashlib
 import mmap
 import os
+import pickle
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import IO, TypeVar
+
+T = TypeVar("T")
 
 INPUTS = "in"
 """Directory of a workplace that no call changes."""
@@ -31,22 +36,32 @@ WHOLE = (
 )  # fmt: skip
 """Directories that appear and change as one."""
 
-UNFINISHED = (".tmp-*", "*/.tmp-*", ".*.partial", "*.checkpoint")
+UNFINISHED = (".tmp-*", "*/.tmp-*", ".*.partial", "*.checkpoint", "tmp/tcpipe-*", "*/writing.json")
 """What a killed call may leave for the next one: temporaries, and where a cost map and a training stand."""
 
+PASSING = ("records/calls", "records/datasets", "index")
+"""Directories of a store that hold times, inodes, and what was done by others: never twice the same."""
+
+_REQUEST = "fault.request"
 _CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.link", "os.symlink", "os.truncate"}
 
 
 @dataclass(frozen=True)
 class Fault:
-    """What befalls a call: a signal, or a disk that is full from then on (0), at a step, from 1, or after a time [s]; or so much room."""
+    """What befalls a call: a signal, or a disk that is full from then on (0), at a step, from 1, or after a time [s]; or so much room.
+
+    A ``victim`` is no call, but what it depends on: see `fault_services`.
+    """
 
     signal: int
     step: int = 0
     after_s: float = 0.0
     room_bytes: int = 0
+    victim: str = ""
 
     def __str__(self) -> str:
+        if self.victim:
+            return f"{self.victim} after {self.after_s:.3f} s"
         if self.room_bytes:
             return f"room for {self.room_bytes} bytes"
         what = signal.Signals(self.signal).name if self.signal else "disk full"
@@ -65,25 +80,79 @@ class Ended:
     left_running: bool
 
 
-def call(run: Callable[[], object], work: Path, fault: Fault | None = None) -> Ended:
+def call(
+    run: Callable[[], object],
+    work: Path,
+    fault: Fault | None = None,
+    *,
+    in_bucket: bool = False,
+    strike: Callable[[str], None] | None = None,
+) -> Ended:
     """Run something in ``work`` in a forked child. Import what it needs before: children share it."""
+    begun = _begun(run, work, fault, in_bucket=in_bucket)
+    struck = None
+    if fault and fault.after_s:
+        time.sleep(fault.after_s)
+        if strike and fault.victim:
+            strike(fault.victim)
+        else:
+            os.kill(begun.child, fault.signal)
+        struck = time.monotonic()
+    return _ended(begun, struck)
+
+
+def calls_together(runs: Sequence[Callable[[], object]], work: Path) -> list[Ended]:
+    """Run several things at once."""
+    return [_ended(each, None) for each in [_begun(run, work, None) for run in runs]]
+
+
+def in_child(act: Callable[[], T]) -> T:
+    """Return what a function gives in a child: this process loads nothing that has threads, which children would lack."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        code = 1
+        try:
+            with os.fdopen(write, "wb") as stream:
+                pickle.dump(act(), stream)
+            code = 0
+        finally:
+            os._exit(code)
+    os.close(write)
+    with os.fdopen(read, "rb") as stream:
+        data = stream.read()
+    assert os.waitpid(child, 0)[1] == 0
+    return pickle.loads(data)  # noqa: S301  our own
+
+
+@dataclass(frozen=True)
+class _Begun:
+    child: int
+    counted: "memoryview[int]"
+    at_s: float
+    output: IO[bytes]
+
+
+def _begun(run: Callable[[], object], work: Path, fault: Fault | None, *, in_bucket: bool = False) -> _Begun:
     counted = memoryview(mmap.mmap(-1, 8)).cast("q")
-    begun = struck = time.monotonic()
-    with tempfile.TemporaryFile() as output:
-        sys.stdout.flush()
-        child = os.fork()
-        if child == 0:
-            _be_the_child(run, work, output.fileno(), counted, fault)
-        if fault and fault.after_s:
-            time.sleep(fault.after_s)
-            os.kill(child, fault.signal)
-            struck = time.monotonic()
-        code = _waited(child, time.monotonic() + LONGEST_S)
-        ended = time.monotonic()
-        left_running = _outlived(child)
+    begun_s = time.monotonic()
+    output = tempfile.TemporaryFile()  # noqa: SIM115  closed where the child has ended
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        _be_the_child(run, work, output.fileno(), counted, fault, in_bucket=in_bucket)
+    return _Begun(child, counted, begun_s, output)
+
+
+def _ended(begun: _Begun, struck_s: float | None) -> Ended:
+    code = _waited(begun.child, time.monotonic() + LONGEST_S)
+    ended_s = time.monotonic()
+    left_running = _outlived(begun.child)
+    with begun.output as output:
         output.seek(0)
         said = output.read().decode(errors="replace")
-    return Ended(code, said, counted[0], ended - begun, ended - struck, left_running)
+    late_s = ended_s - (begun.at_s if struck_s is None else struck_s)
+    return Ended(code, said, begun.counted[0], ended_s - begun.at_s, late_s, left_running)
 
 
 def command(*arguments: str) -> Callable[[], object]:
@@ -99,7 +168,13 @@ def command(*arguments: str) -> Callable[[], object]:
 
 
 def _be_the_child(
-    run: Callable[[], object], work: Path, output: int, counted: "memoryview[int]", fault: Fault | None
+    run: Callable[[], object],
+    work: Path,
+    output: int,
+    counted: "memoryview[int]",
+    fault: Fault | None,
+    *,
+    in_bucket: bool,
 ) -> None:
     """Become the child: never returns."""
     code = 70
@@ -111,7 +186,9 @@ def _be_the_child(
         os.dup2(output, 1)
         os.dup2(output, 2)
         tempfile.tempdir = os.environ["TMPDIR"] = str(work / "tmp")
-        sys.addaudithook(_hook(work, counted, fault))
+        if in_bucket:
+            _tell_of_requests()
+        sys.addaudithook(_hook(work, counted, fault, in_bucket=in_bucket))
         run()
         code = 0
     except SystemExit as done:
@@ -125,12 +202,29 @@ def _be_the_child(
         os._exit(code)
 
 
-def _hook(work: Path, counted: "memoryview[int]", fault: Fault | None):
+def _tell_of_requests() -> None:
+    """Have requests that change something in a bucket tell the audit hook when they begin, and when they are answered."""
+    import obstore
+
+    def telling(act: Callable[..., object]) -> Callable[..., object]:
+        def told(*args: object, **how: object) -> object:
+            sys.audit(_REQUEST)
+            found = act(*args, **how)
+            sys.audit(_REQUEST)
+            return found
+
+        return told
+
+    obstore.put, obstore.delete = telling(obstore.put), telling(obstore.delete)
+
+
+def _hook(work: Path, counted: "memoryview[int]", fault: Fault | None, *, in_bucket: bool):
     """Count steps, and let the fault come at its own."""
     inside = f"{work}{os.sep}"
 
     def hook(event: str, args: tuple[object, ...]) -> None:
-        if event in _CHANGES or (event == "open" and _is_change(args, inside)):
+        changes = event == _REQUEST if in_bucket else event in _CHANGES
+        if changes or (event == "open" and not in_bucket and _is_change(args, inside)):
             counted[0] += 1
             if fault and fault.step and counted[0] >= fault.step:
                 if fault.signal and counted[0] == fault.step:
@@ -199,15 +293,19 @@ Tree = dict[str, str]
 
 
 def tree(root: Path, besides: str = INPUTS) -> Tree:
-    """Return everything below a directory but the inputs."""
+    """Return everything below a directory but the inputs, and what is never twice the same."""
     found: Tree = {}
     for directory, names, files in os.walk(root):
         here = Path(directory).relative_to(root)
-        if here == Path():
-            names[:] = [name for name in names if name != besides]
+        names[:] = [name for name in names if str(here / name) != besides and not is_passing(str(here / name))]
         found |= {str(here / name): "directory" for name in names}
         found |= {str(here / name): hashlib.sha256((root / here / name).read_bytes()).hexdigest() for name in files}
     return found
+
+
+def is_passing(path: str) -> bool:
+    """Tell whether a path is, or lies in, what is never twice the same."""
+    return any(f"/{passing}/" in f"/{path}/" for passing in PASSING)
 
 
 def without_unfinished(found: Tree) -> Tree:

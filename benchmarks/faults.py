@@ -1,9 +1,10 @@
 """What faults leave behind, and hostile inputs cost; docs/explanation/faults.md says what is promised.
 
-``python benchmarks/faults.py kills|signals|full-disk|faults|hostile|mutations|all``: every command that writes is broken at its steps
-(`fault_children`), at random moments, and by disks of several sizes. Then everything it left is looked at, and it is called again.
+``python benchmarks/faults.py kills|signals|full-disk|services|together|faults|hostile|mutations|all``: every command that writes is
+broken at its steps (`fault_children`), at random moments, and by disks of several sizes; the object store and the cluster that it uses are
+stopped and killed under it (`fault_services`); two commands run at once. Then everything it left is looked at, and it is called again.
 Hostile inputs (`hostile_inputs`) and mutated logs are read. The exit code is 1 where something is not as promised. ``--only``, ``--steps``
-and ``--times`` make it shorter.
+and ``--times`` make it shorter. Cases in a bucket and on a cluster are left out where TCPIPE_TEST_OBJECT_STORAGE names no gateway.
 """
 
 import argparse
@@ -15,24 +16,50 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 
 os.environ["OMP_NUM_THREADS"] = "1"  # forked children have one thread
 
 from fault_cases import CASES, LOG, Case, make_inputs
-from fault_children import INPUTS, LATEST_S, Ended, Fault, Tree, call, different, half_written, tree, without_unfinished
+from fault_children import (
+    INPUTS,
+    LATEST_S,
+    Ended,
+    Fault,
+    Tree,
+    call,
+    calls_together,
+    different,
+    half_written,
+    in_child,
+    is_passing,
+    tree,
+    without_unfinished,
+)
+from fault_services import OUTAGES_S, PROGRAM, VICTIMS, Services, get_objects, put_objects
 from hostile_inputs import try_all
+
+from tcpipe.pipeline.verify import verify
+
+services = Services()
 
 FULL = 0
 _DISK_BYTES = 256 << 20
-STRIKES = {"kills": (signal.SIGKILL,), "signals": (signal.SIGTERM, signal.SIGINT, signal.SIGHUP), "full-disk": (FULL,)}
+STRIKES = {
+    "kills": (signal.SIGKILL,),
+    "signals": (signal.SIGTERM, signal.SIGINT, signal.SIGHUP),
+    "full-disk": (FULL,),
+    "services": (),
+    "together": (),
+}
 PROMISES = """
 false if: a final path is neither whole as before nor whole as after, at the moment of the fault or later; the next identical call does not
 complete, or leaves other bytes than an undisturbed one, or any temporary; a process outlives its command; a command that is asked to end
-(SIGTERM, SIGINT, SIGHUP) takes more than 5 s, exits with another code than 128 + signal, or leaves a temporary; a full disk is told in
-more than plain lines, or leaves a temporary."""
+(SIGTERM, SIGINT, SIGHUP) takes more than 5 s, exits with another code than 128 + signal, or leaves a temporary; a full disk, a gateway or
+a cluster that is gone is told in more than plain lines; a full disk leaves a temporary; verify finds a problem after the next call."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +68,8 @@ class Undisturbed:
 
     case: Case
     state: Path
+    objects: dict[str, bytes]
+    """What lies in its bucket before."""
     before: Tree
     after: Tree
     ended: Ended
@@ -53,20 +82,32 @@ def undisturbed(case: Case, work: Path) -> Undisturbed:
     """Run a case twice from the same state: the same bytes, or no comparison means anything."""
     state = work.parent / "state"
     _clear(work)
+    put_objects(case.url, {})
     for run in case.before:
         _assert_done(case, call(run, work))
     shutil.rmtree(state, ignore_errors=True)
     shutil.copytree(work, state, ignore=lambda at, _: {INPUTS} if at == str(work) else set())
-    before = tree(work)
+    objects, before = get_objects(case.url), all_of(case, work)
     _assert_done(case, call(case.run, work))
-    after = tree(work)
+    after = all_of(case, work)
     again = call(case.run, work)
-    assert not different(after, tree(work)), f"{case.name}: a second call changes {different(after, tree(work))}"
+    changed = different(after, all_of(case, work))
+    assert not changed, f"{case.name}: a second call changes {changed}"
     _restore(state, work)
-    ended = call(case.run, work)
-    assert not different(after, tree(work)), f"{case.name}: not the same twice: {different(after, tree(work))}"
-    size_bytes = sum((work / path).stat().st_size for path in after if before.get(path) != after[path])
-    return Undisturbed(case, state, before, after, ended, again.code, size_bytes)
+    put_objects(case.url, objects)
+    ended = call(case.run, work, in_bucket=bool(case.url))
+    changed = different(after, all_of(case, work))
+    assert not changed, f"{case.name}: not the same twice: {changed}"
+    there = {path: work / path for path in after if before.get(path) != after[path]}
+    size_bytes = sum(path.stat().st_size for path in there.values() if path.is_file())
+    size_bytes += sum(map(len, get_objects(case.url).values()))
+    return Undisturbed(case, state, objects, before, after, ended, again.code, size_bytes)
+
+
+def all_of(case: Case, work: Path) -> Tree:
+    """Return what is in the workplace, and below ``there/`` what is in its bucket."""
+    there = {f"there/{name}": sha256(data).hexdigest() for name, data in get_objects(case.url).items()}
+    return tree(work) | {name: of for name, of in there.items() if not is_passing(name)}
 
 
 def _assert_done(case: Case, ended: Ended) -> None:
@@ -87,21 +128,64 @@ def _restore(state: Path, work: Path) -> None:
 
 def struck(plain: Undisturbed, work: Path, fault: Fault) -> list[str]:
     """Let a fault befall a case, look, call it again, look; return what is not as promised."""
+    case = plain.case
     _restore(plain.state, work)
+    put_objects(case.url, plain.objects)
     with _room(work, fault.room_bytes):
-        ended = call(plain.case.run, work, fault)
-    now = tree(work)
+        ended = call(case.run, work, fault, in_bucket=bool(case.url), strike=services.strike)
+    services.mend()
+    now = all_of(case, work)
     bad = half_written(plain.before, plain.after, now)
     bad += ["processes outlive it"] if ended.left_running else []
-    if fault.signal != signal.SIGKILL:
+    if fault.victim:
+        bad += _not_plain(plain, ended)
+    elif fault.signal != signal.SIGKILL:
         bad += _untrue(plain, fault, ended, now)
-        left = [path for path in now.keys() - without_unfinished(now).keys() if ".tmp-" in path]
+        left = [path for path in now.keys() - without_unfinished(now).keys() if ".tmp-" in path or "tmp/" in path]
         bad += [f"left: {path}" for path in sorted(left)]
+    bad += _of_the_next_call(plain, work, plain.after)
+    return [f"{case.name}, {fault}: {line}" for line in bad]
+
+
+def together(plain: Undisturbed, work: Path, turn: int) -> list[str]:
+    """Run a case and what is beside it at once, each again, and compare with one after the other."""
+    case = plain.case
+    runs = [case.run, case.beside or case.run]
+    trees = []
+    for at_once in (False, True):
+        _restore(plain.state, work)
+        put_objects(case.url, plain.objects)
+        ended = calls_together(runs, work) if at_once else [call(run, work) for run in runs]
+        for run in runs:
+            call(run, work)
+        trees.append(all_of(case, work))
+    bad = [line for each in ended for line in _not_plain(plain, each)]
+    bad += _of_the_next_call(plain, work, trees[0])
+    return [f"{case.name}, two at once ({turn}): {line}" for line in bad]
+
+
+def _not_plain(plain: Undisturbed, ended: Ended) -> Iterator[str]:
+    """Yield what is wrong with the end of a call for which something else was in the way."""
+    if ended.code not in (plain.ended.code, plain.again, 0, 1, 2, 3):
+        yield f"ends with {ended.code}"
+    if "internal error" in ended.said or "Traceback" in ended.said:
+        yield f"not plain: {ended.said.strip()[-300:]}"
+
+
+def _of_the_next_call(plain: Undisturbed, work: Path, wanted: Tree) -> Iterator[str]:
+    """Call a case again; yield what is not as after an undisturbed call."""
     again = call(plain.case.run, work)
     if again.code not in (plain.ended.code, plain.again):
-        bad.append(f"the next call ends with {again.code}: {again.said.strip()[-300:]}")
-    bad += [f"the next call leaves other bytes: {path}" for path in different(plain.after, tree(work))[:3]]
-    return [f"{plain.case.name}, {fault}: {line}" for line in bad]
+        yield f"the next call ends with {again.code}: {again.said.strip()[-300:]}"
+    for path in different(wanted, all_of(plain.case, work))[:3]:
+        yield f"the next call leaves other bytes: {path}"
+    for store in filter(None, ("tcpipe-store", plain.case.url and f"{plain.case.url}/store")):
+        if store == "tcpipe-store" and not (work / store / "store.json").exists():
+            continue
+        if plain.case.url and not any(name.startswith("there/store/") for name in wanted):
+            continue
+        path = store if "://" in store else work / store
+        yield from (f"verify: {problem}" for problem in in_child(lambda path=path: verify(path).problems))
 
 
 @contextmanager
@@ -139,14 +223,19 @@ def faults_of(plain: Undisturbed, campaign: str, options: argparse.Namespace) ->
     """Yield every step of a case, or ``--steps`` of them, and ``--times`` random moments."""
     strikes, count, rng = STRIKES[campaign], plain.ended.steps, random.Random(f"{options.seed} {plain.case.name}")
     every = max(1.0, count / options.steps) if options.steps else 1.0
-    for at in range(int(count / every)):
+    for at in range(int(count / every) if strikes and not (plain.case.url and campaign == "full-disk") else 0):
         yield Fault(strikes[at % len(strikes)], step=1 + int(at * every))
-    if campaign != "full-disk":
+    if campaign == "services":
+        victims = [*(OUTAGES_S if plain.case.url else ()), *(VICTIMS if "cluster" in plain.case.wants else ())]
+        for at in range(options.times if victims else 0):
+            after_s = rng.uniform(0.001, plain.ended.seconds)
+            yield Fault(signal.SIGKILL, after_s=after_s, victim=victims[at % len(victims)])
+    elif campaign != "full-disk":
         yield from (
             Fault(strikes[at % len(strikes)], after_s=rng.uniform(0.001, 1.05 * plain.ended.seconds))
             for at in range(options.times)
         )
-    elif plain.state.parent.is_mount():
+    elif plain.state.parent.is_mount() and plain.size_bytes:
         yield from (Fault(FULL, room_bytes=1 + (at * plain.size_bytes) // options.times) for at in range(options.times))
 
 
@@ -161,7 +250,8 @@ def workplace(wanted: set[str]) -> Iterator[Path]:
         print("no disk of a chosen size can be mounted: full disks are played at steps alone")
     try:
         make_inputs(place / "work" / INPUTS, wanted)
-        yield place / "work"
+        with closing(services):
+            yield place / "work"
     finally:
         if mounted:
             subprocess.run(["umount", "--lazy", place], check=True)
@@ -177,14 +267,16 @@ def run(campaigns: list[str], cases: list[Case], options: argparse.Namespace) ->
     total = dict.fromkeys(campaigns, 0)
     findings = 0
     with workplace(set().union(*(case.wants for case in cases))) as work:
-        inputs = tree(work / INPUTS)
+        inputs = without_unfinished(tree(work / INPUTS))
         for case in cases:
+            services.start(gateway=bool(case.url), cluster="cluster" in case.wants)
             plain, wrong = undisturbed(case, work), []
             counts = dict.fromkeys(campaigns, 0)
             for name in campaigns:
-                for fault in faults_of(plain, name, options):
+                for fault in faults_of(plain, name, options) if name != "together" else range(1, 1 + options.twice):
                     counts[name] += 1
-                    wrong += [lines] if (lines := struck(plain, work, fault)) else []
+                    try_it = together if name == "together" else struck
+                    wrong += [lines] if (lines := try_it(plain, work, fault)) else []
             columns = "".join(f" {count:10}" for count in counts.values())
             print(
                 f"{case.name:32} {plain.ended.steps:6} {plain.ended.seconds:8.2f}{columns} {len(wrong):10}", flush=True
@@ -193,7 +285,7 @@ def run(campaigns: list[str], cases: list[Case], options: argparse.Namespace) ->
                 print(f"    {line}", flush=True)
             total = {name: total[name] + counts[name] for name in campaigns}
             findings += len(wrong)
-        changed = different(inputs, tree(work / INPUTS))
+        changed = different(inputs, without_unfinished(tree(work / INPUTS)))
     print(f"{'together':32} {'':6} {'':8}" + "".join(f" {count:10}" for count in total.values()) + f" {findings:10}")
     print(*(f"an input was changed: {path}" for path in changed), PROMISES, sep="\n")
     return not findings and not changed
@@ -205,6 +297,7 @@ def main() -> int:
     parser.add_argument("--only", default="", help="these calls alone, by commas")
     parser.add_argument("--steps", type=int, default=0, help="at most so many steps of each call (0: every one)")
     parser.add_argument("--times", type=int, default=15, help="so many random moments of each call")
+    parser.add_argument("--twice", type=int, default=3, help="so often two run at once")
     parser.add_argument("--seed", type=int, default=1, help="of the random moments")
     parser.add_argument("--mutations", type=int, default=10_000, help="so many mutated logs")
     parser.add_argument("--shown", type=int, default=5, help="findings shown of each call")
@@ -222,7 +315,7 @@ def main() -> int:
 def faulted(options: argparse.Namespace) -> bool:
     """Break the commands, as options say."""
     only = options.only.split(",") if options.only else [case.name for case in CASES]
-    cases = [case for case in CASES if case.name in only]
+    cases = [case for case in CASES if case.name in only and (PROGRAM in os.environ or not case.url)]
     campaigns = [options.campaign] if options.campaign in STRIKES else list(STRIKES)
     return run(campaigns, cases, options)
 
