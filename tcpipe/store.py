@@ -92,15 +92,9 @@ logger = logging.getLogger("tcpipe")
 
 _HASH_IN_NAME = re.compile(r"-([0-9a-f]{8,64})$")
 _STREAMS = "streams"
-
-SPOOL = "spool"
-"""Where segments and pixels of a dataset wait until it is written, in its directory or, for a cluster, in the store; it goes in the end."""
-
 _BUCKETS = ("s3://", "gs://", "az://")
-
 _NAME_HEX = 8
 """So many digits of its log's sha256 stand in a run's name, more where two recordings of one name share them."""
-
 _MAP_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 
 
@@ -173,9 +167,8 @@ class Store:
             if free := self.map_number(name) == after:
                 maps.put_files(prefix, directory)
         told = DATA_MODEL_VERSION, f"{prefix}/{name}.zarr", f"{prefix}/{name}.png", below(prefix, checksums)
-        data = to_json(sealed(MapDocument(*told))).encode()
+        data, new = to_json(sealed(MapDocument(*told))).encode(), name_of(name, after + 1)
         same = free and after > 0 and maps.read(name_of(name, after)) == data
-        new = name_of(name, after + 1)
         if not same and not (free and maps.put_new(new, data)) and maps.read(new) != data:
             raise StoreError(f"map {name}: another process has written it meanwhile, and it stays; look at it first")
 

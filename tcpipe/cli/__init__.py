@@ -30,7 +30,7 @@ from tcpipe.cli.overlay import overlay
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
 from tcpipe.cli.preflight import preflight
-from tcpipe.cli.process import Ended, ended_in_time, prepare_process
+from tcpipe.cli.process import NOTHING_HALF, Ended, ended_in_time, prepare_process
 from tcpipe.cli.prune import prune
 from tcpipe.cli.report import report
 from tcpipe.cli.reproduce import reproduce
@@ -109,9 +109,9 @@ def _run() -> NoReturn:
         code = cli.main(prog_name="tcpipe", standalone_mode=False)
         sys.stdout.flush()
     except (click.exceptions.Abort, KeyboardInterrupt):
-        _fail(["interrupted; nothing is half-written; run the same command again"], 128 + signal.SIGINT)
+        _fail([f"interrupted; {NOTHING_HALF}"], 128 + signal.SIGINT)
     except Ended as ended:
-        _fail([f"{ended}; nothing is half-written; run the same command again"], ended.exit_code)
+        _fail([f"{ended}; {NOTHING_HALF}"], ended.exit_code)
     except click.UsageError as error:
         if not sys.argv[1:]:
             error.show()

@@ -11,6 +11,9 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from tcpipe.cli.output import say_failure
+
+NOTHING_HALF = "nothing is half-written; run the same command again"
 _LATEST_S = 4.0
 """So long a process has to end in order: a library that waits for a network or computes lets no signal through to Python."""
 
@@ -62,7 +65,7 @@ def _watch(heard: int) -> None:
         if not ending and told[0] in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             end, ending = time.monotonic() + _LATEST_S, told[0]
         left_s = max(0.0, end - time.monotonic()) if ending else None
-    os.write(2, f"tcpipe: {Ended(ending)}; nothing is half-written; run the same command again\n".encode())
+    say_failure([f"{Ended(ending)}; {NOTHING_HALF}"], 128 + ending, as_json="--json" in sys.argv)
     os._exit(128 + ending)
 
 

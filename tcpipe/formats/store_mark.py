@@ -17,6 +17,8 @@ from tcpipe.tables.levels import DATA_MODEL_VERSION
 
 MARK = "store.json"
 """Is written first where a store is new, and last where one is brought over."""
+SPOOL = "spool"
+"""Where pixels wait until a dataset is written, in its directory or, for a cluster, in the store; they go in the end."""
 
 
 def is_outdated(place: Place) -> bool:

@@ -62,8 +62,8 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         if not known.streams:
             known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
+        remember_outline(store, run_id, sha256, log)  # before it is done: then nobody looks again
         manifest = _fuse_and_label(store, run_id, streams, known, task)
-        remember_outline(store, run_id, sha256, log)
     return result_of(source, "done", facts_of(manifest, state=""), sha256, same_as=same_as)
 
 

@@ -17,11 +17,12 @@ from tcpipe.formats.numbered import numbers, read_sealed_at, stem_and_number
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
 from tcpipe.formats.record_files import DatasetMade
+from tcpipe.formats.store_mark import SPOOL
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.calls import in_bytes
 from tcpipe.pipeline.verify_store import strangers_in
 from tcpipe.recipe import Recipe
-from tcpipe.store import SPOOL, Store, open_store
+from tcpipe.store import Store, open_store
 
 _CONTENT = re.compile(r"(?:^|/)[0-9a-f]{16}/")
 """In the name of a file: a directory that is named after its content."""

@@ -24,11 +24,11 @@ from tcpipe.formats.published import FetchedShards
 from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Manifest, MapDocument, RunJson
 from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_seal_in, read_checksums, wrong_checksum
-from tcpipe.formats.store_mark import MARK
+from tcpipe.formats.store_mark import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.report.overview import shows_map
-from tcpipe.store import SPOOL, Store
+from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, READ_VERSIONS, REJECTIONS, STREAMS
 

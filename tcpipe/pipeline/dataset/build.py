@@ -48,6 +48,7 @@ from tcpipe.formats.published import has_card, here_by_range, published, settle
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.record_files import Call, DatasetMade, record_name
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
+from tcpipe.formats.store_mark import SPOOL
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
@@ -71,7 +72,7 @@ from tcpipe.report.overview import class_overview, maps_overview, relief_overvie
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.regions import Regions
-from tcpipe.store import SPOOL, Store, open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 

@@ -10,10 +10,11 @@ from synthetic_store import add_run, lanes, segments
 from tcpipe.errors import UsageError
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.record_files import DatasetMade
+from tcpipe.formats.store_mark import SPOOL
 from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import ReadConfig, Recipe
-from tcpipe.store import SPOOL, open_store
+from tcpipe.store import open_store
 
 OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
 
