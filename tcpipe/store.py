@@ -31,7 +31,7 @@ from typing import TypeVar
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket import open_place, side_by_side
 from tcpipe.formats.geoparquet import located_segments
 from tcpipe.formats.index_files import (
     RunFacts,
@@ -189,21 +189,24 @@ class Store:
         known = read_runs(self.index_place) if run_id is None else {}
         finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[tuple[str, str], str]()
         rows = dict[tuple[str, str], RunFacts]()
-        for listed in self._listed(run_id):
+
+        def seen(of: tuple[ListedRun, str, int]) -> RunDirectory | ManifestHead | StoreError:
+            try:
+                return self._ingestion(*of, known.get((of[0].run_id, of[1])))
+            except StoreError as error:
+                return error
+
+        every = [(listed, *of) for listed in self._listed(run_id) for of in listed.manifests()]
+        for (listed, recipe, _), found in zip(every, side_by_side(self.root, seen, every), strict=True):
             name, by = listed.run_id, superseded.get(listed.run_id)
-            for recipe, number in listed.manifests():
-                try:
-                    found = self._ingestion(listed, recipe, number, known.get((name, recipe)))
-                except StoreError as error:
-                    damaged.update({} if by else {(name, recipe): error.problems[0]})
-                    continue
-                if isinstance(found, ManifestHead):
-                    others.update({} if by else {name: found})
-                    continue
+            if isinstance(found, StoreError):
+                damaged.update({} if by else {(name, recipe): found.problems[0]})
+            elif isinstance(found, ManifestHead):
+                others.update({} if by else {name: found})
+            else:
                 row = found.facts
                 rows[name, recipe] = row if row.superseded_by == by else replace(row, superseded_by=by)
-                if by is None:
-                    finished.append(found)
+                finished += [found] if by is None else []
         current = {run.run_id for run in finished}
         outdated = {name: head for name, head in others.items() if name not in current}
         return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=_differ(rows, known))
@@ -252,7 +255,7 @@ class Store:
         if row.log is not None and row.log.state == state:
             return row
         try:
-            known = self.run_json(row.run_id)
+            known = self.run_json(row.run_id, of.numbers)
         except StoreError:
             known = None
         tags = known.tags if known and len(last) > 1 else row.tags
@@ -287,16 +290,18 @@ class Store:
 
     def seen_logs(self) -> dict[str, list[Sighting]]:
         """Return what is remembered of all logs, by lineage; a record that the index has is not read, while its file is as it was."""
-        known, rows = read_logs(self.index_place), dict[tuple[str, str], SeenLog]()
-        for entry in self.place.below("records").entries("logs"):
+        known = read_logs(self.index_place)
+
+        def row_of(entry: Entry) -> SeenLog | None:
             lineage, _, name = entry.name.removesuffix(".json").rpartition("/")
             row, state = known.get((lineage, name)), state_of(entry)
             if row is None or row.state != state:
                 sighting = self.recall(f"{lineage}/{name}", Sighting)
-                if sighting is None:
-                    continue
-                row = SeenLog(lineage, name, state, sighting)
-            rows[lineage, name] = row
+                row = None if sighting is None else SeenLog(lineage, name, state, sighting)
+            return row
+
+        found = side_by_side(self.root, row_of, self.place.below("records").entries("logs"))
+        rows = {(row.lineage, row.name): row for row in found if row is not None}
         if _differ(rows, known):
             write_logs(self.index_place, rows.values())
         seen: dict[str, list[Sighting]] = {}
@@ -373,9 +378,12 @@ class Store:
         """Return the tags in a document; None for number 0."""
         return read_as_at(self.runs_place, f"{run_id}/{name_of('tags', number)}", Tags).tags if number else None
 
-    def run_json(self, run_id: str) -> RunJson | None:
-        """Return what is known of a run's log, or None; `StoreError` if it is not as it was written, or another run's."""
-        last = numbers(self.runs_place.files(run_id))
+    def run_json(self, run_id: str, last: Mapping[str, int] | None = None) -> RunJson | None:
+        """Return what is known of a run's log, or None; `StoreError` if it is not as it was written, or another run's.
+
+        ``last`` are the highest numbers of its documents, where they are known.
+        """
+        last = numbers(self.runs_place.files(run_id)) if last is None else last
         if not last.get("run"):
             return None
         name = f"{run_id}/{name_of('run', last['run'])}"

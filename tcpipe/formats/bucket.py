@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import scratch_directory
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from obstore import ListResult, ObjectMeta
     from obstore.store import ObjectStore
 
+T = TypeVar("T")
+U = TypeVar("U")
+
 _PIECE_BYTES = 1 << 24
 _AT_ONCE = 8
 """Files that are on their way at once."""
@@ -33,6 +36,14 @@ _SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
 def open_place(path: str | Path) -> Place:
     """Return the place that a path or a URL names; nothing is asked of it yet."""
     return BucketPlace(str(path).rstrip("/")) if is_url(path) else DirectoryPlace(Path(path))
+
+
+def side_by_side(path: str | Path, function: Callable[[T], U], items: Sequence[T]) -> list[U]:
+    """Return what a function gives for each item, one after another; some at once where it asks a bucket, as each answer takes a while."""
+    if not is_url(path) or not items:
+        return list(map(function, items))
+    with ThreadPoolExecutor(_AT_ONCE) as pool:
+        return list(pool.map(function, items))
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +160,7 @@ class BucketPlace:
             with told(self.where(name), StoreError, what="written"):
                 obstore.put(store, key, path)
 
-        files = sorted(path for path in directory.rglob("*") if path.is_file())
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
-            list(pool.map(upload, files))
+        side_by_side(self.url, upload, sorted(path for path in directory.rglob("*") if path.is_file()))
 
     def checksum(self, name: str) -> Checksum | None:
         """Return size and sha256 of an object."""
