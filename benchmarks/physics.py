@@ -32,10 +32,10 @@ NAMES = {4: "grass", 5: "mud", 6: "unpaved", 7: "paved"}
 
 
 def plain_robot(*, half_radius_m: float = math.inf) -> SimulatedRobot:
-    """Return a robot without slip, whose torque on curves is the same at every radius unless told otherwise."""
+    """Return a robot without slip that loses 45 N in its drivetrain, whose torque on curves is the same at every radius unless told."""
     usual = SimulatedRobot()
     ground = {name: replace(of, slip=0.0) for name, of in usual.ground.items()}
-    return replace(usual, ground=ground, slope_slip=0.0, scrub_half_radius_m=half_radius_m)
+    return replace(usual, ground=ground, slope_slip=0.0, scrub_half_radius_m=half_radius_m, drivetrain_loss_newton=45.0)
 
 
 def drive_of(robot: SimulatedRobot, *, metres: float) -> Scenario:
@@ -71,7 +71,12 @@ def of_simulation(robot: SimulatedRobot, *, metres: float, seed: int) -> Sequenc
     lines = [physics_in_words("simulated robot", found)]
     weight = robot.mass_kg * GRAVITY_MPS2 / robot.drive_efficiency
     ground = {name: robot.ground[k].rolling_resistance for k, name in NAMES.items()}
-    true = {"standing": robot.idle_watt, "grade": weight, "turning": robot.scrub_torque_nm / robot.drive_efficiency}
+    true = {
+        "standing": robot.idle_watt,
+        "drivetrain": robot.drivetrain_loss_newton / robot.drive_efficiency,
+        "grade": weight,
+        "turning": robot.scrub_torque_nm / robot.drive_efficiency,
+    }
     others = (of for of in found.terms if of.term != "rolling")
     lines += [_against(f"{of.term} {of.terrain} [{of.unit}]", of.value, of.std, true[of.term]) for of in others]
     lines += [

@@ -16,7 +16,7 @@ _FOLDS = 5  # contiguous: neighbours of a held-out metre are held out, too
 _BLOCK = 10  # consecutive segments that are drawn together
 _DRAWS = 2000
 _SEED = 20260101
-_UNITS = {"standing": "W", "rolling": "N", "grade": "N", "turning": "W s/rad"}
+_UNITS = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""What physics explains of a robot's power: standing, rolling, grade and turning, fitted to its labels, and how much each takes.
+"""What physics explains of a robot's power, fitted to its labels: standing, drivetrain, rolling, grade, turning, and how much each takes.
 
 On a slope that rises by tan(s) a robot of weight m g at horizontal speed v does the mechanical work
 
@@ -7,12 +7,13 @@ On a slope that rises by tan(s) a robot of weight m g at horizontal speed v does
 a second, and a skid-steered one drags its wheels sideways with a torque that hardly depends on how fast it turns. The drive needs
 1 / efficiency of both, and gives back a share of what is negative (the slope drives the wheels)::
 
-    P = P0 + g(F v + N v tan(s) + M |yaw rate|),   g(x) = x for x > 0, k x for x < 0
+    P = P0 + D v + g(F v + N v tan(s) + M |yaw rate|),   g(x) = x for x > 0, k x for x < 0
 
-P0 is what is drawn while the robot stands, N = m g / efficiency [N], F = N c [N] and M [W per rad/s] are of a terrain class, or of all
-ground where classes are not known. All are sizes, none negative. They are fitted to the force P / v with Huber's weights (Huber 1964; k
-= 1.345), so that a minority of odd metres bends nothing. Their deviations count that neighbours err alike (White's sandwich over
-blocks of consecutive segments; Cameron and Miller, J. Human Resources 50, 2015).
+P0 is what is drawn while the robot stands, D [N] what motors and gears take as soon as they turn, on any grade, N = m g / efficiency [N],
+F = N c [N] and M [W per rad/s] are of a terrain class, or of all ground where classes are not known. All are sizes, none negative. D is
+told from F by where the slope begins to drive the robot, and is a term only where that is seen; else F holds it. They are fitted to the
+force P / v with Huber's weights (Huber 1964; k = 1.345), so that a minority of odd metres bends nothing. Their deviations count that
+neighbours err alike (White's sandwich over blocks of consecutive segments; Cameron and Miller, J. Human Resources 50, 2015).
 """
 
 from __future__ import annotations
@@ -33,6 +34,9 @@ _LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling ca
 _SURE = 0.005  # standard deviation of what halts tell of standing, of itself: looser, it takes over what rolling does
 _SUREST_WATT = 0.1  # and no less than this
 _FEWEST_DOWNHILL = 10  # segments that drive the robot: fewer tell no recovery
+_MOST_RECOVERED = (
+    0.9  # where nearly all comes back, power is as straight downhill as uphill, and no bend tells the drivetrain
+)
 _STEPS = 100  # of reweighting at most
 _HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)
 _NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal variate
@@ -41,6 +45,8 @@ _FINEST = 0.02  # of the power: no such model is better
 _PLAUSIBLE_RESISTANCE = 1.5  # coefficient of rolling resistance: tracks in deep sand stay below
 _BLOCK, _FEWEST_BLOCKS = 20, 20  # consecutive segments that may err alike, and how many such blocks there are at least
 _MOST_ROWS = 20_000  # that are fitted, evenly taken of more: coefficients are sure to a few per mille by then
+
+_ALWAYS = ("standing", "drivetrain")  # are paid on any grade, and never given back
 
 ALL = "all"
 """The ground of a fit that knows no classes, and of classes with too few segments."""
@@ -74,8 +80,8 @@ class Physics:
 
     Attributes
     ----------
-    terms : what each coefficient is of: (standing, rolling, grade or turning; terrain class or `ALL`), J of them.
-    value : P0 [W], F [N], N [N], M [W per rad/s], shape (J,).
+    terms : what each coefficient is of: (standing, drivetrain, rolling, grade or turning; terrain class or `ALL`), J of them.
+    value : P0 [W], D [N], F [N], N [N], M [W per rad/s], shape (J,).
     covariance : of the values, shape (J, J); 0 where a coefficient stands at zero.
     recovered : k, share of downhill work that comes back; 0 where nothing was driven down steeply enough to tell.
     residual_watt : robust standard deviation of what is left [W], at least 2 % of the power.
@@ -105,13 +111,15 @@ class Physics:
         slope = np.array([1.0 / grade, -rolling / grade**2])
         return rolling / grade, float(np.sqrt(slope @ self.covariance[np.ix_(places, places)] @ slope))
 
+    def is_driven(self, metres: Metres) -> NDArray[np.bool_]:
+        """Return where motors drive the robot rather than the slope, shape (M,)."""
+        always = _always(self.terms)
+        return np.asarray(_design(metres, self.terms)[:, ~always] @ self.value[~always] > 0.0)
+
     def parts_watt(self, metres: Metres) -> Floats:
         """Return what each coefficient adds to the predicted power [W], shape (M, J)."""
-        design = _design(metres, self.terms)
-        standing = np.array([term == "standing" for term, _ in self.terms])
-        driven = (design[:, ~standing] @ self.value[~standing]) > 0.0
-        gain = np.where(standing[None, :] | driven[:, None], 1.0, self.recovered)
-        return np.asarray(design * gain * self.value)
+        gain = np.where(_always(self.terms) | self.is_driven(metres)[:, None], 1.0, self.recovered)
+        return np.asarray(_design(metres, self.terms) * gain * self.value)
 
     def power_watt(self, metres: Metres) -> Floats:
         """Return the predicted power [W], shape (M,)."""
@@ -119,8 +127,8 @@ class Physics:
 
     def is_plausible(self) -> bool:
         """Return whether a robot can be so: it rolls, no heavier than tracks in deep sand, and climbing costs it something."""
-        rolling = [at for at, (term, _) in enumerate(self.terms) if term == "rolling"]
-        resistances = [self.rolling_resistance(self.terms[at][1]) for at in rolling]
+        rolling = [at for at, (term, _) in enumerate(self.terms) if term in {"rolling", "drivetrain"}]
+        resistances = [self.rolling_resistance(name) for term, name in self.terms if term == "rolling"]
         climb = self.of("grade")
         return bool(self.value[rolling].max() > 0.0 and (climb is None or climb[0] > 0.0)) and all(
             of is None or of[0] < _PLAUSIBLE_RESISTANCE for of in resistances
@@ -149,16 +157,26 @@ def fit_physics(metres: Metres, *, standing_watt: float | None = None, turning: 
     used = metres.take(rows[:: -(-rows.size // _MOST_ROWS)])
     terms = _terms(used, standing_watt=standing_watt, turning=turning)
     found = _fitted(used, terms, standing_watt)
-    told = found.of("standing")
-    if (
-        standing_watt is None and told is not None and told[0] <= 2.0 * told[1]
-    ):  # nobody saw it stand, and nothing tells it from rolling
-        found = _fitted(used, [term for term in terms if term[0] != "standing"], None)
+    for term in ("drivetrain", "standing"):
+        if not _is_told(found, term, used) and not (term == "standing" and standing_watt is not None):
+            terms = [known for known in terms if known[0] != term]
+            found = _fitted(used, terms, standing_watt)
     off = used.power_watt - found.power_watt(used)
     spread = _NORMAL * float(np.median(np.abs(off - np.median(off))))
     return replace(
         found, residual_watt=max(spread, _FINEST * float(np.median(np.abs(used.power_watt)))), segments=rows.size
     )
+
+
+def _is_told(found: Physics, term: str, metres: Metres) -> bool:
+    """Return whether a term is sure to be there: what nothing tells from rolling is rolling's."""
+    value, std = found.of(term) or (np.inf, 0.0)
+    bend = (~found.is_driven(metres)).sum() >= _FEWEST_DOWNHILL and found.recovered < _MOST_RECOVERED
+    return bool(value > 2.0 * std and (bend or term != "drivetrain"))
+
+
+def _always(terms: Sequence[tuple[str, str]]) -> NDArray[np.bool_]:
+    return np.array([term in _ALWAYS for term, _ in terms])
 
 
 def _terms(metres: Metres, *, standing_watt: float | None, turning: bool) -> list[tuple[str, str]]:
@@ -168,8 +186,10 @@ def _terms(metres: Metres, *, standing_watt: float | None, turning: bool) -> lis
     classes = own if len(own) == len(names) else [*own, ALL]
     spread = float(np.std(metres.velocity_mps)) > _LEAST_SPEED * float(np.median(metres.velocity_mps))
     terms = [("standing", ALL)] if standing_watt is not None or spread else []
+    hilly = float(np.std(metres.rise)) >= _LEAST_SLOPE
+    terms += [("drivetrain", ALL)] if hilly else []
     terms += [("rolling", name) for name in classes]
-    terms += [("grade", ALL)] if float(np.std(metres.rise)) >= _LEAST_SLOPE else []
+    terms += [("grade", ALL)] if hilly else []
     return terms + ([("turning", name) for name in classes] if turning else [])
 
 
@@ -177,6 +197,7 @@ def _design(metres: Metres, terms: Sequence[tuple[str, str]]) -> Floats:
     """Return what each coefficient is multiplied with, shape (M, J)."""
     of = {
         "standing": np.ones_like(metres.velocity_mps),
+        "drivetrain": metres.velocity_mps,
         "rolling": metres.velocity_mps,
         "grade": metres.velocity_mps * metres.rise,
         "turning": metres.turn_rate_radps,
@@ -190,29 +211,38 @@ def _design(metres: Metres, terms: Sequence[tuple[str, str]]) -> Floats:
 
 
 def _fitted(metres: Metres, terms: Sequence[tuple[str, str]], standing_watt: float | None) -> Physics:
-    """Return the coefficients by iteratively reweighted least squares on the force P / v; what is measured at halts is one row more."""
-    is_standing = np.array([term == "standing" for term, _ in terms])
+    """Return the coefficients by iteratively reweighted least squares on the force P / v; what is measured at halts is one row more.
+
+    Of downhill metres force is a product of k and the coefficients: each step solves for both by its tangent (Gauss and Newton).
+    """
+    always, count = _always(terms), len(terms)
     design = _design(metres, terms) / metres.velocity_mps[:, None]
     force = metres.power_watt / metres.velocity_mps
-    value, recovered = np.zeros(len(terms)), 0.5
-    prior = None if standing_watt is None else is_standing / max(_SURE * standing_watt, _SUREST_WATT)
+    value, recovered = np.zeros(count), 0.0
+    prior = None if standing_watt is None else np.zeros(count + 1)
+    if prior is not None and standing_watt is not None:
+        prior[terms.index(("standing", ALL))] = 1.0 / max(_SURE * standing_watt, _SUREST_WATT)
     made, off, weight, scale = design, force, np.ones_like(force), 1.0
-    for step in range(_STEPS):
-        traction = design[:, ~is_standing] @ value[~is_standing]
-        driven = (traction > 0.0) | (step == 0)
-        recovered = _recovered(traction, force - design[:, is_standing] @ value[is_standing], weight, ~driven)
-        made = np.where(is_standing[None, :] | driven[:, None], design, recovered * design)
-        off = force - made @ value
+    for _ in range(_STEPS):
+        traction = np.minimum(design[:, ~always] @ value[~always], 0.0)
+        driven = traction == 0.0
+        if (~driven).sum() < _FEWEST_DOWNHILL:
+            traction, recovered = np.zeros_like(force), 0.0
+        made = np.column_stack([np.where(always | driven[:, None], design, recovered * design), traction])
+        off = force - made[:, :count] @ value
         scale = max(_NORMAL * float(np.median(np.abs(off))), 1e-9)
         weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(off), 1e-12))
-        by, seen = made * np.sqrt(weight)[:, None] / scale, force * np.sqrt(weight) / scale
+        by = made * np.sqrt(weight)[:, None] / scale
+        seen = (force + recovered * traction) * np.sqrt(weight) / scale
         if prior is not None and standing_watt is not None:
             by, seen = np.vstack([by, prior]), np.append(seen, prior.max() * standing_watt)
         q, r = np.linalg.qr(by)
-        before, value = value, _sizes(r, q.T @ seen)
+        before, found = value, _sizes(r, q.T @ seen)
+        value, recovered = found[:count], min(float(found[count]), 1.0)
         if np.abs(value - before).max() < 1e-7 * np.abs(value).max():
             break
-    covariance = _covariance(made, off, weight, scale, free=value > 0.0, prior=prior)
+    free = np.append(value > 0.0, 0.0 < recovered < 1.0)
+    covariance = _covariance(made, off, weight, scale, free=free, prior=prior)[:count, :count]
     return Physics(tuple(terms), value, covariance, recovered, 0.0, len(force))
 
 
@@ -222,19 +252,10 @@ def _sizes(made: Floats, seen: Floats) -> Floats:
     return plain if (plain >= 0.0).all() else non_negative(made, seen)
 
 
-def _recovered(traction: Floats, force: Floats, weight: Floats, down: NDArray[np.bool_]) -> float:
-    """Return which share of the work downhill comes back; 0 where too little is driven down to tell."""
-    if down.sum() < _FEWEST_DOWNHILL:
-        return 0.0
-    work = weight[down] * traction[down]
-    size = float(work @ traction[down])  # 0 where standing is said to take all that was measured
-    return float(np.clip((work @ force[down]) / size, 0.0, 1.0)) if size > 0.0 else 0.0
-
-
 def _covariance(
     made: Floats, off: Floats, weight: Floats, scale: float, *, free: NDArray[np.bool_], prior: Floats | None
 ) -> Floats:
-    """Return the covariance of the coefficients, shape (J, J), by what blocks of consecutive rows leave over."""
+    """Return the covariance of coefficients and k, shape (J + 1, J + 1), by what blocks of consecutive rows leave over."""
     rows = made[:, free] / scale
     length = max(1, min(_BLOCK, len(rows) // _FEWEST_BLOCKS))
     starts = np.arange(0, len(rows), length)

@@ -259,7 +259,7 @@ class DatasetCard:
     findings: tuple[RunFinding, ...] = ()
     """What ingest found of the runs, by cause."""
     physics: Mapping[str, PhysicsFit] = field(default_factory=dict, metadata=LEFT_OUT)
-    """By robot, what standing, rolling, grade and turning take of its power on each class; without robots for which nothing fits."""
+    """By robot, what standing, drivetrain, rolling, grade and turning take on each class; without robots for which nothing fits."""
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""

@@ -145,7 +145,7 @@ class Model:
 
     @property
     def physics(self) -> PhysicsFit | None:
-        """What standing, rolling, grade and turning cost the robot."""
+        """What standing, drivetrain, rolling, grade and turning cost the robot."""
         return self.card.physics
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -20,18 +20,18 @@ from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 Floats = NDArray[np.float64]
 
 _CLASSES = 256
-_NO_LOAD_QUANTILES = (0.01, 0.03, 0.1, 0.2, 0.3, 0.5)
-"""Of the power, that are tried for what is drawn without any load."""
 
 
 @dataclass(frozen=True, slots=True)
 class PhysicsModel:
-    """P = P0 + g(F v + N v tan(s) + M v |turn|), and v as a curve over the slope s."""
+    """P = P0 + D v + g(F v + N v tan(s) + M v |turn|), and v as a curve over the slope s."""
 
     speed: Curves
     """One output [m/s], straight in each third of the slopes."""
     no_load_watt: Floats
     """P0, shape ()."""
+    drivetrain_newton: Floats
+    """D, shape ()."""
     grade_newton: Floats
     """N, shape ()."""
     recovered: Floats
@@ -49,7 +49,8 @@ class PhysicsModel:
         turn = np.where(np.isfinite(beside.turn_radpm), beside.turn_radpm, self.usual_turn_radpm)
         force = self.rolling_newton[beside.class_id] + self.grade_newton * np.tan(beside.slope_rad)
         work = velocity * (force + self.turning_joule_per_rad[beside.class_id] * turn)
-        return np.column_stack([self.no_load_watt + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
+        always = self.no_load_watt + self.drivetrain_newton * velocity
+        return np.column_stack([always + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return everything by name, as `physics_model_of` takes it."""
@@ -62,6 +63,7 @@ _NUMBERS = tuple(of.name for of in fields(PhysicsModel) if of.name != "speed")
 def physics_model_of(arrays: Mapping[str, NDArray[Any]], where: str) -> PhysicsModel:
     """Return the model that `PhysicsModel.arrays` told of; `ModelError` if these are another's."""
     speed, rest = curves_of("linear", arrays, where)
+    rest = {"drivetrain_newton": np.array(0.0), **rest}  # models before 0.7 have all of it in P0
     if rest.keys() != set(_NUMBERS):
         raise ModelError(f"{where}: holds the weights of another model; train the model again")
     return PhysicsModel(speed, **rest)
@@ -77,9 +79,7 @@ def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | 
     labels
         Power [W] and velocity [m/s], finite, shape (N, 2).
     standing_watt
-        What the robot was seen to draw while it stood; None where it was not. Drives that turn may draw more without any load, and
-        where speeds hardly vary nothing tells that from rolling but the ground that is driven down: of this and some of the smaller
-        powers, that one is P0 which leaves the least error.
+        What the robot was seen to draw while it stood; None where it was not.
 
     Raises
     ------
@@ -90,27 +90,19 @@ def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | 
     names = np.where(beside.class_id > 0, beside.class_id.astype(np.str_), ALL)
     power, velocity = labels.T
     metres = Metres(power, velocity, np.tan(beside.slope_rad), beside.turn_radpm * velocity, names)
-    found = _best(metres, [standing_watt, *np.quantile(power, _NO_LOAD_QUANTILES).tolist()])
+    found = fit_physics(metres, standing_watt=standing_watt)
     if found is None:
         raise ModelError(f"{len(labels)} samples to fit physics to, wanted at least {FEWEST} that move")
     known = beside.turn_radpm[np.isfinite(beside.turn_radpm)]
     return PhysicsModel(
         speed=fit_curves("linear", beside.slope_rad, beside.class_id, labels[:, 1:]),
         no_load_watt=_of_all(found, "standing"),
+        drivetrain_newton=_of_all(found, "drivetrain"),
         grade_newton=_of_all(found, "grade"),
         recovered=np.array(found.recovered),
         usual_turn_radpm=np.array(float(known.mean()) if known.size else 0.0),
         rolling_newton=_by_class(found, "rolling"),
         turning_joule_per_rad=_by_class(found, "turning"),
-    )
-
-
-def _best(metres: Metres, candidates_watt: Sequence[float | None]) -> Physics | None:
-    """Return the fit of the least mean error among those with each of these powers at no load."""
-    fits = [fit_physics(metres, standing_watt=None if watt is None else max(watt, 0.0)) for watt in candidates_watt]
-    found = [fit for fit in fits if fit is not None]
-    return min(
-        found, key=lambda fit: float(np.nanmean(np.abs(metres.power_watt - fit.power_watt(metres)))), default=None
     )
 
 

@@ -1,4 +1,4 @@
-"""What standing, rolling, grade and turning take of a robot's energy, in words."""
+"""What standing, drivetrain, rolling, grade and turning take of a robot's energy, in words."""
 
 from __future__ import annotations
 
@@ -49,4 +49,4 @@ def _with_std(of: PhysicsTerm) -> str:
 def physics_sections(fits: dict[str, PhysicsFit]) -> list[Section]:
     """Return a section of the fits by robot; none where there are none."""
     text = " ".join(physics_in_words(robot, fit) for robot, fit in fits.items())
-    return [Section("What a metre costs: standing, rolling, grade, turning", text)] if fits else []
+    return [Section("What a metre costs: standing, drivetrain, rolling, grade, turning", text)] if fits else []

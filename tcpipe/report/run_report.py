@@ -157,7 +157,7 @@ def _physics_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: s
         return []
     left = _column(segments, "power_watt").astype(float) - _column(segments, "physics_power_watt").astype(float)
     text = (
-        f"Power minus what standing, rolling, grade and turning, fitted on this run, predict ({physics.segments} segments): "
+        f"Power minus what standing, drivetrain, rolling, grade and turning, fitted on this run, predict ({physics.segments} segments): "
         f"terrain and errors. {physics.outliers} segments are further than four standard deviations of "
         f"{physics.residual_watt:.0f} W."
     )

@@ -15,7 +15,7 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS
 
 
 def with_physics(table: pa.Table, standing_watt: float) -> tuple[pa.Table, PhysicsFacts]:
-    """Return the labelled segments with the power that standing, rolling, grade and turning predict, and the fit.
+    """Return the labelled segments with the power that standing, drivetrain, rolling, grade and turning predict, and the fit.
 
     Parameters
     ----------

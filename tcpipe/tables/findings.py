@@ -338,10 +338,10 @@ class EnergyBudget:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsTerm:
-    """A coefficient of P = standing + rolling v + grade v tan(s) + turning |yaw rate|, and its standard deviation."""
+    """A coefficient of P = standing + drivetrain v + rolling v + grade v tan(s) + turning |yaw rate|, and its standard deviation."""
 
     term: str
-    """``standing``, ``rolling``, ``grade`` or ``turning``."""
+    """``standing``, ``drivetrain`` (motors and gears, paid on any grade), ``rolling``, ``grade`` or ``turning``."""
     terrain: str
     """The class of terrain, or ``all``."""
     value: float
@@ -359,7 +359,7 @@ class PhysicsScore:
 
 @dataclass(frozen=True, slots=True)
 class PhysicsFit:
-    """What standing, rolling, grade and turning take of a robot's power (`tcpipe.cost.physics`)."""
+    """What standing, drivetrain, rolling, grade and turning take of a robot's power (`tcpipe.cost.physics`)."""
 
     segments: int
     terms: tuple[PhysicsTerm, ...]

@@ -380,7 +380,7 @@ _LABEL_COLUMNS = (
         "physics_power_watt",
         _F64,
         "W",
-        "power by standing, rolling, grade and turning alone, fitted on the run; null without power or fit",
+        "power by standing, drivetrain, rolling, grade and turning alone, fitted on the run; null without power or fit",
         nullable=True,
     ),
     Column("power_samples", pa.int32(), "1", "power samples inside the segment"),

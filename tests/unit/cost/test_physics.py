@@ -34,11 +34,33 @@ def test_where_nobody_saw_it_stand_the_speeds_tell():
     assert steady.is_plausible()
 
 
-def test_standard_deviations_hold_what_noise_does():
+@pytest.mark.parametrize("speeds", [(0.6, 1.0), (0.8, 0.81)])
+@pytest.mark.parametrize("standing_watt", [STANDING_WATT, None])
+def test_what_motors_take_on_any_grade_is_no_rolling(speeds, standing_watt):
+    """14 W at halts, 80 N of motors and gears: where the slope begins to drive the robot tells them from rolling."""
+    metres = made(1, drivetrain_newton=80.0, speeds=speeds)
+    found = fit_physics(metres, standing_watt=standing_watt)
+    unseen = 0.0 if found.of("standing") else STANDING_WATT / np.mean(speeds)  # at one speed a force as any other
+    assert found.of("drivetrain")[0] == pytest.approx(80.0 + unseen, rel=0.01)
+    assert [found.rolling_resistance(name)[0] for name in RESISTANCE] == pytest.approx([*RESISTANCE.values()], rel=0.01)
+    assert found.recovered == pytest.approx(RECOVERED, rel=0.01)
+    np.testing.assert_allclose(found.power_watt(metres), metres.power_watt, atol=0.5)
+
+
+def test_where_the_slope_never_drives_the_robot_rolling_holds_all_that_is_paid_always():
+    metres = made(2, drivetrain_newton=80.0)
+    found = fit_physics(metres.take(metres.rise > -0.1), standing_watt=STANDING_WATT)
+    assert found.of("drivetrain") is None
+    assert found.of("rolling", "grass")[0] == pytest.approx(80.0 + NEWTON * RESISTANCE["grass"], rel=1e-4)
+
+
+@pytest.mark.parametrize("drivetrain_newton", [0.0, 80.0])
+def test_standard_deviations_hold_what_noise_does(drivetrain_newton):
     """Over many drawings: of z = (found - true) / deviation about two thirds lie within one, and nearly all within three."""
     z = []
     for seed in range(40):
-        found = fit_physics(made(seed, 400, noise_watt=20.0), standing_watt=STANDING_WATT)
+        metres = made(seed, 400, noise_watt=20.0, drivetrain_newton=drivetrain_newton)
+        found = fit_physics(metres, standing_watt=STANDING_WATT)
         for name, resistance in RESISTANCE.items():
             turning, rolling = found.of("turning", name), found.rolling_resistance(name)
             z += [(turning[0] - TURNING[name]) / turning[1], (rolling[0] - resistance) / rolling[1]]
