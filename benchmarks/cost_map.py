@@ -31,7 +31,7 @@ from tcpipe.planning.cost_model import BATCH_PATCHES
 from tcpipe.planning.survey import new_survey
 
 ROUNDS = 5
-WANTED = 0.8
+WANTED = 0.9
 
 
 def timed(run: Callable[[], object]) -> tuple[float, float]:

@@ -4,9 +4,10 @@
 
 Drives wander over the paper's simulated site. They are simulated as labels, metre by metre, not as logs: time and energy of the plant
 at 11 points of a metre, with the hidden resistance of the place, a level of the run's own (5 % of the resistance, 2 % of the speed), the
-fluctuation in time, and end points that err by 2 cm, whose errors neighbours share with opposite sign. The table sees class, slope and
-cross slope, as of a patch. Its residuals are those of blocks of 10 m, as training has them. Coverage is the mean over the further drives,
-with the 95 % interval of drawing them anew (percentile bootstrap, 2000 draws); 90 is to lie in it.
+fluctuation in time, and end points that err by 2 cm, whose errors neighbours share with opposite sign. The table is the one that `train`
+fits, curves and trees; it sees class, slope, its change and cross slope, as of a patch. Its residuals are those of blocks of 10 m, as
+training has them. Coverage is the mean over the further drives, with the 95 % interval of drawing them anew (percentile bootstrap, 2000
+draws); 90 is to lie in it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.cost.prediction_errors import Errors, centring_of, errors_of
-from tcpipe.learning.forest import Forest, grow
+from tcpipe.learning.table_model import TableModel, fit_table
 from tcpipe.planning.pieces import cut_path
 from tcpipe.simulation import scenario
 from tcpipe.simulation.robot import SimulatedRobot
@@ -32,6 +33,7 @@ LENGTHS = (1, 10, 30, 100)
 POINTS = 11
 END_STD_M, RUN_RESISTANCE, RUN_SPEED = 0.02, 0.05, 0.02
 QUANTITIES = ("duration", "energy")
+CHANNELS, CLASS_COUNT = ("height", "terrain"), 7
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,9 @@ def drive(world: World, robot: SimulatedRobot, rng: np.random.Generator, *, metr
     length = 1.0 + np.diff(END_STD_M * rng.standard_normal(len(x) + 1))  # of ground in what was taken for a metre
     duration, energy = length * np.mean(1.0 / velocity, axis=1), length * np.mean(power / velocity, axis=1)
     begun = np.concatenate([[0.0], np.cumsum(duration)[:-1]])
-    shares = np.stack([(classes == k).mean(axis=1) for k in (4, 5, 6, 7)], axis=1)
-    features = np.column_stack([slope.mean(axis=1), np.abs(cross.mean(axis=1)), np.ptp(slope, axis=1), shares])
+    shares = np.stack([(classes == k + 1).mean(axis=1) for k in range(CLASS_COUNT)], axis=1)
+    unknown = np.zeros((len(x), 3))  # curvature across, roughness and relief
+    features = np.column_stack([slope.mean(axis=1), np.abs(cross.mean(axis=1)), np.ptp(slope, axis=1), unknown, shares])
     blocks = np.floor(ends.mean(axis=1) / 10.0).astype(np.int64)
     under = np.array([np.bincount(row).argmax() for row in classes])
     return Drive(
@@ -108,7 +111,7 @@ def drive(world: World, robot: SimulatedRobot, rng: np.random.Generator, *, metr
     )
 
 
-def trained(drives: list[Drive]) -> tuple[Forest, dict[str, NDArray[np.generic]]]:
+def trained(drives: list[Drive]) -> tuple[TableModel, dict[str, NDArray[np.generic]]]:
     """Return a table of all metres, and what the other folds said of each."""
     features = np.concatenate([of.features for of in drives])
     labels = np.column_stack(
@@ -117,15 +120,16 @@ def trained(drives: list[Drive]) -> tuple[Forest, dict[str, NDArray[np.generic]]
     folds = np.random.default_rng(0).permuted(np.arange(5).repeat(200_000))[
         np.concatenate([of.block for of in drives]) % 1_000_000
     ]
-    grown = grow(features, labels, np.ones_like(labels), folds)
-    return grown.forest, {
+    weights = np.ones_like(labels)
+    table, said = fit_table(features, labels, weights, folds, channels=CHANNELS, class_count=CLASS_COUNT)
+    return table, {
         "run_id": np.concatenate([[of.run] * len(of.block) for of in drives]),
         "start_ns": np.concatenate([of.start_ns for of in drives]),
         "terrain_class": np.concatenate([of.class_id for of in drives]),
         "power_watt": labels[:, 0],
         "velocity_mps": labels[:, 1],
-        "power_predicted_watt": grown.held_out[:, 0],
-        "velocity_predicted_mps": grown.held_out[:, 1],
+        "power_predicted_watt": said[:, 0],
+        "velocity_predicted_mps": said[:, 1],
     }
 
 
@@ -167,11 +171,11 @@ def trial(
     """Train on drives and yield `held` of further ones."""
     site = scenario("paper")
     made = [drive(site.world, site.drives[0].robot, rng, metres=metres, run=f"run{k}") for k in range(train + further)]
-    forest, residuals = trained(made[:train])
+    table, residuals = trained(made[:train])
     centring, errors = centring_of(residuals), errors_of(residuals)
     assert errors is not None
     for of in made[train:]:
-        power, velocity = centring.apply(*forest.predict(of.features).T, of.class_id)
+        power, velocity = centring.apply(*table.predict(of.features).T, of.class_id)
         yield from held(errors, {"duration": 1.0 / velocity, "energy": power / velocity}, of)
 
 
