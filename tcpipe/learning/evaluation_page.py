@@ -148,7 +148,7 @@ def _baselines(found: Evaluation) -> Section:
         "baseline's, with their 95 % interval (paired bootstrap over runs or blocks): below 1 the model is better. Physics and boosting "
         "are told the turn of each metre, too. "
     )
-    text += COUNTED + ". ".join(verdicts(found.baselines))
+    text += f"{COUNTED}{'. '.join(verdicts(found.baselines))}. {audit_lines(found)}"
     if not found.baselines:
         return Section("Beside what is simplest")
     return Section("Beside what is simplest", text, header=header, rows=rows, figures_from=3)
@@ -192,13 +192,30 @@ def _by_class(found: Evaluation) -> list[Section]:
         sections.append(
             Section(
                 f"Table {number}: {_CALLED[name]}",
-                f"{_TEXT[name]} {COUNTED}{leakage_line(part.leakage)}",
+                f"{_TEXT[name]} {_told_by(found)}{COUNTED}{leakage_line(part.leakage)}",
                 header=header,
                 rows=rows,
                 figures_from=2,
             )
         )
     return sections
+
+
+def _told_by(found: Evaluation) -> str:
+    """Return what samples the model knows its own errors by, in words."""
+    training = found.model.training
+    count = training.samples["held out"]
+    if training.config.model == "resnet18":
+        return (
+            f"Intervals, NLL and CRPS rest on its errors on the one fold of train that stopped it ({count} samples), which it fits a "
+            "little too well: no second network was trained for them. "
+        )
+    return f"Intervals, NLL and CRPS rest on its errors on all {count} samples of train, each told by the other folds. "
+
+
+def audit_lines(found: Evaluation) -> str:
+    """Return how much of each split was met in training, in words."""
+    return " ".join(f"{split}: {leakage_line(found.splits[split].leakage)}" for split in found.ordered_splits)
 
 
 def leakage_line(leakage: Leakage | None) -> str:
@@ -240,7 +257,7 @@ def _ablation(found: Evaluation) -> Section:
     header = ("layers", "", "", *(f"{q} {(MEASURES | SCORES)[m]} [{_unit(m, q)}]" for q, m in _ABLATION_COLUMNS))
     draws = found.config.draws
     text = f"Layers not named are replaced by noise, mean of {draws} draws; retrained: a network that never had them. {COUNTED}"
-    text += " ".join(f"{split}: {leakage_line(found.splits[split].leakage)}" for split in splits)
+    text += audit_lines(found)
     return Section("Table III: ablation", text, header=header, rows=rows, figures_from=3)
 
 
@@ -287,7 +304,7 @@ def _compared(
         "",
         *(f"{split}, {called} [{_unit(m, quantity)}]" for split in splits for m, called in (MEASURES | SCORES).items()),
     )
-    text += " " + COUNTED + " ".join(f"{split}: {leakage_line(found.splits[split].leakage)}" for split in splits)
+    text += f" {COUNTED}{audit_lines(found)}"
     return Section(title, text, header=header, rows=rows, figures_from=2)
 
 

@@ -30,13 +30,14 @@ mean power w [W] and velocity v [m/s] give T = d / v and E = w d / v with d = {{
   as many as are best where each fold of train is predicted by the others; the loss {{ config.loss }} there is
   {{ "%.4f" | format(told.held_out_loss) }}.
 {% elif config.model == "physics" -%}
-- Physics: standing, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted robustly. Its
-  loss {{ config.loss }} where each fold of train is predicted by the others is {{ "%.4f" | format(told.held_out_loss) }}. Of a patch it
-  takes slope and class, which `predict` is told beside it.
+- Physics: standing, drivetrain, grade, and rolling and turning of each class, at a speed that is a curve over class and slope; fitted
+  robustly. Its loss {{ config.loss }} where each fold of train is predicted by the others is {{ "%.4f" | format(told.held_out_loss) }}.
+  Of a patch it takes slope and class, which `predict` is told beside it.
 {% else -%}
 - Network: ResNet-18 of width {{ width }}; loss {{ config.loss }}, Adam {{ config.learning_rate }}, batch {{ config.batch }},
   seed {{ config.seed }}; best of {{ told.epochs }} epochs by fold {{ config.fold }} of train: {{ told.best_epoch }},
-  loss {{ "%.4f" | format(told.held_out_loss) }}.
+  loss {{ "%.4f" | format(told.held_out_loss) }}. Its intervals rest on its errors on the
+  {{ told.samples["held out"] }} samples of that one fold, which it fits a little too well.
 {% endif -%}
 - Trained on {{ told.samples["fitted"] }} samples of {{ dataset.name }}, checksum {{ dataset.sha256 }}.
 - Seen: {{ classes }}; slope {{ slope }}; relief of a patch {{ relief }}. Beyond these it has no business.

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from tcpipe.learning.claims import Claim
 from tcpipe.learning.evaluation_facts import Evaluation
 from tcpipe.learning.evaluation_files import SIMULATED
-from tcpipe.learning.evaluation_page import evaluation_page
+from tcpipe.learning.evaluation_page import audit_lines, evaluation_page
 from tcpipe.learning.fidelity import differences
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
 from tcpipe.learning.plant_floor import CLASS_AND_SLOPE
@@ -42,7 +42,7 @@ def reproduction_page(
         title="The paper's experiment on a simulated site",
         lead=f"Of {len(claims)} claims: {told}; {len(runs)} training{'s' if len(runs) > 1 else ''}.",
         before=[
-            _claims(claims),
+            _claims(claims, audit_lines(runs[0])),
             _floor(runs[0]),
             _variance(shares, hidden),
             _driven(splits, terrain),
@@ -54,14 +54,15 @@ def reproduction_page(
     )
 
 
-def _claims(claims: Sequence[Claim]) -> Section:
+def _claims(claims: Sequence[Claim], audit: str) -> Section:
     rows = [
         (claim.says, claim.split, claim.verdict, str(claim.ratio), "–" if claim.in_the_paper is None else f"{claim.in_the_paper:.2f}")
         for claim in claims
     ]  # fmt: skip
     text = (
         "RMSE of E of the network over a baseline's, of the same samples, with its 95 % interval: held if all of it lies below 1, NOT held "
-        "if above, open if it holds 1. Height, class and slow ground matter by construction of the site, so they are no claims."
+        "if above, open if it holds 1. Height, class and slow ground matter by construction of the site, so they are no claims. "
+        + audit
     )
     header = ("claim", "split", "", "here", "the paper")
     return Section("What could have failed", text, header=header, rows=rows, figures_from=3)
@@ -78,7 +79,8 @@ def _floor(run: Evaluation) -> Section:
             rmse = (f"{value:.3f} {UNITS[quantity]}" for value in (here.rmse, least.rmse, here.rmse - least.rmse))
             mape = (here.mape_percent, least.mape_percent, here.mape_percent - least.mape_percent)
             rows.append((split, quantity, *rmse, *(f"{value:.2f} %" for value in mape)))
-    text = "The floor knows the simulator, map, path and turn without error; what nothing shows and the labels' noise are left to it."
+    text = "The floor knows the simulator, map, path and turn without error; what nothing shows and the labels' noise are left to it. "
+    text += audit_lines(run)
     header = ("", "", "RMSE", "of the floor", "excess", "MAPE", "of the floor", "excess")
     return Section("How far above the floor", text, header=header, rows=rows, figures_from=2)
 
@@ -132,7 +134,8 @@ def _seeds(runs: Sequence[Evaluation]) -> list[Section]:
             )
             rows.append((split, quantity, *figures))
     header = ("", "", *(f"seed {number}" for number in range(len(runs))))
-    return [Section("Every training: RMSE and MAPE of all classes", header=header, rows=rows, figures_from=2)]
+    title = "Every training: RMSE and MAPE of all classes"
+    return [Section(title, audit_lines(runs[0]), header=header, rows=rows, figures_from=2)]
 
 
 def _sources(*, quick: bool) -> Section:
