@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
 from tcpipe.cli.options import (
-    OUTPUT_DIRECTORY,
+    PUBLISHED,
     SEALED,
     FloatRange,
     LonLat,
@@ -21,7 +19,7 @@ from tcpipe.cli.options import (
 
 @click.command("cost-map", short_help="Directional cost maps of a whole map")
 @click.argument("model", type=SEALED, metavar="MODEL")
-@click.argument("out", default="cost-map", type=OUTPUT_DIRECTORY, metavar="[OUT]")
+@click.argument("out", default="cost-map", type=PUBLISHED, metavar="[OUT]")
 @map_option
 @click.option(
     "--step",
@@ -57,7 +55,7 @@ def cost_map(
     """Predict power, velocity, time and energy a metre along 16 courses in every cell of a map.
 
     Writes to OUT (default: cost-map) Cloud-Optimised GeoTIFFs with a band a course, the reasons where MODEL has no business, and
-    maps for Nav2. An interrupted call goes on where it was.
+    maps for Nav2. An interrupted call goes on where it was; OUT may be a URL in a bucket, where nothing is replaced.
     """
     from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.models import chosen_model
@@ -67,5 +65,5 @@ def cost_map(
     with progress("cost-map", 1, quiet=quiet) as shown:
         source = chosen_map(store, map_name)
         found = chosen_model(model, speed_mps=speed_mps)
-        result = make_cost_map(found, source, Path(out), step_m=step_m, origin_deg=origin_deg, step=shown.count)
+        result = make_cost_map(found, source, out, step_m=step_m, origin_deg=origin_deg, step=shown.count)
     say_result(result, as_json=as_json)

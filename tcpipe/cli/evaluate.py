@@ -5,7 +5,7 @@ from __future__ import annotations
 import click
 
 from tcpipe.cli.options import (
-    OUTPUT_DIRECTORY,
+    PUBLISHED,
     SEALED,
     SEED,
     json_option,
@@ -18,7 +18,7 @@ from tcpipe.cli.options import (
 @click.command(short_help="Measure a model, beside the paper's tables")
 @click.argument("model", type=SEALED, metavar="MODEL")
 @click.argument("dataset", type=SEALED, metavar="DATASET")
-@click.argument("out", default="evaluation", type=OUTPUT_DIRECTORY, metavar="[OUT]")
+@click.argument("out", default="evaluation", type=PUBLISHED, metavar="[OUT]")
 @click.option(
     "--draws",
     default=5,
@@ -59,7 +59,7 @@ def evaluate(
 
     RMSE and MAPE of power, velocity, time and energy by terrain class; the ablation of the input layers; the baselines of Wei and
     Isler and the expected time; what the labels' own noise allows; each beside the paper's own figures. Networks that it trains are
-    kept in OUT and used again.
+    kept in OUT and used again. OUT may be a URL in a bucket, where nothing is replaced.
 
     With --drive: time and energy of whole drives, measured against predicted on the store's map, with intervals and a picture, in
     drives.json and drives.html of OUT; DATASET, that MODEL was trained on, tells whether a drive was held back.

@@ -120,7 +120,7 @@ map_option = click.option(
 
 physics_option = click.option(
     "--physics",
-    type=INPUT_DIRECTORY,
+    type=SEALED,
     metavar="DATASET",
     help="Dataset whose card says what turning costs the robot (default: the one that MODEL was trained on).",
 )

@@ -82,11 +82,12 @@ def plan_path(
     Exit code 3: some of the path has no cost, because --step is large.
     """
     from tcpipe.cli.output import progress, say_result
+    from tcpipe.formats.published import here
     from tcpipe.learning.models import chosen_model
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.plan_files import PlanRequest, plan
 
-    request = PlanRequest(start, goal, objective, step_m, allow_unseen, Path(cost_map) if cost_map else None)
+    request = PlanRequest(start, goal, objective, step_m, allow_unseen, here(cost_map) if cost_map else None)
     with progress("plan-path", 1, quiet=quiet) as shown:
         source = chosen_map(store, map_name)
         drawn = Path(picture) if picture else None

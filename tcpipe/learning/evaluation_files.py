@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
+from tcpipe.formats.bucket import open_place
 from tcpipe.formats.dataset_files import is_shard, read_card
-from tcpipe.formats.json_files import digest, read_as, read_json, write_json
-from tcpipe.formats.published import here, here_by_range
+from tcpipe.formats.json_files import digest, parse_json, read_as, read_json, typed, write_json
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import here, here_by_range, published
 from tcpipe.formats.seals import sealed
 from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
@@ -32,7 +34,7 @@ JSON, CSV, PAGE = "evaluation.json", "evaluation.csv", "evaluation.html"
 class EvaluationResult:
     """What was found and where it lies; ``str`` of it is what the command prints."""
 
-    path: Path
+    path: Path | str
     values: Evaluation
 
     def __str__(self) -> str:
@@ -49,7 +51,7 @@ class EvaluationResult:
                 lines.append(f"{split}: 90 % intervals hold {energy.held_percent:.1f} % of E, CRPS {energy.crps:.2f} J")
             lines.append(f"{split}: {leakage_line(part.leakage)}")
         lines += verdicts(self.values.baselines)
-        return plain_lines((*lines, f"open {self.path / PAGE}"))
+        return plain_lines((*lines, f"open {self.path}/{PAGE}"))
 
 
 def run_evaluation(
@@ -62,7 +64,7 @@ def run_evaluation(
 ) -> EvaluationResult:
     """Evaluate a model on a dataset into the directory ``out``: new, empty, or an earlier evaluation, whose networks are used again.
 
-    Where the same evaluation is already, only its table and page are written again.
+    It may be a URL in a bucket, where nothing is replaced. Where the same evaluation is already, only its table and page are written again.
 
     Raises
     ------
@@ -72,6 +74,14 @@ def run_evaluation(
         As `evaluate`.
 
     """
+    rules = config or EvaluateConfig()
+    key = _key(model, dataset, rules, simulated=plant is not None)
+    if is_url(out):
+        if (known := _in_bucket(str(out))) is not None and known.key == key:
+            return EvaluationResult(str(out), known)
+        with published(str(out), JSON) as made:
+            result = run_evaluation(model, dataset, made, config=config, plant=plant)
+        return replace(result, path=str(out))
     place = Path(out)
     clear(place)
     ours = {JSON, CSV, PAGE, NETWORKS, "drives.json", "drives.html"}
@@ -79,8 +89,6 @@ def run_evaluation(
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
         raise UsageError(f"{place}: exists and is no evaluation; it is left alone; give another OUT")
-    rules = config or EvaluateConfig()
-    key = _key(model, dataset, rules, simulated=plant is not None)
     if not (place / JSON).is_file() or read_json(place / JSON).get("key") != key:
         write_json(place / JSON, evaluate(model, dataset, place, rules, key=key, plant=plant))
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
@@ -94,6 +102,12 @@ def run_evaluation(
     write_text(place / CSV, table.getvalue())
     write_text(place / PAGE, evaluation_page(values, title=f"Evaluation on {name}", lead=lead, warnings=warnings))
     return EvaluationResult(place, values)
+
+
+def _in_bucket(url: str) -> Evaluation | None:
+    """Return the evaluation at a URL; None where there is none."""
+    data, where = open_place(url).read(JSON), Path(url, JSON)
+    return None if data is None else typed(parse_json(data, where), Evaluation, where)
 
 
 def _key(model: str | Path, dataset: str | Path, config: EvaluateConfig, *, simulated: bool) -> str:

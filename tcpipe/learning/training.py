@@ -17,10 +17,10 @@ from tcpipe.dataset.beside import beside_of, inputs_of
 from tcpipe.errors import DatasetError, ModelError, StoreError, UsageError
 from tcpipe.formats.atomic import clear_beside
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import read_card
+from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, read_json
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.published import has_card, here, published
+from tcpipe.formats.published import has_card, here, here_by_range, published
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.checkpoint import read_checkpoint
 from tcpipe.learning.fitting import FitConfig, Fitted, ModelKind, Spent, Task, fit, labels_of
@@ -95,7 +95,7 @@ class TrainResult:
 
 def model_for(dataset: str | Path) -> ModelKind:
     """Return the kind of model that a dataset of this size is best served by, and say so."""
-    count = read_card(Path(dataset)).splits.get("train", 0)
+    count = read_card(here_by_range(dataset, by_range=is_shard)[0]).splits.get("train", 0)
     kind: ModelKind = "table" if count < FEW_SAMPLES else "resnet18"
     than, other = ("fewer than", "resnet18") if kind == "table" else ("not fewer than", "table")
     logger.info(

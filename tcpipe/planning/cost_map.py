@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from shutil import rmtree
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import has_card, here, published
 from tcpipe.formats.seals import Checksum, broken_checksums, file_checksums, read_sealed_as, write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
@@ -43,6 +45,8 @@ from tcpipe.terrain.grid import MapGrid
 logger = logging.getLogger("tcpipe")
 
 Floats32 = NDArray[np.float32]
+
+Step: TypeAlias = Callable[[int, int], None]
 
 CARD = "cost-map.json"
 KIND = "tcpipe cost map"
@@ -107,7 +111,7 @@ class CostMapCard:
 class CostMapResult:
     """What became of a cost map; ``str`` of it is what the command prints."""
 
-    path: Path
+    path: Path | str
     status: str
     """``done`` or ``unchanged``."""
     card: CostMapCard
@@ -136,11 +140,11 @@ def cost_map_key(model: CostModel, source: MapFile, step_m: float) -> str:
 def make_cost_map(
     model: CostModel,
     source: MapFile,
-    out: Path,
+    out: Path | str,
     *,
     step_m: float,
     origin_deg: tuple[float, float] | None = None,
-    step: Callable[[int, int], None] = lambda _, __: None,
+    step: Step = lambda _, __: None,
 ) -> CostMapResult:
     """Write the cost map of a whole map to ``out``, whole or not at all; an interrupted call goes on where it was.
 
@@ -149,7 +153,8 @@ def make_cost_map(
     model, source
         Who predicts, and the map.
     out
-        Its directory: new, empty, or a cost map, which is replaced unless it is made from the same.
+        Its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where
+        nothing is replaced, and an interrupted call begins anew.
     step_m
         Side of a cell in the map's plane [m].
     origin_deg
@@ -166,6 +171,9 @@ def make_cost_map(
 
     """
     check_model(model, source)
+    if is_url(out):
+        return _into_bucket(model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step)
+    out = Path(out)
     clear_beside(out)
     grid, key, origin_m = grid_over(source, step_m), cost_map_key(model, source, step_m), _origin_m(source, origin_deg)
     if out.exists() and not (out / CARD).is_file() and (not out.is_dir() or any(out.iterdir())):
@@ -186,6 +194,18 @@ def make_cost_map(
             write_sealed(directory / CARD, card)
         rmtree(place)
     return CostMapResult(out, "done", card)
+
+
+def _into_bucket(
+    model: CostModel, source: MapFile, url: str, *, step_m: float, origin_deg: tuple[float, float] | None, step: Step
+) -> CostMapResult:
+    """Make it on this machine, and put it to a URL; what is there already is not replaced."""
+    known = read_cost_map_card(here(url)) if has_card(url) else None
+    if known is not None and (known.key, known.origin_deg) == (cost_map_key(model, source, step_m), origin_deg):
+        return CostMapResult(url, "unchanged", known)
+    with published(url, CARD) as place:
+        made = make_cost_map(model, source, place, step_m=step_m, origin_deg=origin_deg, step=step)
+    return replace(made, path=url)
 
 
 def read_cost_map_card(path: Path) -> CostMapCard | None:

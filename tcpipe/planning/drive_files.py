@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,8 @@ from tcpipe.dataset import Dataset
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import published
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.drives import Against, DriveCost, drive_cost, drive_in, in_words
 from tcpipe.report.page import Number, Section, render_page
@@ -40,7 +42,7 @@ class Drives:
 class DrivesResult:
     """What was found and where it lies; ``str`` of it is what the command prints."""
 
-    path: Path
+    path: Path | str
     values: Drives
 
     def __str__(self) -> str:
@@ -54,13 +56,13 @@ class DrivesResult:
             lines.append(
                 f"all {len(held)} drives held back: {sums}; intervals hold {hits[0]} of the times and {hits[1]} of the energies"
             )
-        return plain_lines((*lines, f"open {self.path / PAGE}"))
+        return plain_lines((*lines, f"open {self.path}/{PAGE}"))
 
 
 def evaluate_drives(
     model: CostModel, data: Dataset, source: MapReader, logs: Sequence[str], *, store: str | Path, out: str | Path
 ) -> DrivesResult:
-    """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``.
+    """Compare drives with what a model says of them and write ``drives.json`` and ``drives.html`` into the directory ``out``, or to a URL.
 
     Raises
     ------
@@ -68,6 +70,10 @@ def evaluate_drives(
         As `drives.drive_cost`; ``out`` is a file.
 
     """
+    if is_url(out):
+        with published(str(out), JSON) as made:
+            result = evaluate_drives(model, data, source, logs, store=store, out=made)
+        return replace(result, path=str(out))
     place, opened = Path(out), open_store(store)
     runs = [drive_in(opened, log) for log in logs]
     clear(place)

@@ -9,6 +9,8 @@ import numpy as np
 import pyproj
 import pytest
 from made_models import CARD, made_model
+from object_gateway import in_environment
+from storage_server import object_store
 from synthetic_store import STANDING_WATT, small_store
 
 from tcpipe.cost.prediction_errors import centring_of
@@ -150,7 +152,7 @@ def test_its_files_say_the_same(evaluated):
     page = (place / "evaluation.html").read_text()
     for told in ("Table I:", "Table II:", "Table III:", "Table V:", "12.80", "17.45", "<svg"):
         assert told in page
-    tables = re.split(r"Table [IV]+:", page)[1:]
+    tables = re.split(r"<h2>Table [IV]+:", page)[1:]
     assert len(tables) == 5
     assert all("label noise alone" in table for table in tables)
     assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
@@ -235,3 +237,19 @@ def test_a_folder_of_something_else_is_left_alone(model, dataset, tmp_path):
     (tmp_path / "thesis.txt").write_text("important")
     with pytest.raises(UsageError, match="exists and is no evaluation"):
         run_evaluation(model, dataset, tmp_path, config=CONFIG)
+
+
+def test_it_goes_to_a_bucket_whole_and_is_not_replaced(evaluated, model, dataset, tmp_path, monkeypatch):
+    place, values = evaluated
+    monkeypatch.setattr("tcpipe.learning.evaluation_files.evaluate", lambda *_, key, **__: replace(values, key=key))
+    (tmp_path / "served" / "found").mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, _):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        told = run_evaluation(model, dataset, "s3://found/by me", config=CONFIG)
+        assert str(told).endswith("open s3://found/by me/evaluation.html")
+        there = tmp_path / "served" / "found" / "by me"
+        for name in ("evaluation.json", "evaluation.csv", "evaluation.html"):
+            assert (there / name).read_bytes() == (place / name).read_bytes()
+        assert run_evaluation(model, dataset, "s3://found/by me", config=CONFIG).values == told.values
+        with pytest.raises(UsageError, match="what lies in a bucket is not replaced"):
+            run_evaluation(model, dataset, "s3://found/by me", config=replace(CONFIG, seed=1))

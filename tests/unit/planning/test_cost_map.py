@@ -11,11 +11,14 @@ import pyproj
 import pytest
 import rasterio
 from map_worlds import ArrayMap
+from object_gateway import in_environment
 from physics_model import PhysicsModel, energy_joule, power_watt, velocity_mps
 from planning_worlds import plane
 from ruamel.yaml import YAML
+from storage_server import object_store
 
 from tcpipe.errors import MapError, ModelError, UsageError
+from tcpipe.formats.published import here
 from tcpipe.pipeline.verify import verify
 from tcpipe.planning.cost_grid import blocks, grid_over
 from tcpipe.planning.cost_map import cost_map_key, make_cost_map, open_cost_map, read_cost_map_card
@@ -221,3 +224,17 @@ def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew
     assert make_cost_map(MODEL, source, out, step_m=2.0, origin_deg=lonlat).status == "unchanged"
     with pytest.raises(UsageError, match=r"km from map .*; give LON,LAT \(longitude first\)"):
         make_cost_map(MODEL, source, out, step_m=2.0, origin_deg=lonlat[::-1])
+
+
+def test_a_cost_map_goes_to_a_bucket_whole_and_is_not_replaced(made, tmp_path, monkeypatch):
+    source, result = made
+    (tmp_path / "served" / "maps").mkdir(parents=True)
+    with object_store(tmp_path / "served") as (environment, _):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        told = make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0)
+        assert (told.path, told.status, told.card.checksums) == ("s3://maps/of a site", "done", result.card.checksums)
+        there = open_cost_map(here("s3://maps/of a site"), told.card)
+        np.testing.assert_array_equal(there.power_watt, open_cost_map(result.path, result.card).power_watt)
+        assert make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0).status == "unchanged"
+        with pytest.raises(UsageError, match="what lies in a bucket is not replaced"):
+            make_cost_map(MODEL, source, "s3://maps/of a site", step_m=2.0)
