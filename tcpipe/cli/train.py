@@ -19,7 +19,7 @@ _OF_THE_NETWORK = {"epochs", "patience", "batch", "learning_rate", "fold", "mirr
 @click.option(
     "--model", type=click.Choice(["resnet18", "table", "physics"]),
     help="The paper's network; boosted trees on features of patches; or physics. The last two take seconds and heed --loss, --weights, "
-    "--label and --beside alone (default: a table of fewer than 5000 samples, else, and with the network's own options, the network).",
+    "--label and --beside alone (default: a table of fewer than 20000 samples, else, and with the network's own options, the network).",
 )  # fmt: skip
 @click.option(
     "--loss", default="nrmse", show_default=True, type=click.Choice(["nrmse", "paper_eq4"]),

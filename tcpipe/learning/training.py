@@ -34,8 +34,8 @@ logger = logging.getLogger("tcpipe")
 
 _READ_TOGETHER = 1024
 
-FEW_SAMPLES = 5_000
-"""Training samples below which a network has nothing to show that a table has not (docs/how-to/reproduce.md)."""
+FEW_SAMPLES = 20_000
+"""Training samples below which a network is not expected to do better than a table (docs/adr, A network begins where it may pay)."""
 
 _CALLED = {"turn_radpm": "turn (turn_rate_radps)", "command_mps": "commanded speed (commanded_velocity_mps)"}
 

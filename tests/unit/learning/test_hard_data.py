@@ -104,7 +104,7 @@ def test_a_small_dataset_gets_a_table_and_is_told_so(dataset, tmp_path):
     done = tcpipe("train", dataset, "model", cwd=tmp_path)
     assert load_model(tmp_path / "model").card.training.config.model == "table"
     assert (
-        "training samples are fewer than 5000: a table is trained; --model resnet18 is the other choice" in done.stderr
+        "training samples are fewer than 20000: a table is trained; --model resnet18 is the other choice" in done.stderr
     )
 
 
