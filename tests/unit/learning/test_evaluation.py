@@ -155,7 +155,7 @@ def test_its_files_say_the_same(evaluated):
     tables = re.split(r"<h2>Table [IV]+:", page)[1:]
     assert len(tables) == 5
     assert all("label noise alone" in table for table in tables)
-    assert "http" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
+    assert "http:" not in page.replace("http://www.w3.org", "").replace("http://purl.org", "").replace(
         "http://creativecommons.org", ""
     )
 
