@@ -111,7 +111,7 @@ class CostMapCard:
 class CostMapResult:
     """What became of a cost map; ``str`` of it is what the command prints."""
 
-    path: Path | str
+    path: str
     status: str
     """``done`` or ``unchanged``."""
     card: CostMapCard
@@ -183,7 +183,7 @@ def make_cost_map(
         if found is not None and found.key == key and not any(broken_checksums(out, found.checksums)):
             if found.origin_deg == origin_deg:
                 rmtree(place)
-                return CostMapResult(out, "unchanged", found)
+                return CostMapResult(str(out), "unchanged", found)
             costs = open_cost_map(out, found)
         else:
             spool = _spool(place, key, grid)
@@ -193,7 +193,7 @@ def make_cost_map(
             card = replace(_card(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
             write_sealed(directory / CARD, card)
         rmtree(place)
-    return CostMapResult(out, "done", card)
+    return CostMapResult(str(out), "done", card)
 
 
 def _into_bucket(

@@ -61,7 +61,7 @@ def made(tmp_path_factory):
 
 def test_every_course_of_every_cell_costs_what_physics_says(made):
     _, result = made
-    costs = open_cost_map(result.path, read_cost_map_card(result.path))
+    costs = open_cost_map(Path(result.path), read_cost_map_card(Path(result.path)))
     angle = np.radians(ANGLES_DEG)
     slope = (0.2 * np.cos(angle) + 0.1 * np.sin(angle)) * 0.9996
     for (row, col), class_id in {(12, 4): 5, (12, 12): 4}.items():
@@ -91,7 +91,7 @@ def test_blocks_hold_every_wanted_cell_once(monkeypatch, strip):
 
 def test_bands_say_what_they_are_and_the_last_three_sum_up_the_courses(made):
     _, result = made
-    with rasterio.open(result.path / "energy.tif") as dataset:
+    with rasterio.open(Path(result.path) / "energy.tif") as dataset:
         assert dataset.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
         assert dataset.descriptions[:2] == ("course 0.0 deg", "course 26.6 deg")
         assert dataset.descriptions[16:] == ("min", "mean", "best course, ccw from grid east")
@@ -107,18 +107,18 @@ def test_bands_say_what_they_are_and_the_last_three_sum_up_the_courses(made):
     assert known[18] == pytest.approx(ANGLES_DEG[known[:16].argmin()], rel=1e-6)
     downhill = np.degrees(np.arctan2(-0.1, -0.2)) % 360.0
     assert abs(known[18] - downhill) < 14.0
-    with rasterio.open(result.path / "velocity.tif") as dataset:
+    with rasterio.open(Path(result.path) / "velocity.tif") as dataset:
         velocity = dataset.read()[:, 12, 12]
     assert velocity[18] == pytest.approx(ANGLES_DEG[velocity[:16].argmax()])
 
 
 def test_nav2_finds_a_scale_map_with_trees_that_are_lethal(made):
     _, result = made
-    about = YAML(typ="safe").load((result.path / "energy.yaml").read_text())
+    about = YAML(typ="safe").load((Path(result.path) / "energy.yaml").read_text())
     assert about["mode"] == "scale"
     assert about["free_thresh"] == 0.0
     assert about["origin"] == [500_000.0, 5_200_000.0 - 24.0, 0.0]
-    grey = matplotlib.image.imread(result.path / about["image"])
+    grey = matplotlib.image.imread(Path(result.path) / about["image"])
     occupied = (255 - grey.astype(float)) / 255.0
     cost = np.where(occupied > about["occupied_thresh"], 100, np.rint(100.0 * occupied / about["occupied_thresh"]))
     assert grey.shape == (24, 24)
@@ -154,11 +154,11 @@ def test_an_interrupted_map_goes_on_where_it_was_and_ends_the_same(made, tmp_pat
         make_cost_map(stopped, source, tmp_path / "cost-map", step_m=1.0)
     assert not (tmp_path / "cost-map").exists()
     again = make_cost_map(going_on, source, tmp_path / "cost-map", step_m=1.0)
-    asked = int(np.count_nonzero(~np.isnan(open_cost_map(again.path, again.card).velocity_mps)))
+    asked = int(np.count_nonzero(~np.isnan(open_cost_map(Path(again.path), again.card).velocity_mps)))
     assert sum(stopped.patches) + sum(going_on.patches) == asked
     assert again.card.key == whole.card.key
-    for path in sorted(whole.path.iterdir()):
-        assert (again.path / path.name).read_bytes() == path.read_bytes(), path.name
+    for path in sorted(Path(whole.path).iterdir()):
+        assert (Path(again.path) / path.name).read_bytes() == path.read_bytes(), path.name
     assert [entry.name for entry in tmp_path.iterdir()] == ["cost-map"]
 
 
@@ -234,7 +234,7 @@ def test_a_cost_map_goes_to_a_bucket_whole_and_is_not_replaced(made, tmp_path, m
         told = make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0)
         assert (told.path, told.status, told.card.checksums) == ("s3://maps/of a site", "done", result.card.checksums)
         there = open_cost_map(here("s3://maps/of a site"), told.card)
-        np.testing.assert_array_equal(there.power_watt, open_cost_map(result.path, result.card).power_watt)
+        np.testing.assert_array_equal(there.power_watt, open_cost_map(Path(result.path), result.card).power_watt)
         assert make_cost_map(MODEL, source, "s3://maps/of a site", step_m=1.0).status == "unchanged"
         with pytest.raises(UsageError, match="what lies in a bucket is not replaced"):
             make_cost_map(MODEL, source, "s3://maps/of a site", step_m=2.0)
