@@ -17,7 +17,6 @@ from tcpipe.formats.maps.map_facts import MapInputs, MapSummary
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.maps.terrain_polygons import is_drawn
 from tcpipe.formats.maps.text import map_lines
-from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.seals import file_checksum, seal_of
 from tcpipe.formats.store_mark import gone_if_empty
 from tcpipe.report.overview import quick_look, write_quick_look
@@ -40,10 +39,10 @@ _CLASSES = "classes"
 class AddedMap:
     """What became of a map; ``str`` of it is what the command prints."""
 
-    path: Path | str
+    path: str
     status: Literal["done", "unchanged"]
     map: MapSummary
-    picture: Path | str
+    picture: str
     """A quick look at it: orthophoto or shaded relief, tinted by class, white where a layer has no data."""
 
     def __str__(self) -> str:
@@ -163,10 +162,7 @@ def _unchanged(store: Store, name: str, inputs: MapInputs) -> AddedMap:
 def _added(store: Store, name: str, status: Literal["done", "unchanged"]) -> AddedMap:
     document, place = store.map_document(name), store.place.below("maps")
     found = open_map(*store.map_at(document)).summary()
-    path, picture = (
-        where if is_url(where) else Path(where) for where in map(place.where, (document.zarr, document.picture))
-    )
-    return AddedMap(path, status, found, picture)
+    return AddedMap(place.where(document.zarr), status, found, place.where(document.picture))
 
 
 def _found(given: Mapping[str, Files]) -> dict[str, list[Path]]:
