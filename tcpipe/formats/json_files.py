@@ -11,6 +11,7 @@ from dataclasses import fields, is_dataclass
 from enum import Enum
 from inspect import cleandoc
 from pathlib import Path
+from threading import Lock
 from typing import Any, TypeVar
 
 import msgspec
@@ -24,6 +25,9 @@ Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 """Of every schema in ``schemas/``."""
+
+_CONVERTING = Lock()
+"""msgspec (0.22) ends the process where two threads meet a dataclass for the first time at once."""
 
 MOST_BYTES = 32 << 20
 """A document is at most so large [byte], written and read: the card of ten thousand runs."""
@@ -134,7 +138,8 @@ def typed(value: object, cls: type[T], path: Path | str) -> T:
 
     """
     try:
-        return msgspec.convert(value, cls, str_keys=True, dec_hook=_from_text)
+        with _CONVERTING:
+            return msgspec.convert(value, cls, str_keys=True, dec_hook=_from_text)
     except msgspec.ValidationError as error:
         raise StoreError(f"{path}: is not what this version writes: {_in_words(str(error))}") from None
 
@@ -142,7 +147,8 @@ def typed(value: object, cls: type[T], path: Path | str) -> T:
 def of_json(text: str, cls: type[T], path: Path | str) -> T:
     """Return JSON text as a dataclass, or what is made of such; as `typed`."""
     try:
-        return msgspec.json.decode(text, type=cls)
+        with _CONVERTING:
+            return msgspec.json.decode(text, type=cls)
     except msgspec.DecodeError as error:
         raise StoreError(f"{path}: is not what this version writes: {error}") from None
 

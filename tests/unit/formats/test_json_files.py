@@ -1,6 +1,8 @@
 """JSON documents as dataclasses: what is written is read again, and what does not fit is named by file and key."""
 
 import json
+import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -72,3 +74,25 @@ def test_a_schema_names_every_key_and_its_type():
     assert schema["$schema"].endswith("2020-12/schema")
     assert schema["$defs"]["Counts"]["properties"]["segments"] == {"type": "integer"}
     assert schema["$defs"]["Document"]["required"] == ["counts"]
+
+
+def test_threads_that_meet_a_document_at_once_all_read_it():
+    """In a process of its own: msgspec alone would end it."""
+    program = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+from tcpipe.formats.json_files import plain, typed
+from tcpipe.formats.run_documents import LogOrigin, RunJson
+
+sys.setswitchinterval(1e-6)
+known, together = RunJson(LogOrigin(("a.mcap",), "b", 1)), Barrier(8)
+
+def read(_):
+    together.wait()
+    return typed(plain(known), RunJson, "run-1.json")
+
+with ThreadPoolExecutor(8) as pool:
+    assert set(map(repr, pool.map(read, range(8)))) == {repr(known)}
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
