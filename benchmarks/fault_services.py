@@ -10,13 +10,16 @@ import time
 import urllib.request
 from contextlib import ExitStack, suppress
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from dask_cluster import DaskCluster, dask_cluster
 from fault_children import in_child
 
 from tcpipe.formats.bucket import open_place
+
+if TYPE_CHECKING:
+    from dask_cluster import DaskCluster
 
 BUCKET = "faults"
 PROGRAM = "TCPIPE_TEST_OBJECT_STORAGE"
@@ -103,6 +106,8 @@ class Services:
         raise TimeoutError("the gateway does not come back")
 
     def _start_cluster(self) -> None:
+        from dask_cluster import dask_cluster  # of an extra
+
         number = len(list(self._directory.glob("cluster-*")))
         directory = self._directory / f"cluster-{number}"
         directory.mkdir()

@@ -42,8 +42,6 @@ from fault_children import (
 from fault_services import OUTAGES_S, PROGRAM, VICTIMS, Services, get_objects, put_objects
 from hostile_inputs import try_all
 
-from tcpipe.pipeline.verify import verify
-
 services = Services()
 
 FULL = 0
@@ -184,8 +182,14 @@ def _of_the_next_call(plain: Undisturbed, work: Path, wanted: Tree) -> Iterator[
             continue
         if plain.case.url and not any(name.startswith("there/store/") for name in wanted):
             continue
-        path = store if "://" in store else work / store
-        yield from (f"verify: {problem}" for problem in in_child(lambda path=path: verify(path).problems))
+        yield from in_child(lambda path=store if "://" in store else work / store: _problems(path))
+
+
+def _problems(store: str | Path) -> list[str]:
+    """Return what is not as it was written in a store."""
+    from tcpipe.pipeline.verify import verify
+
+    return [f"verify: {problem}" for problem in verify(store).problems]
 
 
 @contextmanager

@@ -31,6 +31,7 @@ from typing import TypeVar
 import pyarrow as pa
 
 from tcpipe.errors import StoreError, TableError, UsageError
+from tcpipe.formats.atomic import clear_scratch
 from tcpipe.formats.bucket import open_place, side_by_side
 from tcpipe.formats.geoparquet import located_segments
 from tcpipe.formats.index_files import (
@@ -585,6 +586,8 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
         mark_store(store.place, found=found)
         if isinstance(place := store.place, DirectoryPlace):  # what killed commands left
             place.clear()
+        else:
+            clear_scratch()
     return store
 
 

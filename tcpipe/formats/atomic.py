@@ -128,15 +128,23 @@ def working_directory(staging: Path) -> Iterator[Path]:
 @contextmanager
 def scratch_directory() -> Iterator[Path]:
     """Yield an empty directory of this user in the system's own (``TMPDIR``); what killed processes left there goes first."""
-    parent, prefix = Path(tempfile.gettempdir()), f"tcpipe-{os.getuid()}-"
-    for left in parent.glob(f"{prefix}*"):
-        _claimed(left, lambda left=left: shutil.rmtree(left))  # type: ignore[misc]
-    directory, lock = _locked_directory(parent, prefix, mode=0o700)
+    clear_scratch()
+    directory, lock = _locked_directory(Path(tempfile.gettempdir()), _scratch_prefix(), mode=0o700)
     try:
         yield directory
     finally:
         shutil.rmtree(directory, ignore_errors=True)
         os.close(lock)
+
+
+def clear_scratch() -> None:
+    """Remove what killed processes left of their scratch directories."""
+    for left in Path(tempfile.gettempdir()).glob(f"{_scratch_prefix()}*"):
+        _claimed(left, lambda left=left: shutil.rmtree(left))  # type: ignore[misc]
+
+
+def _scratch_prefix() -> str:
+    return f"tcpipe-{os.getuid()}-"
 
 
 def lasting_scratch() -> Path:

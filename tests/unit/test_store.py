@@ -1,6 +1,8 @@
 """The protocol of the store, on disk and in a bucket: what readers see of writers that are killed, race, replace or copy by halves."""
 
+import os
 import shutil
+import tempfile
 import uuid
 from contextlib import suppress
 from dataclasses import replace
@@ -181,6 +183,16 @@ def test_a_store_is_moved_by_copying_its_files(root, tmp_path):
         path.write_bytes(store.place.read(entry.name))
     assert counted(Store(tmp_path / "moved")) == [10]
     assert verify(tmp_path / "moved").problems == ()
+
+
+def test_what_a_killed_call_left_on_this_machine_goes_when_a_store_is_opened(tmp_path, monkeypatch):
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    (tmp_path / f"tcpipe-{os.getuid()}-0123abcd" / "new").mkdir(parents=True)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    with object_store(tmp_path / "served") as (environment, _):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        open_store("s3://tests/store", create=True)
+    assert not list(tmp_path.glob("tcpipe-*"))
 
 
 def test_a_store_of_a_later_layout_is_refused(tmp_path, monkeypatch):
