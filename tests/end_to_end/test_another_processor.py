@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 import rasterio
+import shapely
 from processors import ANOTHER_PROCESSOR
 from simulated_streams import streams_of
 
@@ -44,6 +45,9 @@ def _near(name: str, ours: pa.ChunkedArray, theirs: pa.ChunkedArray) -> bool:
     if pa.types.is_floating(ours.type):
         here, there = (column.to_numpy().astype(float) for column in (ours, theirs))
         return np.allclose(there, here, rtol=0.0, atol=NEAR * np.nanmax(np.abs(here), initial=0.0), equal_nan=True)
+    if name == "geometry":
+        here, there = (shapely.get_coordinates(shapely.from_wkb(column.to_pylist())) for column in (ours, theirs))
+        return np.allclose(there, here, rtol=0.0, atol=NEAR * np.abs(here).max(initial=0.0))
     if name.endswith("_ns"):  # an interpolated stamp that is rounded to a whole one
         return bool(pc.all(pc.less_equal(pc.abs(pc.subtract(ours, theirs)), 1)).as_py())
     return ours.equals(theirs)
