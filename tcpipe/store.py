@@ -43,6 +43,7 @@ from tcpipe.formats.index_files import (
     read_logs,
     read_runs,
     state_of,
+    uncollected,
     write_logs,
     write_runs,
 )
@@ -181,6 +182,7 @@ class Store:
         """Return the finished ingestions of one run."""
         return list(self.ingestions(run_id).finished)
 
+    @uncollected()
     def ingestions(self, run_id: str | None = None) -> Ingestions:
         """Return what there is of all runs, or of one, by one listing.
 
@@ -289,6 +291,7 @@ class Store:
             write_runs(self.index_place, {**read_runs(self.index_place), **proved}.values())
         return damaged
 
+    @uncollected()
     def seen_logs(self) -> dict[str, list[Sighting]]:
         """Return what is remembered of all logs, by lineage; a record that the index has is not read, while its file is as it was."""
         known = read_logs(self.index_place)

@@ -13,7 +13,7 @@ from typing import Literal, get_args
 from tcpipe import __version__
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.index_files import RunFacts, uncollected
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
@@ -88,6 +88,7 @@ class Status:
         return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
 
 
+@uncollected()
 def status(
     logs: Iterable[str | Path] = (),
     *,
