@@ -69,7 +69,7 @@ from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
 from tcpipe.formats.stored_runs import (
     Ingestions,
-    ListedRun,
+    Listed,
     RunDirectory,
     below,
     local_file,
@@ -193,7 +193,7 @@ class Store:
         finished, others, damaged = list[RunDirectory](), dict[str, ManifestHead](), dict[tuple[str, str], str]()
         rows = dict[tuple[str, str], RunFacts]()
 
-        def seen(of: tuple[ListedRun, str, int]) -> RunDirectory | ManifestHead | StoreError:
+        def seen(of: tuple[Listed, str, int]) -> RunDirectory | ManifestHead | StoreError:
             try:
                 return self._ingestion(*of, known.get((of[0].run_id, of[1])))
             except StoreError as error:
@@ -214,17 +214,15 @@ class Store:
         outdated = {name: head for name, head in others.items() if name not in current}
         return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=_differ(rows, known))
 
-    def _listed(self, run_id: str | None) -> Iterator[ListedRun]:
+    def _listed(self, run_id: str | None) -> Iterator[Listed]:
         """Yield the files of each run, perhaps without its streams: one listing."""
         runs, found = self.runs_place, dict[str, dict[str, Entry]]()
         for entry in runs.entries(run_id or "", but=_STREAMS):
             name, _, rest = entry.name.partition("/")
             found.setdefault(name, {})[rest] = entry
-        return (ListedRun(runs, name, files, numbers(files)) for name, files in found.items())
+        return (Listed(runs, name, files, numbers(files)) for name, files in found.items())
 
-    def _ingestion(
-        self, of: ListedRun, recipe_id: str, number: int, row: RunFacts | None
-    ) -> RunDirectory | ManifestHead:
+    def _ingestion(self, of: Listed, recipe_id: str, number: int, row: RunFacts | None) -> RunDirectory | ManifestHead:
         """Return an ingestion, or the head of one of another data model; `StoreError` if it is not as it was written, or a file is gone.
 
         ``row`` is what the index has of it.
@@ -251,7 +249,7 @@ class Store:
         files_state = " ".join(state_of(of.files[name[above:]]) for name in (row.segments_file, row.track_file))
         return RunDirectory(of.run_id, recipe_id, place, self._with_log(row, of), files_state)
 
-    def _with_log(self, row: RunFacts, of: ListedRun) -> RunFacts:
+    def _with_log(self, row: RunFacts, of: Listed) -> RunFacts:
         """Return what the index has of an ingestion with what is known of its log and tags now; None of a log that cannot be believed."""
         last = [name_of(stem, of.numbers[stem]) for stem in ("run", "tags") if stem in of.numbers]
         state = " ".join(state_of(of.files[name]) for name in last)

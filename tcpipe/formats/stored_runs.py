@@ -21,7 +21,7 @@ from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
 
 
 @dataclass(frozen=True, slots=True)
-class ListedRun:
+class Listed:
     """What lies in the directory of a run: its files by name there, and the last numbers of its documents."""
 
     runs: Place
