@@ -106,7 +106,7 @@ def _add_run(store: Store, number: int, rows: int) -> None:
     info = TrackInfo(run_id, "husky", Datum(lon[0], lat[0], 600.0), 20.0, "smoother")
     recipe = Recipe()
     ledger_m = {"kept": float(floats(table, "arc_length_m").sum())}
-    store.write_run_json(run_id, RunJson(LogOrigin((f"{run_id}.mcap",), run_id, 1)))
+    store.write_run_json(run_id, RunJson(LogOrigin((f"{run_id}.mcap",), f"{number:08x}".ljust(64, "0"), 1)))
     manifest = Manifest(
         run_id=run_id,
         recipe_id=recipe_id(recipe, "husky"),

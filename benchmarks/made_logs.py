@@ -6,17 +6,19 @@ IMU 200 Hz, two odometries 50 Hz, power 20 Hz, GNSS 10 Hz, and raw images of 154
 import heapq
 import itertools
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
+from numpy.typing import NDArray
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
-from rosbags.typesys import Stores, get_typestore
 
-from tcpipe.formats.logs.writing import MessageStream, _payloads
+from tcpipe.formats.logs.writing import MessageStream, _payloads, _typestore
 
 RATES_HZ = (
     ("/imu/data", "sensor_msgs/msg/Imu", 200, "angular_velocity.z"),
@@ -29,7 +31,7 @@ NAVIGATION = [topic for topic, *_ in RATES_HZ]
 CAMERA, CAMERA_HZ = "/camera/image_raw", 10
 RAGGED = "/diagnostics"
 START_NS = 1_700_000_000_000_000_000
-STORES = {"cdr": get_typestore(Stores.ROS2_HUMBLE), "ros1": get_typestore(Stores.ROS1_NOETIC)}
+STORES = {"cdr": _typestore("cdr"), "ros1": _typestore("ros1")}
 CHUNK_BYTES = 1 << 20
 
 Message = tuple[int, str, bytes]
@@ -58,20 +60,23 @@ def navigation(minutes: float, encoding: str = "cdr") -> Iterator[Message]:
 
 def camera(minutes: float, encoding: str = "cdr") -> Iterator[Message]:
     """Yield raw images of a textured scene, each pixel noisy as a sensor's are: zstd takes a tenth off them."""
-    rng, store = np.random.default_rng(1), STORES[encoding]
-    types = store.types
-    stamp_type, header_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    rng = np.random.default_rng(1)
     scene = np.kron(rng.integers(0, 200, (30, 64, 1), dtype=np.uint8), np.ones((8, 5, 2), np.uint8)).ravel()
     pictures = [scene + rng.integers(0, 6, scene.size, dtype=np.uint8) for _ in range(8)]
     for index in range(int(minutes * 60 * CAMERA_HZ)):
-        stamp = START_NS + index * (10**9 // CAMERA_HZ) + 1
-        header = {"stamp": stamp_type(stamp // 10**9, stamp % 10**9), "frame_id": "camera"}
-        header |= {"seq": index} if encoding == "ros1" else {}
-        image = types["sensor_msgs/msg/Image"](
-            header_type(**header), 240, 320, "yuv422", 0, 640, np.roll(pictures[index % 8], index)
-        )
-        serialize = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
-        yield stamp, CAMERA, bytes(serialize(image, "sensor_msgs/msg/Image"))
+        yield image(START_NS + index * (10**9 // CAMERA_HZ) + 1, np.roll(pictures[index % 8], index), encoding)
+
+
+def image(stamp: int, pixels: NDArray[np.uint8], encoding: str = "cdr") -> Message:
+    """Return an image of 320 pixels by as many rows as there are."""
+    store = STORES[encoding]
+    types = store.types
+    stamp_type, header_type = types["builtin_interfaces/msg/Time"], types["std_msgs/msg/Header"]
+    header = {"stamp": stamp_type(stamp // 10**9, stamp % 10**9), "frame_id": "camera"}
+    header |= {"seq": 0} if encoding == "ros1" else {}
+    said = types["sensor_msgs/msg/Image"](header_type(**header), pixels.size // 640, 320, "yuv422", 0, 640, pixels)
+    serialize = store.serialize_ros1 if encoding == "ros1" else store.serialize_cdr
+    return stamp, CAMERA, bytes(serialize(said, "sensor_msgs/msg/Image"))
 
 
 def ragged(messages: int) -> Iterator[Message]:
@@ -117,10 +122,10 @@ def repeated(messages: Iterator[Message], seconds: float, times: int) -> Iterato
 
 
 def write_mcap(
-    path: Path, messages: Iterator[Message], *, compression: str, crcs: bool = True, camera_apart: bool = False
-) -> Path:
-    """Write an .mcap; with ``camera_apart`` images fill chunks of their own."""
-    with path.open("wb") as file:
+    path: Any, messages: Iterator[Message], *, compression: str, crcs: bool = True, camera_apart: bool = False
+) -> Any:
+    """Write an .mcap, to a path or an open file; with ``camera_apart`` images fill chunks of their own."""
+    with path.open("wb") if isinstance(path, Path) else nullcontext(path) as file:
         writer = McapWriter(
             file,
             chunk_size=CHUNK_BYTES,
