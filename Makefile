@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-object-storage test-dagster test-mutants check check-and-train kernels lock schemas docs clean
+.PHONY: help demo test test-object-storage test-dagster test-pages test-mutants check check-and-train kernels lock schemas docs clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -76,6 +76,15 @@ kernels: .venv/installed-dev
 test-dagster: .venv-dagster/installed
 	.venv-dagster/bin/python -m pytest tests/schedulers --override-ini filterwarnings=default
 
+# Pages opened, clicked and read in Debian's Chromium; playwright wants an environment of its own.
+.venv-pages/installed: pyproject.toml
+	$(PYTHON) -m venv .venv-pages
+	.venv-pages/bin/python -m pip --disable-pip-version-check install --quiet --no-compile playwright axe-core-python pytest pytest-randomly --editable .
+	@touch $@
+
+test-pages: .venv-pages/installed
+	.venv-pages/bin/python -m pytest tests/pages
+
 # Changes of the rooms of numbers, one at a time: does a test notice? docs/explanation/mutants.md; an hour and more on one core.
 # MUTANTS="--rooms motion path --draw 0" tries less.
 MUTANTS ?=
@@ -105,4 +114,4 @@ docs: .venv/installed
 	$(BIN)/python docs/generate.py
 
 clean:
-	rm -rf .venv .venv-dagster .venv-mutants tcpipe-demo
+	rm -rf .venv .venv-dagster .venv-pages .venv-mutants tcpipe-demo

@@ -22,7 +22,7 @@ def unpacked(told, name):
         return np.frombuffer(part, {"u8": "<u1", "u16": "<u2", "u32": "<u4"}[of["kind"]])
     halves = np.frombuffer(part, "<u2").astype(np.uint32)
     if of["kind"] == "steps":
-        return of["low"] + of["step"] * halves
+        return np.where(halves == 65535, np.nan, of["low"] + of["step"] * halves)
     if of["kind"] == "half":
         return (halves << 16).view(np.float32)
     return ((halves[: len(halves) // 2] << 16) | halves[len(halves) // 2 :]).view(np.float32)

@@ -13,7 +13,7 @@ page.ready.then(async () => {
       const part = buffer.slice(first, first + bytes);
       if (kind in whole) return [name, new whole[kind](part)];
       const halves = new Uint16Array(part);
-      if (kind === "steps") return [name, Float64Array.from(halves, (n) => low + step * n)];
+      if (kind === "steps") return [name, Float64Array.from(halves, (n) => (n === 65535 ? NaN : low + step * n))];
       const count = kind === "half" ? halves.length : halves.length / 2;
       const bits = new Uint32Array(count);
       for (let i = 0; i < count; i++) bits[i] = ((halves[i] << 16) | (kind === "half" ? 0 : halves[count + i])) >>> 0;
@@ -97,8 +97,14 @@ page.ready.then(async () => {
   at("ground").onchange = () => layers.forEach((layer, i) => { layer.visible = told.ground[i] === at("ground").value; });
   for (const [id, name] of [["next", "drive next"], ["leaks", "leaks"]]) {
     const drawn = page.model(name);
-    at(id).onchange = () => { drawn.visible = at(id).checked; };
-    at(id).disabled = drawn === null || (told.empty ?? []).includes(name);
+    at(id).onchange = () => {
+      if (name === "leaks") {
+        const held = Array.from(c.nearest.keys()).filter((i) => c.nearest[i] !== i), near = held.map((i) => c.nearest[i]);
+        drawn.data_source.data = { x0: held.map((i) => c.x[i]), y0: held.map((i) => c.y[i]), x1: near.map((i) => c.x[i]), y1: near.map((i) => c.y[i]) };
+      }
+      drawn.visible = at(id).checked;
+    };
+    at(id).disabled = drawn === null || (name === "leaks" && !c.nearest?.some((j, i) => i !== j));
   }
   const brush = page.model("brush");
   const plotted = () => ({ across: Float64Array.from(c[at("across").value]), up: Float64Array.from(c[at("up").value]) });

@@ -40,10 +40,8 @@ def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[
     lost = _draw_pictures(plot, directory, card, bounds)
     lost += _draw_places(plot, directory, card)
     figure = plot.figure
-    leaks = shown.leaks_m
-    figure.multi_line(
-        list(leaks[:, :, 0]), list(leaks[:, :, 1]), color="#ff2d95", line_width=1.5, name="leaks", visible=False
-    )
+    ends = {end: np.empty(0) for end in ("x0", "y0", "x1", "y1")}
+    figure.segment(source=ends, color="#ff2d95", line_width=1.5, name="leaks", visible=False)
     rings = _rings(card.split.region, Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True))
     figure.multi_line(
         [ring[:, 0] for ring in rings],

@@ -120,7 +120,6 @@ def _data(
         "samples": shown.json,
         "patches": patches,
         "ground": [name.removeprefix("layer ") for name in names if name.startswith("layer ")],
-        "empty": [] if len(shown.leaks_m) else ["leaks"],
         "classes": [{"id": of.id, "name": of.name, "colour": class_colour(of.id)} for of in card.classes],
         "splits": [{"name": name, "colour": SPLIT_COLOURS[name], "count": card.splits[name]} for name in SPLIT_COLOURS],
         "runs": [

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import Json
-from tcpipe.report.packed import Column, packed
+from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.bits import Quality
 
@@ -22,6 +22,9 @@ MOST_SAMPLES = 100_000
 """Samples that can each be clicked; more are means over cells."""
 
 _LABELS = {"power": "power_watt", "velocity": "velocity_mps", "duration": "duration_s", "energy": "energy_joule"}
+_DIGITS = {"power": 1, "velocity": 3, "duration": 3, "energy": 1}
+"""Decimals that the page shows."""
+
 _STD = {
     "power": "power_std_watt",
     "velocity": "velocity_std_mps",
@@ -59,12 +62,10 @@ Ints = NDArray[np.int64]
 class SamplesShown:
     """What the page holds: a row a sample, or one a cell.
 
-    ``xy_m`` are middles in the first map's plane, (N, 2); ``leaks_m`` are pairs of a held-out middle and the nearest train
-    one that lie within a patch's diagonal, (L, 2, 2); ``row_of`` is where each sample of the table went, (T,).
+    ``xy_m`` are middles in the first map's plane, (N, 2); ``row_of`` is where each sample of the table went, (T,).
     """
 
     xy_m: Floats
-    leaks_m: Floats
     row_of: Ints
     cell_m: float | None
     json: Json
@@ -99,8 +100,6 @@ def samples_shown(card: DatasetCard, table: pa.Table) -> SamplesShown:
     split = table.column("split").to_numpy(zero_copy_only=False).astype(np.str_)
     apart_m, nearest = nearest_train_m(xy_m, split)
     values = _values(card, table, apart_m) | {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
-    near = np.flatnonzero(apart_m < np.sqrt(2.0) * card.patch_m)[:MOST_SAMPLES]
-    leaks_m = np.stack([xy_m[near], xy_m[nearest[near]]], axis=1).reshape(-1, 2, 2)
     cell_m, row_of = None, np.arange(table.num_rows)
     keys = {"split": _split_numbers(split), "class": np.nan_to_num(floats(table, "terrain_class")).astype(np.int64)}
     keys |= {"quality": table.column("quality").to_numpy().astype(np.int64), "run": _run_numbers(card, table)}
@@ -108,14 +107,16 @@ def samples_shown(card: DatasetCard, table: pa.Table) -> SamplesShown:
         values, keys, row_of, cell_m = _in_cells(values, keys)
         xy_m = np.column_stack([values["x"], values["y"]])
     columns: dict[str, Column] = {"x": ("steps", values["x"]), "y": ("steps", values["y"])}
-    columns |= {name: ("f32", values[name]) for name in _LABELS}
+    columns |= {name: shown_to(digits, values[name]) for name, digits in _DIGITS.items()}
     columns |= {name: ("half", part) for name, part in values.items() if name not in {*columns, "count"}}
     columns |= {"split": ("u8", keys["split"]), "class": ("u8", keys["class"]), "quality": ("u16", keys["quality"])}
     columns |= {"run": ("u16", keys["run"]), "count": ("u32", values["count"])}
     if cell_m is None:
         columns |= _starts(card, table)
+        near = apart_m < np.sqrt(2.0) * card.patch_m
+        columns["nearest"] = ("u32", np.where(near, nearest, np.arange(len(near))))
     told: dict[str, Json] = {"packed": packed(columns), "cell_m": cell_m, "ids": _ids_if_odd(table)}
-    return SamplesShown(xy_m, leaks_m, row_of, cell_m, told)
+    return SamplesShown(xy_m, row_of, cell_m, told)
 
 
 def _values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[str, Floats]:

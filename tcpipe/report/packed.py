@@ -6,10 +6,10 @@ kind       what a reader gets
 ``u8``     whole numbers to 255; ``u16`` to 65 535; ``u32`` to 4 294 967 295
 ``f32``    a float32
 ``half``   the upper 16 bits of a float32, rounded: to 0.4 %, for slopes and deviations
-``steps``  ``low + step * number`` over the column's range in 65 535 steps, for coordinates
+``steps``  ``low + step * number`` over the column's range in 65 534 steps, for coordinates and labels
 =========  ======================================================================================
 
-NaN stays NaN in ``f32`` and ``half``; a column of ``steps`` has none. ``dataset.js`` reads it.
+NaN stays NaN; among ``steps`` it is 65 535. ``dataset.js`` reads it.
 """
 
 from __future__ import annotations
@@ -42,17 +42,23 @@ def packed(columns: Mapping[str, Column]) -> Json:
     return {"columns": told, "data": base64.b64encode(zlib.compress(bytes(blob), 6)).decode("ascii")}
 
 
+def shown_to(digits: int, values: NDArray[np.float64]) -> Column:
+    """Return a column that is shown with so many decimals: in steps where these are finer than half of the last one."""
+    return ("steps" if _scale(values)[1] < 0.5 * 10.0**-digits else "f32"), values
+
+
 def _scale(values: NDArray[np.generic]) -> tuple[float, float]:
     numbers = values.astype(np.float64)
-    low, high = float(numbers.min(initial=np.inf)), float(numbers.max(initial=-np.inf))
-    return (low, (high - low) / 65535 or 1.0) if len(numbers) else (0.0, 1.0)
+    known = numbers[np.isfinite(numbers)]
+    return (float(known.min()), (float(known.max()) - float(known.min())) / 65534 or 1.0) if len(known) else (0.0, 1.0)
 
 
 def _bytes(kind: Kind, values: NDArray[np.generic], low: float, step: float) -> bytes:
     if kind in _WHOLE:
         return values.astype(_WHOLE[kind]).tobytes()
     if kind == "steps":
-        return np.round((values.astype(np.float64) - low) / step).astype("<u2").tobytes()
+        steps = np.round((values.astype(np.float64) - low) / step)
+        return np.where(np.isfinite(steps), steps, 65535).astype("<u2").tobytes()
     bits = values.astype("<f4").view("<u4")
     if kind == "half":
         upper = np.where(np.isnan(values.astype(np.float64)), 0x7FC0, (bits.astype(np.uint64) + 0x8000) >> 16)

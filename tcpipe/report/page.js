@@ -10,7 +10,7 @@ const page = (() => {
     const roots = drawn.roots.map((root) => root.id);
     const item = { docid: "page", root_ids: roots, roots: Object.fromEntries(roots.map((id) => [id, id])) };
     ready = Bokeh.embed.embed_items({ page: drawn }, [item]).then((managers) => {
-      for (const manager of managers) plots.push(...manager);
+      for (const manager of managers) plots.push(...[...manager].filter((view) => "request_paint" in view));
     });
   }
   const repaint = () => plots.forEach((plot) => plot.request_paint());

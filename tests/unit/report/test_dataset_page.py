@@ -58,7 +58,7 @@ def test_its_numbers_are_the_cards(built, page):
 def test_every_sample_is_there_as_the_table_has_it(built, page):
     table, data = pq.read_table(built / "samples.parquet"), data_of(page)
     told = data["samples"]["packed"]
-    np.testing.assert_array_equal(unpacked(told, "energy"), table["energy_joule"].to_numpy().astype(np.float32))
+    np.testing.assert_allclose(unpacked(told, "energy"), table["energy_joule"].to_numpy(), rtol=0.0, atol=0.03)
     np.testing.assert_allclose(unpacked(told, "energy_std"), table["energy_std_joule"].to_numpy(), rtol=0.004)
     np.testing.assert_array_equal(unpacked(told, "quality"), table["quality"].to_numpy())
     names = [data["splits"][number]["name"] for number in unpacked(told, "split")]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from page_reading import unpacked
 
-from tcpipe.report.packed import packed
+from tcpipe.report.packed import packed, shown_to
 
 COUNT = 1000
 
@@ -19,7 +19,7 @@ def columns():
         "stamp": ("u32", chance.integers(0, 2**32, COUNT)),
         "label": ("f32", wide),
         "std": ("half", np.abs(wide)),
-        "x": ("steps", chance.uniform(697_000.0, 698_000.0, COUNT)),
+        "x": ("steps", np.where(np.isnan(wide), np.nan, chance.uniform(697_000.0, 698_000.0, COUNT))),
         "run": ("u16", chance.integers(0, 65_535, COUNT)),
     }
 
@@ -31,7 +31,7 @@ def test_what_is_packed_is_read_back_as_well_as_the_kind_says(columns):
         np.testing.assert_array_equal(values[name], columns[name][1])
     np.testing.assert_array_equal(values["label"], columns["label"][1].astype(np.float32))
     np.testing.assert_allclose(values["std"], columns["std"][1], rtol=0.004)
-    assert np.abs(values["x"] - columns["x"][1]).max() < 1000.0 / 65_535
+    np.testing.assert_allclose(values["x"], columns["x"][1], rtol=0.0, atol=1000.0 / 65_534)
     assert packed(columns) == told
 
 
@@ -40,3 +40,8 @@ def test_columns_may_be_empty_or_hold_one(count):
     told = packed({"x": ("steps", np.full(count, 7.0)), "label": ("f32", np.full(count, 2.5))})
     assert unpacked(told, "x").tolist() == [7.0] * count
     assert unpacked(told, "label").tolist() == [2.5] * count
+
+
+def test_steps_are_taken_only_where_they_hide_no_digit_that_is_shown():
+    assert shown_to(1, np.array([0.0, 3000.0]))[0] == "steps"
+    assert shown_to(1, np.array([0.0, 4000.0]))[0] == "f32"
