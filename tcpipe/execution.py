@@ -12,6 +12,7 @@ import os
 import re
 import signal
 import threading
+import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -19,7 +20,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, UsageError
@@ -43,6 +44,15 @@ class Outcome(Generic[R]):
     index: int
     result: R | None
     died: bool = False
+
+
+def sound(outcome: Outcome[R | TcpipeError]) -> R:
+    """Return what a task gave that returns its error; raise that, or that its worker died."""
+    if isinstance(outcome.result, TcpipeError):
+        raise outcome.result
+    if outcome.died:
+        raise TcpipeError("a worker process died (killed, or out of memory); try fewer workers (--jobs)")
+    return cast("R", outcome.result)
 
 
 def run_all(
@@ -178,6 +188,14 @@ class _Saying(logging.Handler):
             self._saying.send((record.levelno, text))
 
 
+_spent = {"cpu_s": 0.0}
+
+
+def cluster_cpu_s() -> float:
+    """Return the CPU seconds that clusters' workers spent on tasks of this process, as `resource.RUSAGE_CHILDREN` counts local ones."""
+    return _spent["cpu_s"]
+
+
 _ANSWER_S = 10
 """So long a scheduler has to answer."""
 _ALONE_S = 300
@@ -205,7 +223,7 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
             for future in _ended(client, running, address):
                 index = running.pop(future)
                 try:
-                    said, result = future.result()
+                    said, result, cpu_s = future.result()
                 except KilledWorker:
                     yield Outcome(index, None, died=True)
                 except ModuleNotFoundError as error:
@@ -219,6 +237,7 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
                         f"{address}: the scheduler lacks tcpipe; install there what is installed here"
                     ) from None
                 else:
+                    _spent["cpu_s"] += cpu_s
                     for record in said:
                         logger.log(*record)
                     yield Outcome(index, result)
@@ -296,18 +315,21 @@ def _workers(client: Client, address: str) -> int:
     return len(threads)
 
 
-def _on_worker(function: Callable[[T], R], task: T, version: str, level: int) -> tuple[list[tuple[int, str, str]], R]:
-    """Run a task on a cluster's worker; return what it logged, and its result."""
+def _on_worker(
+    function: Callable[[T], R], task: T, version: str, level: int
+) -> tuple[list[tuple[int, str, str]], R, float]:
+    """Run a task on a cluster's worker; return what it logged, its result, and the CPU seconds that it took."""
     if version != __version__:
         raise UsageError(
             f"{os.uname().nodename}: a worker has tcpipe {__version__}, wanted {version} as here; install that"
         )
     said: list[tuple[int, str, str]] = []
-    keeping = _Keeping(said)
+    keeping, began_s = _Keeping(said), time.process_time()
     logger.addHandler(keeping)
     logger.setLevel(level)
     try:
-        return said, function(task)
+        result = function(task)
+        return said, result, time.process_time() - began_s
     finally:
         logger.removeHandler(keeping)
 

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import click
 
 from tcpipe.cli.options import (
@@ -9,12 +13,17 @@ from tcpipe.cli.options import (
     SEALED,
     FloatRange,
     LonLat,
+    cluster_option,
     json_option,
     map_option,
     quiet_option,
     speed_option,
     store_option,
 )
+
+if TYPE_CHECKING:
+    from tcpipe.formats.maps.map_files import MapFile
+    from tcpipe.planning.cost_model import CostModel
 
 
 @click.command("cost-map", short_help="Directional cost maps of a whole map")
@@ -38,6 +47,7 @@ from tcpipe.cli.options import (
 )
 @speed_option
 @store_option
+@cluster_option
 @json_option
 @quiet_option
 def cost_map(
@@ -49,6 +59,7 @@ def cost_map(
     origin_deg: tuple[float, float] | None,
     speed_mps: float | None,
     store: str,
+    cluster: str | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -58,12 +69,27 @@ def cost_map(
     maps for Nav2. An interrupted call goes on where it was; OUT may be a URL in a bucket, where nothing is replaced.
     """
     from tcpipe.cli.output import progress, say_result
-    from tcpipe.learning.models import chosen_model
-    from tcpipe.planning.cost_map import make_cost_map
-    from tcpipe.planning.inputs import chosen_map
+    from tcpipe.planning.cost_map import Cluster, make_cost_map
 
     with progress("cost-map", 1, quiet=quiet) as shown:
-        source = chosen_map(store, map_name)
-        found = chosen_model(model, speed_mps=speed_mps)
-        result = make_cost_map(found, source, out, step_m=step_m, origin_deg=origin_deg, step=shown.count)
+        paths = (model, store) if cluster is None else (_anywhere(model), _anywhere(store))
+        inputs = partial(_inputs, *paths, map_name, speed_mps)
+        elsewhere = None if cluster is None else Cluster(cluster, inputs)
+        found, source = inputs()
+        result = make_cost_map(
+            found, source, out, step_m=step_m, origin_deg=origin_deg, step=shown.count, cluster=elsewhere
+        )
     say_result(result, as_json=as_json)
+
+
+def _anywhere(path: str) -> str:
+    return path if "://" in path else str(Path(path).absolute())
+
+
+def _inputs(model: str, store: str, map_name: str | None, speed_mps: float | None) -> tuple[CostModel, MapFile]:
+    """Return the model and the map, wherever this is called."""
+    from tcpipe.learning.models import chosen_model
+    from tcpipe.planning.inputs import chosen_map
+
+    source = chosen_map(store, map_name)
+    return chosen_model(model, speed_mps=speed_mps), source

@@ -19,3 +19,17 @@ def map_table(path: Path) -> pa.Table:
     """Return the whole table as a view of the file, which must outlive it."""
     with pa.memory_map(str(path)) as source:
         return pa.ipc.open_file(source).read_all()
+
+
+def table_bytes(table: pa.Table) -> bytes:
+    """Return a table as bytes, schema and all; `table_of` is the way back."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, table.schema) as writer:
+        writer.write_table(table)
+    return bytes(sink.getvalue())
+
+
+def table_of(data: bytes) -> pa.Table:
+    """Return the table in bytes of `table_bytes`."""
+    with pa.ipc.open_stream(data) as reader:
+        return reader.read_all()

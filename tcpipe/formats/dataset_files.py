@@ -24,7 +24,8 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.json_files import typed
 from tcpipe.formats.layer_descriptions import cf_attributes, layers_described
-from tcpipe.formats.parquet import column_names, read_row_group, read_table, write_table
+from tcpipe.formats.parquet import column_names, parquet_bytes, read_row_group, read_table
+from tcpipe.formats.place import Place
 from tcpipe.formats.published import FetchedShards
 from tcpipe.formats.seals import prove_files, read_sealed
 from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
@@ -78,21 +79,65 @@ class Pixels:
     slots: NDArray[np.int64]
     read: Callable[[str, NDArray[np.int64]], LayerPixels]
 
+    def of(self, rows: slice | NDArray[np.int64]) -> Pixels:
+        """Return the patches of some rows."""
+        return replace(self, slots=self.slots[rows])
 
-def write_patches_zarr(
+
+@dataclass(frozen=True, slots=True)
+class ZarrDrawer:
+    """A shard of every layer, to be written by whoever sees where the patches wait, and ``out``."""
+
+    out: Place
+    pixels: Pixels
+    arrays: Mapping[str, ShardedArray]
+    number: int
+    threads: int
+
+    def write(self) -> None:
+        """Write what is not there yet."""
+        shard = (self.number, 0, 0)
+        for layer, array in self.arrays.items():
+            name = f"{PATCHES}/{layer}/{array.shard_name(shard)}"
+            if self.out.size(name) is None:
+                patches = self.pixels.read(layer, self.pixels.slots)
+                self.out.put(name, array.encoded_shard(patches, threads=self.threads))
+
+
+@dataclass(frozen=True, slots=True)
+class ParquetDrawer:
+    """A Parquet shard, as `ZarrDrawer`; ``rows`` gives its rows of the samples table."""
+
+    out: Place
+    pixels: Pixels
+    rows: Callable[[], pa.Table]
+    shard: Shard
+
+    def write(self) -> None:
+        """Write it, unless it is there."""
+        if self.out.size(self.shard.path) is None:
+            table = self.rows()
+            for layer in self.pixels.layers.values():
+                table = table.append_column(*_list_column(layer, self.pixels.read(layer.name, self.pixels.slots)))
+            self.out.put(self.shard.path, parquet_bytes(table, rows_per_group=GROUP_ROWS))
+
+
+Drawer = ZarrDrawer | ParquetDrawer
+
+
+def zarr_drawers(
     directory: Path,
+    out: Place,
     pixels: Pixels,
     sample_ids: Callable[[int, int], Sequence[str]],
     *,
-    compression: Compression = "zstd",
-    threads: int = 1,
-) -> None:
-    """Write ``patches.zarr`` into the dataset's directory.
+    compression: Compression,
+    threads: int,
+) -> list[Drawer]:
+    """Write ``patches.zarr`` into the dataset's directory, all but the layers' shards; return these, to be written to ``out``.
 
     Parameters
     ----------
-    directory
-        The dataset's directory.
     pixels
         The patches of all rows.
     sample_ids
@@ -100,7 +145,7 @@ def write_patches_zarr(
     compression
         What the layers are encoded with.
     threads
-        Chunks encoded side by side; the bytes do not depend on it.
+        Chunks of a shard encoded side by side; the bytes do not depend on it.
 
     """
     n, px = len(pixels.slots), pixels.patch_px
@@ -121,10 +166,6 @@ def write_patches_zarr(
             compression=compression,
             level=_LEVELS[compression],
         )
-        array = open_sharded(directory / PATCHES / layer.name)
-        for number, first in enumerate(range(0, n, shard)):
-            patches = pixels.read(layer.name, pixels.slots[first : first + shard])
-            array.write_shard((number, 0, 0), patches, threads=threads)
     ids = add_array(
         group,
         "sample_id",
@@ -139,45 +180,35 @@ def write_patches_zarr(
         last = min(first + SHARD_ROWS, n)
         ids[first:last] = np.array(sample_ids(first, last), dtype=object)
     consolidate(group)
+    arrays = {layer: open_sharded(directory / PATCHES / layer) for layer in pixels.layers}
+    rows = (slice(first, first + shard) for first in range(0, n, shard))
+    return [ZarrDrawer(out, pixels.of(part), arrays, number, threads) for number, part in enumerate(rows)]
 
 
-def write_patches_parquet(
-    directory: Path,
-    pixels: Pixels,
-    samples: Callable[[NDArray[np.int64]], pa.Table],
-    split: NDArray[np.str_],
-) -> list[Shard]:
-    """Write ``data/<split>-*.parquet``: the columns of the samples and each layer as a plain fixed-size list.
+def parquet_drawers(
+    out: Place, pixels: Pixels, samples: Callable[[NDArray[np.int64]], Callable[[], pa.Table]], split: NDArray[np.str_]
+) -> list[Drawer]:
+    """Return ``data/<split>-*.parquet``, to be written to ``out``: the columns of the samples and each layer as a plain fixed-size list.
 
     Parameters
     ----------
-    directory
-        The dataset's directory.
     pixels
         The patches of all rows.
     samples
-        Gives the rows asked for of the samples table.
+        Gives, for some rows, what gives these rows of the samples table.
     split
         Split of every row, shape (N,).
 
-    Returns
-    -------
-    Every shard.
-
     """
-    shards = list[Shard]()
+    drawers = list[Drawer]()
     for name in SPLITS:
         here = np.flatnonzero(split == name)
         count = -(-len(here) // SHARD_ROWS)
         for number in range(count):
             part = here[number * SHARD_ROWS : (number + 1) * SHARD_ROWS]
-            table = samples(part)
-            for layer in pixels.layers.values():
-                table = table.append_column(*_list_column(layer, pixels.read(layer.name, pixels.slots[part])))
-            path = f"{SHARDS}/{name}-{number:05d}-of-{count:05d}.parquet"
-            write_table(table, directory / path, rows_per_group=GROUP_ROWS)
-            shards.append(Shard(path, name, len(part)))
-    return shards
+            shard = Shard(f"{SHARDS}/{name}-{number:05d}-of-{count:05d}.parquet", name, len(part))
+            drawers.append(ParquetDrawer(out, pixels.of(part), samples(part), shard))
+    return drawers
 
 
 def _list_column(layer: Layer, patches: LayerPixels) -> tuple[pa.Field, pa.Array]:

@@ -31,19 +31,28 @@ def parquet_rows(
     path: Path, schema: pa.Schema, *, rows_per_group: int = ROWS_PER_GROUP
 ) -> Iterator[Callable[[pa.Table], None]]:
     """Yield a function that adds rows to ``path``, each call a row group or more; the file appears at the end, whole or not at all."""
-    with (
-        atomic_file(path) as temporary,
-        pq.ParquetWriter(
-            temporary,
-            schema,
-            compression="zstd",
-            compression_level=1,
-            use_dictionary=[field.name for field in schema if pa.types.is_string(field.type)],
-            store_schema=True,
-            write_page_checksum=True,
-        ) as writer,
-    ):
+    with atomic_file(path) as temporary, _writer(temporary, schema) as writer:
         yield lambda table: writer.write_table(table.combine_chunks(), row_group_size=rows_per_group)
+
+
+def parquet_bytes(table: pa.Table, *, rows_per_group: int = ROWS_PER_GROUP) -> bytes:
+    """Return the file that `write_table` writes."""
+    sink = pa.BufferOutputStream()
+    with _writer(sink, table.schema) as writer:
+        writer.write_table(table.combine_chunks(), row_group_size=rows_per_group)
+    return bytes(sink.getvalue())
+
+
+def _writer(sink: Path | pa.NativeFile, schema: pa.Schema) -> pq.ParquetWriter:
+    return pq.ParquetWriter(
+        sink,
+        schema,
+        compression="zstd",
+        compression_level=1,
+        use_dictionary=[field.name for field in schema if pa.types.is_string(field.type)],
+        store_schema=True,
+        write_page_checksum=True,
+    )
 
 
 def storable(table: pa.Table) -> pa.Table:

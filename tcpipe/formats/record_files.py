@@ -71,7 +71,7 @@ class Call:
     """UTC, ISO 8601."""
     wall_s: float = 0.0
     cpu_s: float = 0.0
-    """Of its process and the workers on the same machine."""
+    """Of its process and its workers, also those of a cluster."""
     logs: tuple[str, ...] = ()
     """As they were given, in full."""
     failed: Mapping[str, str] = field(default_factory=dict)

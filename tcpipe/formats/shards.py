@@ -144,13 +144,11 @@ class ShardedArray:
             out[top - row0 : bottom - row0, left - col0 : right - col0] = part
         return out
 
-    def write_shard(self, shard: tuple[int, ...], values: NDArray[Any], *, threads: int = 1) -> None:
-        """Write a shard from its corner on; what ``values`` leave of its last chunks is fill value.
+    def encoded_shard(self, values: NDArray[Any], *, threads: int = 1) -> bytes:
+        """Return the file of a shard that holds ``values`` from its corner on; what they leave of its last chunks is fill value.
 
         Parameters
         ----------
-        shard
-            Number of the shard along each axis.
         values
             At most ``shard_shape``.
         threads
@@ -159,18 +157,20 @@ class ShardedArray:
         """
         values = np.asarray(values, self.dtype)
         places = list(product(*(range(-(-n // c)) for n, c in zip(values.shape, self.chunk_shape, strict=True))))
-        index = np.full((*self.per_shard, 2), _ABSENT, np.uint64)
-        path = self._shard_path(shard)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("wb") as file, ThreadPoolExecutor(threads) as pool:
+        index, pieces, end = np.full((*self.per_shard, 2), _ABSENT, np.uint64), list[bytes](), 0
+        with ThreadPoolExecutor(threads) as pool:
             encoded = map if threads == 1 else pool.map
             for place, data in zip(places, encoded(lambda place: self._encoded(values, place), places), strict=True):
-                index[place] = file.tell(), len(data) + _CRC_BYTES
-                file.write(data)
-                file.write(_crc(data))
-            table = index.astype("<u8").tobytes()
-            file.write(table)
-            file.write(_crc(table))
+                index[place] = end, len(data) + _CRC_BYTES
+                pieces += [data, _crc(data)]
+                end += len(data) + _CRC_BYTES
+        table = index.astype("<u8").tobytes()
+        return b"".join((*pieces, table, _crc(table)))
+
+    @staticmethod
+    def shard_name(shard: tuple[int, ...]) -> str:
+        """Return the name of a shard's file, below the array's directory, from its number along each axis."""
+        return "/".join(("c", *map(str, shard)))
 
     def _encoded(self, values: NDArray[Any], place: tuple[int, ...]) -> bytes:
         cut = tuple(slice(i * c, (i + 1) * c) for i, c in zip(place, self.chunk_shape, strict=True))
@@ -187,7 +187,7 @@ class ShardedArray:
         return tuple(s // c for s, c in zip(self.shard_shape, self.chunk_shape, strict=True))
 
     def _shard_path(self, shard: tuple[int, ...]) -> Path:
-        return self.path.joinpath("c", *(str(i) for i in shard))
+        return self.path / self.shard_name(shard)
 
     def _encoded_at(
         self, shard: tuple[int, ...], place: tuple[int, ...], end: Callable[[], int], read: Callable[[int, int], bytes]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 from tcpipe.errors import StoreError
+from tcpipe.execution import cluster_cpu_s
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.record_files import Call, record_name
 from tcpipe.store import Store
@@ -124,4 +125,4 @@ def _amount(call: Call) -> int:
 
 def _cpu_s() -> float:
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
-    return sum(of.ru_utime + of.ru_stime for of in used)
+    return sum(of.ru_utime + of.ru_stime for of in used) + cluster_cpu_s()

@@ -80,7 +80,7 @@ def prune(
     keep
         Runs and recipes, by id, of which nothing goes.
     min_age_s
-        What killed calls left is removed when it is so old.
+        What killed calls left is removed when it is so old; what waits for a dataset, when nothing was put there for so long.
     dry_run
         Say what would go, and remove nothing.
 

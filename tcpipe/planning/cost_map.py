@@ -14,9 +14,10 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from shutil import rmtree
 from typing import Any, TypeAlias
@@ -24,7 +25,8 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.errors import MapError, StoreError, UsageError, plain_lines
+from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, plain_lines
+from tcpipe.execution import run_all, sound
 from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
@@ -38,7 +40,7 @@ from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.courses import ANGLES_DEG, COURSES
 from tcpipe.planning.path_cost import projection_of
 from tcpipe.planning.reasons import Reason
-from tcpipe.planning.verdicts import verdicts_of
+from tcpipe.planning.verdicts import Verdicts, verdicts_of
 from tcpipe.tables.bits import name_of
 from tcpipe.terrain.grid import MapGrid
 
@@ -53,7 +55,7 @@ KIND = "tcpipe cost map"
 VERSION = "1.1"
 
 _BLOCKS_KEPT = 8
-"""Blocks after which what is done is on disk."""
+"""Blocks after which what is done is on disk, and those of a task."""
 
 _QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
 _BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)
@@ -145,6 +147,7 @@ def make_cost_map(
     step_m: float,
     origin_deg: tuple[float, float] | None = None,
     step: Step = lambda _, __: None,
+    cluster: Cluster | None = None,
 ) -> CostMapResult:
     """Write the cost map of a whole map to ``out``, whole or not at all; an interrupted call goes on where it was.
 
@@ -161,6 +164,8 @@ def make_cost_map(
         Longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own without.
     step
         Is told how many blocks of how many are done.
+    cluster
+        Whose workers ask the model instead of this process; the bytes are the same.
 
     Raises
     ------
@@ -172,7 +177,9 @@ def make_cost_map(
     """
     check_model(model, source)
     if is_url(out):
-        return _into_bucket(model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step)
+        return _into_bucket(
+            model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster
+        )
     out = Path(out)
     clear_beside(out)
     grid, key, origin_m = grid_over(source, step_m), cost_map_key(model, source, step_m), _origin_m(source, origin_deg)
@@ -187,7 +194,7 @@ def make_cost_map(
             costs = open_cost_map(out, found)
         else:
             spool = _spool(place, key, grid)
-            _fill(model, source, spool, step)
+            _fill(model, source, spool, step, None if cluster is None else partial(_from_cluster, cluster, key))
             costs = spool.costs
         with atomic_directory(out) as directory:
             card = replace(_card(model, source, key, directory, costs, origin_m=origin_m), origin_deg=origin_deg)
@@ -197,14 +204,23 @@ def make_cost_map(
 
 
 def _into_bucket(
-    model: CostModel, source: MapFile, url: str, *, step_m: float, origin_deg: tuple[float, float] | None, step: Step
+    model: CostModel,
+    source: MapFile,
+    url: str,
+    *,
+    step_m: float,
+    origin_deg: tuple[float, float] | None,
+    step: Step,
+    cluster: Cluster | None,
 ) -> CostMapResult:
     """Make it on this machine, and put it to a URL; what is there already is not replaced."""
     known = read_cost_map_card(here(url)) if has_card(url) else None
     if known is not None and (known.key, known.origin_deg) == (cost_map_key(model, source, step_m), origin_deg):
         return CostMapResult(url, "unchanged", known)
     with published(url, CARD) as place:
-        made = make_cost_map(model, source, place, step_m=step_m, origin_deg=origin_deg, step=step)
+        made = make_cost_map(
+            model, source, place, step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster
+        )
     return replace(made, path=url)
 
 
@@ -297,7 +313,56 @@ def _job(place: Path) -> str | None:
         return None
 
 
-def _fill(model: CostModel, source: MapFile, spool: _Spool, step: Callable[[int, int], None]) -> None:
+@dataclass(frozen=True, slots=True)
+class Cluster:
+    """A Dask scheduler's address, and what gives its workers the model and the map, by files that they see."""
+
+    address: str
+    inputs: Callable[[], tuple[CostModel, MapFile]]
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Blocks of cells for one worker, and what the cost map is made from."""
+
+    inputs: Callable[[], tuple[CostModel, MapFile]]
+    key: str
+    grid: MapGrid
+    blocks: tuple[Cells, ...]
+
+
+def _from_cluster(cluster: Cluster, key: str, grid: MapGrid, todo: Sequence[Cells]) -> Iterator[tuple[Cells, Verdicts]]:
+    """Yield what a cluster's workers say of each block, as their tasks end."""
+    parts = [tuple(todo[first : first + _BLOCKS_KEPT]) for first in range(0, len(todo), _BLOCKS_KEPT)]
+    tasks = [_Task(cluster.inputs, key, grid, part) for part in parts]
+    with closing(run_all(_answer, tasks, jobs=1, cluster=cluster.address)) as outcomes:
+        for outcome in outcomes:
+            found: list[Verdicts] = sound(outcome)
+            yield from zip(tasks[outcome.index].blocks, found, strict=True)
+
+
+def _answer(task: _Task) -> list[Verdicts] | TcpipeError:
+    """Ask the model about the blocks of a task, on a worker."""
+    try:
+        model, source = task.inputs()
+        if cost_map_key(model, source, task.grid.pitch_m) != task.key:
+            raise UsageError(
+                f"{os.uname().nodename}: a worker finds another map {source.name} or model {model.name} than the caller; "
+                "wanted the same files under the same names"
+            )
+        frames = CellFrames(task.grid, where=f"map {source.name}")
+        return list(verdicts_of(model, source, (frames.of(cells) for cells in task.blocks)))
+    except TcpipeError as error:
+        return error
+
+
+def _fill(
+    model: CostModel,
+    source: MapFile,
+    spool: _Spool,
+    step: Step,
+    elsewhere: Callable[[MapGrid, Sequence[Cells]], Iterator[tuple[Cells, Verdicts]]] | None,
+) -> None:
     """Ask the model about every cell that is not done."""
     costs = spool.costs
     frames = CellFrames(costs.grid, where=f"map {source.name}")
@@ -306,8 +371,12 @@ def _fill(model: CostModel, source: MapFile, spool: _Spool, step: Callable[[int,
     if not missing.all():
         logger.info("going on where it was: %.0f %% of the cells are done", 100.0 * (1.0 - missing.mean()))
     ready: list[Cells] = []
-    answers = verdicts_of(model, source, (frames.of(cells) for cells in todo))
-    for number, (cells, found) in enumerate(zip(todo, answers, strict=True), 1):
+    answers: Iterator[tuple[Cells, Verdicts]]
+    if elsewhere is None:
+        answers = zip(todo, verdicts_of(model, source, (frames.of(cells) for cells in todo)), strict=True)
+    else:
+        answers = elsewhere(costs.grid, todo)
+    for number, (cells, found) in enumerate(answers, 1):
         costs.put(cells, found)
         ready.append(cells)
         if len(ready) == _BLOCKS_KEPT or number == len(todo):

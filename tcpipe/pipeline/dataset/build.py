@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import shutil
-import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, pla
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.croissant import croissant
-from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding, Shard
+from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding
 from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
@@ -30,26 +29,22 @@ from tcpipe.formats.dataset_files import (
     SAMPLES,
     SHARDS,
     FileFormat,
-    Pixels,
     read_card,
     read_current_card,
     read_samples,
-    write_patches_parquet,
-    write_patches_zarr,
 )
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
 from tcpipe.formats.published import has_card, here_by_range, published, settle
 from tcpipe.formats.recipe_toml import find_recipe, load_recipe
 from tcpipe.formats.record_files import Call, DatasetMade, record_name
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
-from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
@@ -59,13 +54,15 @@ from tcpipe.pipeline.dataset.card import (
     dataset_card,
     is_whole,
 )
-from tcpipe.pipeline.dataset.content import Content, gather_content
+from tcpipe.pipeline.dataset.content import gather_content
 from tcpipe.pipeline.dataset.findings import doubt_in_words, findings_in_words
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
 from tcpipe.pipeline.dataset.runs import gone_runs
+from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.pipeline.dataset.splitting import empty_splits
+from tcpipe.pipeline.dataset.writing import write_patches
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
@@ -221,7 +218,7 @@ def build_dataset(
         return _planned(place, opened, inputs, jobs=jobs)
     else:
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
-        with whole as directory, _waiting_place(directory, opened, inputs.digest, cluster=cluster) as pixels:
+        with whole as directory, _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers:
             known = _build(
                 directory,
                 inputs,
@@ -229,11 +226,11 @@ def build_dataset(
                 regions,
                 earlier,
                 file_format=file_format,
-                pixels=pixels,
-                jobs=jobs,
-                cluster=cluster,
+                workers=workers,
                 beside=place.absolute().parent if isinstance(place, Path) else None,
             )
+        for entry in workers.waiting.entries():
+            workers.waiting.delete(entry.name)
         result = _result(place, "done", known, problems)
     if not dry_run:
         _remember(opened, watch, result, inputs, jobs, size=sum(of.size_bytes for of in known.checksums.values()))
@@ -351,17 +348,20 @@ def _card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
 
 
 @contextmanager
-def _waiting_place(directory: Path, store: Store, inputs: str, *, cluster: str | None) -> Iterator[Place]:
-    """Yield where pixels wait: in the directory that is made, or, where workers elsewhere write them, in the store, which they see."""
+def _workers(directory: Path, store: Store, inputs: str, *, jobs: int, cluster: str | None) -> Iterator[Workers]:
+    """Yield who samples and writes; what waits lies in the directory that is made, or in the store, which a cluster's workers see."""
     if cluster is None:
-        yield DirectoryPlace(directory / SPOOL / "pixels")
+        yield Workers(jobs, None, DirectoryPlace(directory / SPOOL), DirectoryPlace(directory))
         return
-    place = store.place.below(f"{SPOOL}/{inputs}-{uuid.uuid4().hex[:8]}")
+    waiting = store.place.below(f"{SPOOL}/{inputs}")
     try:
-        yield place
-    finally:
-        for entry in place.entries():
-            place.delete(entry.name)
+        yield Workers(1, cluster, waiting, waiting.below("files"))
+    except StoreError as error:
+        if f"/{SPOOL}/{inputs}/" not in str(error) or "is gone" not in str(error):
+            raise
+        raise StoreError(
+            f"{waiting.where()}: another build of the same was first, and took away what both used; run the same command again"
+        ) from None
 
 
 def _build(
@@ -372,20 +372,18 @@ def _build(
     earlier: pa.Table | None,
     *,
     file_format: FileFormat,
-    pixels: Place,
-    jobs: int,
-    cluster: str | None,
+    workers: Workers,
     beside: Path | None,
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
     waiting = directory / SPOOL
     waiting.mkdir()
-    content = gather_content(waiting, inputs, recipe, regions, earlier, spool_place=pixels, jobs=jobs, cluster=cluster)
+    content = gather_content(waiting, inputs, recipe, regions, earlier, workers=workers)
     logger.info("writing %d samples", len(content.samples))
     with parquet_rows(directory / SAMPLES, content.samples.schema) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):
             write(piece)
-    shards = _write_patches(directory, content, file_format, compression=recipe.dataset.compression, threads=jobs)
+    shards = write_patches(directory, content, file_format, workers, compression=recipe.dataset.compression)
     shutil.rmtree(waiting)
     _write_overviews(directory, content.sources)
     balance, drive_next = measure_balance(
@@ -426,18 +424,6 @@ def _write_overviews(directory: Path, sources: Sequence[MapFile]) -> None:
         write_overview(directory / RELIEF, maps_overview(sources, relief_overview))
     if "terrain" in layers:
         write_overview(directory / CLASSES, maps_overview(sources, class_overview))
-
-
-def _write_patches(
-    directory: Path, content: Content, file_format: FileFormat, *, compression: Compression, threads: int
-) -> list[Shard]:
-    """Write the layers; return the shards, where the format has any."""
-    samples, spool = content.samples, content.spool
-    pixels = Pixels(spool.layers, spool.patch_px, samples.slots(), spool.read)
-    if file_format == "parquet":
-        return write_patches_parquet(directory, pixels, samples.take, samples.splits())
-    write_patches_zarr(directory, pixels, samples.ids, compression=compression, threads=threads)
-    return []
 
 
 def _croissant(

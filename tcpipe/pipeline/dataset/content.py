@@ -17,14 +17,13 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Covariate, MapRegistration, Removal
 from tcpipe.formats.geoparquet import located
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.place import Place
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.pipeline.dataset.added_columns import added_columns, narrow_patches, tag_of_each
 from tcpipe.pipeline.dataset.findings import findings_in_words, findings_of_runs
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.pipeline.dataset.registration import register_runs
 from tcpipe.pipeline.dataset.removal import removed_by_ground
-from tcpipe.pipeline.dataset.sampling import Spool, sample_all_segments
+from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
 from tcpipe.pipeline.dataset.segments import move_out, pool_segments
 from tcpipe.pipeline.dataset.splitting import Drawn, draw_splits
 from tcpipe.recipe import Recipe
@@ -154,11 +153,9 @@ def gather_content(
     regions: Regions | None,
     earlier: pa.Table | None,
     *,
-    spool_place: Place,
-    jobs: int,
-    cluster: str | None,
+    workers: Workers,
 ) -> Content:
-    """Sample, split and order; segments wait in files in ``directory``, pixels at ``spool_place``; both must be empty.
+    """Sample, split and order; segments wait in files in ``directory``, which must be empty, pixels where ``workers`` see them.
 
     Raises
     ------
@@ -176,9 +173,7 @@ def gather_content(
         inputs.maps,
         recipe.sample,
         gnss_crs=gnss_crs,
-        spool_place=spool_place,
-        jobs=jobs,
-        cluster=cluster,
+        workers=workers,
     )
     sources = tuple(open_map(*of) for of in inputs.maps())
     lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any, overload
+from zipfile import BadZipFile
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from tcpipe.errors import DatasetError, TcpipeError
-from tcpipe.execution import run_all
+from tcpipe.errors import TcpipeError
+from tcpipe.execution import run_all, sound
 from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
@@ -29,6 +32,8 @@ from tcpipe.terrain.sampling import Patches
 from tcpipe.terrain.sampling_kernel import morton
 from tcpipe.terrain.tiles import TilePool, level_for
 
+logger = logging.getLogger("tcpipe")
+
 _BATCH_ROWS = 8_192
 """Segments sampled together: 50 MB of patches."""
 
@@ -39,6 +44,9 @@ _CELL_DEG = 1e-4
 """Batches follow a space-filling curve over cells of this size, so that a map tile is decoded for few of them."""
 
 _PLACING = ("map_index", "footprint_xy_m", "footprint_lonlat_deg")
+_SAMPLED = ("kept", "lost_by", *_PLACING)
+
+_SIZE_BYTES = 8
 
 _HELD_MAPS = 2
 """Maps that a process keeps open, with their tiles, from batch to batch: 0.3 GB."""
@@ -49,23 +57,63 @@ MapPlaces = Callable[[], tuple[tuple[Path, FetchedShards | None], ...]]
 
 
 @dataclass(frozen=True, slots=True)
+class Workers:
+    """Who samples and writes: processes side by side, or the workers of the Dask scheduler at an address."""
+
+    jobs: int
+    cluster: str | None
+    waiting: Place
+    """Where pixels wait, and what else a dataset is put together from; a cluster's workers see it."""
+    out: Place
+    """Where shards are written; they see that, too."""
+
+
+@dataclass(frozen=True, slots=True)
 class Spool:
     """Pixels that wait for their place in the dataset: one file a batch, one layer after another, in the order of the dataset.
 
     What is read together, a stretch of the dataset, is then one stretch of every file: shuffled on disk, never held in memory, and in a
     bucket as good as in a directory. A slot is the number of a batch (upper 32 bits) and a row of its file.
+
+    Where the spool is ``kept``, what else is said of a batch stands behind its pixels, then the size of that (8 bytes). Of two workers that
+    sample one batch the first is believed, and after a killed build the next one goes on with what is there.
     """
 
     place: Place
     layers: Mapping[str, Layer]
     patch_px: int
+    kept: bool = False
+    """Whether it outlives a build that is killed."""
     counts: tuple[int, ...] = ()
     """Patches by batch."""
 
-    def write(self, batch: int, order: NDArray[np.intp], pixels: Mapping[str, LayerPixels]) -> None:
-        """Write the patches of a batch, each layer of shape (n, px, px), in an order of its rows, (n,)."""
-        whole = b"".join(np.ascontiguousarray(pixels[layer][order]).data for layer in self.layers)
-        self.place.put(f"{batch}", whole, lasting=False)
+    def write(self, batch: int, order: NDArray[np.intp], sampled: Sampled) -> Sampled:
+        """Write the patches of a batch, in an order of its rows, (n,); return what is said of them, without their pixels."""
+        pixels, bare = sampled.patches.pixels, replace(sampled, patches=replace(sampled.patches, pixels={}))
+        waiting = [np.ascontiguousarray(pixels[layer][order]).data for layer in self.layers]
+        if not self.kept:
+            self.place.put(f"{batch}", b"".join(waiting), lasting=False)
+            return bare
+        said = _as_bytes(bare)
+        self.place.put_new(f"{batch}", b"".join((*waiting, said, len(said).to_bytes(_SIZE_BYTES, "little"))))
+        return self.found(batch) or bare
+
+    def found(self, batch: int) -> Sampled | None:
+        """Return what is said of a batch that lies here whole; one of which a part is here goes."""
+        name = f"{batch}"
+        size = self.place.size(name) if self.kept else None
+        if size is None:
+            return None
+        end = max(size - _SIZE_BYTES, 0)
+        said = int.from_bytes(self.place.read_range(name, end, _SIZE_BYTES), "little")
+        try:
+            sampled = _of_bytes(self.place.read_range(name, max(end - said, 0), min(said, end)))
+        except (ValueError, OSError, EOFError, KeyError, BadZipFile):
+            sampled = None
+        if sampled is None or size != len(sampled.kept) * sum(map(self._patch_bytes, self.layers)) + said + _SIZE_BYTES:
+            self.place.delete(name)
+            return None
+        return sampled
 
     def read(self, layer: str, slots: NDArray[np.int64]) -> LayerPixels:
         """Return the patches in ``slots``, shape (n, px, px); of each batch one stretch is read."""
@@ -148,11 +196,9 @@ def sample_all_segments(
     config: SampleConfig,
     *,
     gnss_crs: str,
-    spool_place: Place,
-    jobs: int,
-    cluster: str | None = None,
+    workers: Workers,
 ) -> tuple[Sampled, NDArray[np.int64], Spool]:
-    """Sample every segment from the first map that has data for it; pixels go to files at ``spool_place``, the rest is returned.
+    """Sample every segment from the first map that has data for it; pixels go to files where they wait, the rest is returned.
 
     Beside it, in the order of its ``kept``, which rises: the slots of the spool.
 
@@ -164,10 +210,8 @@ def sample_all_segments(
         Their ranks in the dataset's order, uniform over 64 bits, shape (M,).
     maps, config, gnss_crs
         What is sampled, in order of priority, how, and the CRS of the segments' positions.
-    spool_place
-        Where the pixels wait.
-    jobs, cluster
-        Processes side by side, or the address of a Dask scheduler whose workers sample instead; they see maps and ``spool_place``.
+    workers
+        Who samples; they see the maps.
 
     Raises
     ------
@@ -178,16 +222,19 @@ def sample_all_segments(
     sources = [open_map(*of) for of in maps()]
     check_alike(sources)
     rows = list(_batch_rows(segments))
-    spool = Spool(spool_place, in_order(joint([source.layers for source in sources])), config.patch_px)
+    layers = in_order(joint([source.layers for source in sources]))
+    spool = Spool(workers.waiting.below("pixels"), layers, config.patch_px, kept=workers.cluster is not None)
+    if there := len(spool.place.files()):
+        logger.info("going on where it was: %d of %d batches are sampled", there, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
     batches = _Batches(rows, ranks, placed, maps, config, gnss_crs, spool)
     lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     warnings: dict[int, tuple[str, ...]] = {}
     try:
-        with closing(run_all(_sample_batch, batches, jobs=jobs, cluster=cluster)) as outcomes:
+        with closing(run_all(_sample_batch, batches, jobs=workers.jobs, cluster=workers.cluster)) as outcomes:
             for outcome in outcomes:
-                part, batch = _sound(outcome.result), outcome.index
+                part, batch = sound(outcome), outcome.index
                 kept = rows[batch][part.kept]
                 lost_by[rows[batch]] = part.lost_by
                 slots[kept[_in_order(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))
@@ -206,6 +253,20 @@ def sample_all_segments(
     return sampled, slots[kept], replace(spool, counts=tuple(counts))
 
 
+def _as_bytes(sampled: Sampled) -> bytes:
+    arrays: dict[str, Any] = {name: getattr(sampled, name) for name in _SAMPLED} | sampled.patches.columns()
+    with BytesIO() as file:
+        np.savez(file, warnings=np.array(sampled.warnings, np.str_), **arrays)
+        return file.getvalue()
+
+
+def _of_bytes(data: bytes) -> Sampled:
+    with np.load(BytesIO(data), allow_pickle=False) as held:
+        columns = dict(held)
+    warnings, rest = tuple(columns.pop("warnings").tolist()), {name: columns.pop(name) for name in _SAMPLED}
+    return Sampled(patches=Patches({}, **columns), warnings=warnings, **rest)
+
+
 def _in_order(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
     """Return the rows of a batch in the order of the dataset."""
     return np.argsort(ranks, kind="stable")
@@ -214,15 +275,6 @@ def _in_order(ranks: NDArray[np.uint64]) -> NDArray[np.intp]:
 def _columns(sampled: Sampled) -> dict[str, NDArray[Any]]:
     """Return what is said of the patches, an array each."""
     return {**sampled.patches.columns(), **{name: getattr(sampled, name) for name in _PLACING}}
-
-
-def _sound(part: Sampled | TcpipeError | None) -> Sampled:
-    """Return what a batch gave; raise what was wrong with it."""
-    if part is None:
-        raise DatasetError("a worker process died while sampling (killed, or out of memory); try fewer --jobs")
-    if isinstance(part, TcpipeError):
-        raise part
-    return part
 
 
 def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
@@ -236,13 +288,14 @@ def _batch_rows(segments: pa.Table) -> Iterator[NDArray[np.int64]]:
 def _sample_batch(batch: _Batch) -> Sampled | TcpipeError:
     """Sample one batch; its pixels go to its file of the spool."""
     try:
+        if (found := batch.spool.found(batch.number)) is not None:
+            return found
         held = [_held_map(*of, batch.config) for of in batch.maps()]
         sources, pools = [each.source for each in held], [each.tiles for each in held]
         sampled = sample_on_maps(batch.segments, sources, batch.config, gnss_crs=batch.gnss_crs, pools=pools)
-        batch.spool.write(batch.number, _in_order(batch.ranks[sampled.kept]), sampled.patches.pixels)
+        return batch.spool.write(batch.number, _in_order(batch.ranks[sampled.kept]), sampled)
     except TcpipeError as error:
         return error
-    return replace(sampled, patches=replace(sampled.patches, pixels={}))
 
 
 def _held_map(path: Path, fetched: FetchedShards | None, config: SampleConfig) -> _HeldMap:

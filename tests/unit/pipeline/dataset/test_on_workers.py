@@ -1,0 +1,138 @@
+"""Datasets that workers elsewhere sample and write, by tasks of pickle: the bytes of this machine, and what a killed build did is done."""
+
+import pickle
+import shutil
+from contextlib import suppress
+
+import numpy as np
+import pytest
+from storage_server import object_store
+from synthetic_store import add_run, add_world, lanes, segments
+
+from tcpipe import execution
+from tcpipe.execution import Outcome
+from tcpipe.formats import dataset_files
+from tcpipe.pipeline.dataset import sampling, writing
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.prune import prune
+from tcpipe.recipe import Recipe
+from tcpipe.store import open_store
+
+ROWS = 600
+BATCH_ROWS, BATCHES = 100, 6
+SHARD_ROWS, SHARDS = 256, 3
+
+
+@pytest.fixture(scope="module", autouse=True)
+def many_tasks():
+    """Batches and shards that are small, no page, and a cluster that takes tasks and gives results as bytes."""
+
+    def sent(what):
+        return pickle.loads(pickle.dumps(what))  # noqa: S301  our own
+
+    def elsewhere(function, tasks, _):
+        for index in range(len(tasks)):
+            yield Outcome(index, sent(sent(function)(sent(tasks[index]))))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sampling, "_BATCH_ROWS", BATCH_ROWS)
+        patch.setattr(dataset_files, "SHARD_ROWS", SHARD_ROWS)
+        patch.setattr(execution, "_run_on_cluster", elsewhere)
+        patch.setattr("tcpipe.pipeline.dataset.build.dataset_report", lambda _: "<!doctype html>")
+        yield
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, many_tasks):
+    """A store of 600 segments, and the datasets that this machine makes of it."""
+    directory = tmp_path_factory.mktemp("made")
+    store = open_store(directory / "store", create=True)
+    add_world(store, directory)
+    add_run(store, "a", segments("a", *lanes(np.linspace(-14.0, 14.0, 30), -10.0, 10.0)))
+    for kind in ("zarr", "parquet"):
+        built = build_dataset(directory / kind, store=store.root, recipe=Recipe(), file_format=kind)
+        assert built.samples == ROWS
+    return directory
+
+
+@pytest.fixture
+def store(made, tmp_path):
+    shutil.copytree(made / "store", tmp_path / "store")
+    return open_store(tmp_path / "store")
+
+
+def files(directory):
+    return {
+        path.relative_to(directory).as_posix(): path.read_bytes() for path in directory.rglob("*") if path.is_file()
+    }
+
+
+def build(store, out, **keywords):
+    return build_dataset(out, store=store, recipe=Recipe(), cluster="tcp://nowhere:1", **keywords)
+
+
+@pytest.mark.parametrize("kind", ["zarr", "parquet"])
+def test_workers_make_the_bytes_of_this_machine_and_leave_no_spool(made, store, tmp_path, kind):
+    build(store.root, tmp_path / "far", file_format=kind)
+    assert files(tmp_path / "far") == files(made / kind)
+    shards = [name for name in files(made / kind) if name.endswith("/0/0") or name.startswith("data/")]
+    assert len(shards) == (3 * SHARDS if kind == "zarr" else SHARDS)
+    assert not (store.root / "spool").exists()
+
+
+def test_workers_of_a_store_in_a_bucket_make_them_too(made, tmp_path, monkeypatch):
+    shutil.copytree(made / "store", tmp_path / "served" / "bucket" / "store")
+    with object_store(tmp_path / "served") as (environment, _):
+        for name in ("HTTP_PROXY", "http_proxy"):
+            monkeypatch.delenv(name, raising=False)
+        for name, value in {**environment, "TCPIPE_CACHE": str(tmp_path / "cache")}.items():
+            monkeypatch.setenv(name, value)
+        build("s3://bucket/store", tmp_path / "far")
+    assert files(tmp_path / "far") == files(made / "zarr")
+    assert not [path for path in (tmp_path / "served").rglob("spool/**/*") if path.is_file()]
+
+
+class _Killed(BaseException):
+    pass
+
+
+def killed(store, out, module, *, after):
+    """Have a build end when it has got so many tasks of a module done."""
+    done = []
+
+    def sound(outcome):
+        if len(done) == after:
+            raise _Killed
+        done.append(outcome)
+        return outcome.result
+
+    with pytest.MonkeyPatch.context() as patch, suppress(_Killed):
+        patch.setattr(module, "sound", sound)
+        build(store, out)
+        pytest.fail("it was not killed")
+    assert not out.exists()
+
+
+def test_a_killed_build_goes_on_and_what_is_half_written_does_not_count(made, store, tmp_path, monkeypatch):
+    sampled, sample = [], sampling.sample_on_maps
+    monkeypatch.setattr(sampling, "sample_on_maps", lambda *of, **how: (sampled.append(1), sample(*of, **how))[1])
+    killed(store.root, tmp_path / "out", sampling, after=3)
+    (spool,) = (store.root / "spool").iterdir()
+    batches = sorted((spool / "pixels").iterdir())
+    assert len(batches) == len(sampled) == 4
+    for path, size in zip(batches, (0, 5, path_size(batches[2]) - 1), strict=False):
+        path.write_bytes(path.read_bytes()[:size])
+    killed(store.root, tmp_path / "out", writing, after=1)
+    assert len(sampled) == 4 + 3 + (BATCHES - 4)
+    assert len([path for path in (spool / "files").rglob("*") if path.is_file()]) == 2 * 3, "two shards of three layers"
+    assert prune(store=store.root, recipe=Recipe(), dry_run=True).removed == (), "it may be going on"
+    found = prune(store=store.root, recipe=Recipe(), dry_run=True, min_age_s=0.0).removed
+    assert [(of.what, of.path) for of in found] == [("left by a killed build", str(spool))]
+    build(store.root, tmp_path / "out")
+    assert len(sampled) == BATCHES + 3, "nothing is sampled that was there"
+    assert files(tmp_path / "out") == files(made / "zarr")
+    assert not (store.root / "spool").exists()
+
+
+def path_size(path):
+    return path.stat().st_size
