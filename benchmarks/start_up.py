@@ -3,8 +3,9 @@
 Run by hand, on idle cores: ``python benchmarks/start_up.py [--quick]``. Each line is CPU time of a process (and of what it starts) beside
 that of ``import numpy, pyarrow, numba`` in the same run, the least of some times: the floor that nothing can go below. ``kernel`` is that
 floor with one cached kernel called, for which numba loads much more. ``ingest`` is half a minute of driving less what the same ingest takes
-once more in the same process. The last two lines are wall times of two logs of twelve minutes, the least of some turns: with one worker
-against two, and by two processes that are started at once, which is what two cores of this machine can do; ``--quick`` leaves them out.
+once more in the same process. The last lines are wall times of two logs of twelve minutes, the least of some turns: with one worker
+against two, by two processes that are started at once, which is what two cores of this machine can do, and by two workers of a Dask
+cluster, which were there before; ``--quick`` leaves them out.
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
+
+from dask_cluster import dask_cluster  # beside the tests
 
 KERNEL = """
 import numpy as np, pyarrow
@@ -63,14 +68,20 @@ def main() -> None:
 
 def second_worker(here: Path, turns: int) -> None:
     logs = [simulated(here / f"hills{seed}", "hills12", seed) for seed in (1, 2)]
-    ways = {"one": [[*logs, "--jobs", 1]], "two": [[*logs, "--jobs", 2]], "apart": [[log] for log in logs]}
-    wall_s: dict[str, list[float]] = {way: [] for way in ways}
-    for turn in range(turns):
-        for way, shares in ways.items():
-            wall_s[way].append(wall_of(shares, here / f"{way}-{turn}"))
-    one, two, apart = (min(seconds) for seconds in wall_s.values())
+    with dask_cluster(here) as cluster:
+        ways = {"one": [[*logs, "--jobs", 1]], "two": [[*logs, "--jobs", 2]], "apart": [[log] for log in logs]}
+        ways["dask"] = [[*logs, "--cluster", cluster.address]]
+        wall_s: dict[str, list[float]] = {way: [] for way in ways}
+        for turn in range(turns):
+            for way, shares in ways.items():
+                wall_s[way].append(wall_of(shares, here / f"{way}-{turn}"))
+    one, two, apart, dask = (min(seconds) for seconds in wall_s.values())
     print(f"workers  {one:5.2f} s with one, {two:.2f} s with two: {one / two:.2f} x")
     print(f"apart    {apart:5.2f} s by two processes started at once: two workers take {two / apart:.2f} x that")
+    turn_by_turn = ", ".join(f"{local / far:.2f}" for local, far in zip(wall_s["two"], wall_s["dask"], strict=True))
+    print(
+        f"dask     {dask:5.2f} s by two workers of a cluster: {two / dask:.2f} of the speed of two here; by turn {turn_by_turn}"
+    )
 
 
 def wall_of(shares: list[list[object]], here: Path) -> float:

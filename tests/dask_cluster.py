@@ -31,7 +31,7 @@ class DaskCluster:
     workers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def start_worker(self, *, threads: int = 1) -> None:
-        """Start one more worker."""
+        """Start one more worker, and wait until it is there."""
         how = ("--nthreads", str(threads), "--no-dashboard", "--local-directory", str(self.file.parent))
         self.workers.append(_started("worker", "--scheduler-file", str(self.file), *how))
         with Client(self.address, set_as_default=False) as client:
@@ -83,3 +83,17 @@ def die_once(mark: Path) -> int:
         return os.getpid()
     os.kill(os.getpid(), signal.SIGKILL)
     raise AssertionError
+
+
+def wants_more(value: int) -> int:
+    """Want a module that no worker has."""
+    import nowhere_to_be_had  # type: ignore[import-not-found]
+
+    return nowhere_to_be_had.task(value)  # type: ignore[no-any-return]
+
+
+def spend(cpu_s: float) -> None:
+    """Compute for so long."""
+    end = time.process_time() + cpu_s
+    while time.process_time() < end:
+        pass

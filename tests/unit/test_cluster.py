@@ -1,5 +1,6 @@
 """Tasks on a real Dask cluster: the same outcomes as here, a killed worker costs its task only, and what is in the way is one line."""
 
+import importlib
 import logging
 import os
 import time
@@ -10,12 +11,12 @@ import pytest
 
 pytest.importorskip("distributed", reason="the extra cluster is not installed")
 
-from dask_cluster import DaskCluster, dask_cluster, die_once, where
+from dask_cluster import DaskCluster, dask_cluster, die_once, spend, wants_more, where
 
 import tcpipe
 from tcpipe import execution
 from tcpipe.errors import TcpipeError, UsageError
-from tcpipe.execution import run_all
+from tcpipe.execution import cluster_cpu_s, run_all
 
 
 @pytest.fixture(scope="module")
@@ -58,6 +59,24 @@ def test_a_worker_of_another_version_is_refused(cluster, monkeypatch):
     monkeypatch.setattr(execution, "__version__", "99.0")
     with pytest.raises(UsageError, match=f"a worker has tcpipe {tcpipe.__version__}, wanted 99.0 as here"):
         list(run_all(where, [1], jobs=1, cluster=cluster.address))
+
+
+def test_what_a_worker_or_the_scheduler_lacks_is_one_line(cluster, tmp_path, monkeypatch):
+    with pytest.raises(
+        UsageError, match=r"tcp://.*: a worker lacks nowhere_to_be_had; install there what is installed"
+    ):
+        list(run_all(wants_more, [1], jobs=1, cluster=cluster.address))
+    (tmp_path / "only_here.py").write_text("def task(value):\n    return value\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    task = importlib.import_module("only_here").task
+    with pytest.raises(UsageError, match=r"tcp://.*: the scheduler lacks tcpipe; install there what is installed here"):
+        list(run_all(task, [1], jobs=1, cluster=cluster.address))
+
+
+def test_what_workers_spend_counts_here(cluster):
+    before_s = cluster_cpu_s()
+    assert [outcome.result for outcome in run_all(spend, [0.1, 0.1], jobs=1, cluster=cluster.address)] == [None, None]
+    assert 0.2 <= cluster_cpu_s() - before_s < 2.0
 
 
 def test_a_worker_of_many_threads_is_refused(tmp_path):
