@@ -140,7 +140,7 @@ def built(store, out):
         counter.clear()
     began = time.process_time()
     result = build.build_dataset(out, store=store.root, recipe=Recipe())
-    return result, spent["sample_all_segments"], spent["_write_patches"], time.process_time() - began
+    return result, spent["sample_all_segments"], spent["write_patches"], time.process_time() - began
 
 
 def floors_of(store, out, result, decoded):
@@ -182,7 +182,7 @@ def measure(directory, samples):
 def main():
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
     timed(content, "sample_all_segments")
-    timed(build, "_write_patches")
+    timed(build, "write_patches")
     counted()
     threading.Thread(target=watch, daemon=True).start()
     directory = Path(sys.argv[1])

@@ -347,13 +347,13 @@ def _answer(task: _Task) -> list[Verdicts] | TcpipeError:
         model, source = task.inputs()
         if cost_map_key(model, source, task.grid.pitch_m) != task.key:
             raise UsageError(
-                f"{os.uname().nodename}: a worker finds another map {source.name} or model {model.name} than the caller; "
-                "wanted the same files under the same names"
+                f"a worker finds another map {source.name} or model {model.name} than the caller; wanted the same files under "
+                "the same names"
             )
         frames = CellFrames(task.grid, where=f"map {source.name}")
         return list(verdicts_of(model, source, (frames.of(cells) for cells in task.blocks)))
-    except TcpipeError as error:
-        return error
+    except TcpipeError as error:  # it may lack what is here: an extra, a file
+        return type(error)(*(f"{os.uname().nodename}: {problem}" for problem in error.problems))
 
 
 def _fill(

@@ -198,7 +198,7 @@ def test_a_cluster_makes_the_same_bytes(made, sent, tmp_path):
 
 def test_a_worker_that_finds_another_model_is_refused(made, sent, tmp_path):
     other = replace(MODEL, checksum="1" * 64)
-    with pytest.raises(UsageError, match=r"a worker finds another map .* or model .* than the caller"):
+    with pytest.raises(UsageError, match=r"^[^:]+: a worker finds another map .* or model .* than the caller"):
         make_cost_map(other, made[0], tmp_path / "costs", step_m=1.0, cluster=Cluster("tcp://nowhere:1", _sloping))
     assert len(sent) == 1
 
