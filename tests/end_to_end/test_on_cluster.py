@@ -21,13 +21,13 @@ import os, signal, sys
 from tcpipe.pipeline.dataset import sampling
 from tcpipe.pipeline.dataset.build import build_dataset
 def sound(outcome):
-    if outcome.index == 2:
+    if outcome.index == 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return outcome.result
 sampling.sound, sampling._BATCH_ROWS = sound, int(sys.argv[2])
 build_dataset("far", store="there", cluster=sys.argv[1])
 """
-"""A build that is killed when the third batch is there."""
+"""A build that is killed when the second batch is there."""
 
 
 def _files(directory: Path) -> dict[str, bytes]:
@@ -43,8 +43,8 @@ def test_a_cluster_makes_the_bytes_that_this_machine_makes(tmp_path, monkeypatch
     with dask_cluster(tmp_path, workers=1) as cluster:
         there = tcpipe("ingest", *logs, "--store", "there", "--cluster", cluster.address, cwd=tmp_path)
         add_map("site", **site.rasters, store=tmp_path / "there")
-        monkeypatch.setattr(sampling, "_BATCH_ROWS", 8)
-        killed = subprocess.run([sys.executable, "-c", KILLED, cluster.address, "8"], cwd=tmp_path, check=False)
+        monkeypatch.setattr(sampling, "_BATCH_ROWS", 3)
+        killed = subprocess.run([sys.executable, "-c", KILLED, cluster.address, "3"], cwd=tmp_path, check=False)
         assert killed.returncode == -signal.SIGKILL
         built = tcpipe("build-dataset", "far", "--store", "there", "--cluster", cluster.address, cwd=tmp_path)
     assert "going on where it was: " in built.stderr
