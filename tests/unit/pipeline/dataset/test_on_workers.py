@@ -3,6 +3,7 @@
 import pickle
 import shutil
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from storage_server import object_store
 from synthetic_store import add_run, add_world, lanes, segments
 
 from tcpipe import execution
+from tcpipe.errors import StoreError
 from tcpipe.execution import Outcome
 from tcpipe.formats import dataset_files
+from tcpipe.pipeline.dataset import build as build_module
 from tcpipe.pipeline.dataset import sampling, writing
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.prune import prune
@@ -127,7 +130,8 @@ def test_a_killed_build_goes_on_and_what_is_half_written_does_not_count(made, st
     assert len([path for path in (spool / "files").rglob("*") if path.is_file()]) == 2 * 3, "two shards of three layers"
     assert prune(store=store.root, recipe=Recipe(), dry_run=True).removed == (), "it may be going on"
     found = prune(store=store.root, recipe=Recipe(), dry_run=True, min_age_s=0.0).removed
-    assert [(of.what, of.path) for of in found] == [("left by a killed build", str(spool))]
+    assert {of.what for of in found} == {"left by a killed build"}
+    assert {Path(of.path) for of in found} == {path for path in spool.rglob("*") if path.is_file()}
     build(store.root, tmp_path / "out")
     assert len(sampled) == BATCHES + 3, "nothing is sampled that was there"
     assert files(tmp_path / "out") == files(made / "zarr")
@@ -136,3 +140,16 @@ def test_a_killed_build_goes_on_and_what_is_half_written_does_not_count(made, st
 
 def path_size(path):
     return path.stat().st_size
+
+
+def test_who_ends_second_on_one_spool_is_told(store, tmp_path, monkeypatch):
+    def first(*of, **how):
+        shutil.rmtree(store.root / "spool")
+        return write(*of, **how)
+
+    write = build_module.write_patches
+    monkeypatch.setattr(build_module, "write_patches", first)
+    with pytest.raises(StoreError, match=r"another build of the same was first, .* run the same command again"):
+        build(store.root, tmp_path / "out")
+    monkeypatch.undo()
+    assert build(store.root, tmp_path / "out").samples == ROWS
