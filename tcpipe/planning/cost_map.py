@@ -177,9 +177,7 @@ def make_cost_map(
     """
     check_model(model, source)
     if is_url(out):
-        return _into_bucket(
-            model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster
-        )
+        return _into_bucket(model, source, str(out), step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster)
     out = Path(out)
     clear_beside(out)
     grid, key, origin_m = grid_over(source, step_m), cost_map_key(model, source, step_m), _origin_m(source, origin_deg)
@@ -218,9 +216,7 @@ def _into_bucket(
     if known is not None and (known.key, known.origin_deg) == (cost_map_key(model, source, step_m), origin_deg):
         return CostMapResult(url, "unchanged", known)
     with published(url, CARD) as place:
-        made = make_cost_map(
-            model, source, place, step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster
-        )
+        made = make_cost_map(model, source, place, step_m=step_m, origin_deg=origin_deg, step=step, cluster=cluster)
     return replace(made, path=url)
 
 
