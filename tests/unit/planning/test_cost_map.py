@@ -192,8 +192,8 @@ def test_a_cluster_makes_the_same_bytes(made, sent, tmp_path):
         MODEL, source, tmp_path / "costs", step_m=1.0, cluster=Cluster("tcp://nowhere:1", partial(_sloping, 0.2))
     )
     assert len(sent) > 2
-    for path in sorted(whole.path.iterdir()):
-        assert (result.path / path.name).read_bytes() == path.read_bytes(), path.name
+    for path in sorted(Path(whole.path).iterdir()):
+        assert (Path(result.path) / path.name).read_bytes() == path.read_bytes(), path.name
 
 
 def test_a_worker_that_finds_another_model_is_refused(made, sent, tmp_path):
