@@ -129,11 +129,13 @@ def working_directory(staging: Path) -> Iterator[Path]:
 def scratch_directory() -> Iterator[Path]:
     """Yield an empty directory of this user in the system's own (``TMPDIR``); what killed processes left there goes first."""
     clear_scratch()
-    directory, lock = _locked_directory(Path(tempfile.gettempdir()), _scratch_prefix(), mode=0o700)
+    holder, lock = _locked_directory(Path(tempfile.gettempdir()), _scratch_prefix(), mode=0o700)
     try:
+        directory = holder / "new"  # which others lock in their turn
+        directory.mkdir()
         yield directory
     finally:
-        shutil.rmtree(directory, ignore_errors=True)
+        shutil.rmtree(holder, ignore_errors=True)
         os.close(lock)
 
 

@@ -230,6 +230,8 @@ def test_scratch_of_the_killed_goes_and_of_the_living_stays(tmp_path: Path, monk
     (left / "copy.mcap").touch()
     (tmp_path / "tcpipe-cache").mkdir()
     with scratch_directory() as one, scratch_directory() as other:
-        assert {path.name for path in tmp_path.iterdir()} == {one.name, other.name, "tcpipe-cache"}
-        assert one.stat().st_mode & 0o077 == 0
+        assert {path.name for path in tmp_path.iterdir()} == {one.parent.name, other.parent.name, "tcpipe-cache"}
+        assert one.parent.stat().st_mode & 0o077 == 0
+        with atomic_directory(one / "a") as directory:  # waits for no lock of its own process
+            (directory / "b").touch()
     assert [path.name for path in tmp_path.iterdir()] == ["tcpipe-cache"]
