@@ -26,6 +26,7 @@ def answers() -> dict[str, type]:
     from tcpipe.pipeline.inspect import InspectedLogs, InspectedRun, InspectedStore
     from tcpipe.pipeline.inspected import InspectedDataset, InspectedMap
     from tcpipe.pipeline.known_trouble import Accepted
+    from tcpipe.pipeline.layers import ExportedLayers
     from tcpipe.pipeline.log_inspection import InspectedLog
     from tcpipe.pipeline.maps import AddedMap
     from tcpipe.pipeline.overlay import Overlay
@@ -54,6 +55,7 @@ def answers() -> dict[str, type]:
         "evaluate-drives.answer": Drives,
         "explain.answer": Explained,
         "export.answer": Exported,
+        "export-layers.answer": ExportedLayers,
         "ingest-log.answer": LogLine,
         "ingest-summary.answer": SummaryLine,
         "inspect-dataset.answer": InspectedDataset,

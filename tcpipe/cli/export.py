@@ -1,4 +1,4 @@
-"""``tcpipe export``: any topics of a log as Parquet."""
+"""``tcpipe export``: any topics of a log as Parquet; a dataset, store or run as a GeoPackage."""
 
 from __future__ import annotations
 
@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import LOG, OUTPUT_DIRECTORY, json_option, msgdef_option
+from tcpipe.cli.options import GEOPACKAGE, LOG, OUTPUT_EXPORT, json_option, msgdef_option
+from tcpipe.errors import UsageError
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.export import Exported
 
 
-@click.command(short_help="Topics of a log as Parquet")
-@click.argument("log", type=LOG, metavar="LOG")
+@click.command(short_help="Topics as Parquet; a dataset for QGIS")
+@click.argument("log", type=LOG, metavar="LOG|DATASET|STORE|RUN")
 @click.argument("names", nargs=-1, metavar="[TOPIC]...")
-@click.argument("out", type=OUTPUT_DIRECTORY, metavar="OUT")
+@click.argument("out", type=OUTPUT_EXPORT, metavar="OUT")
 @click.option("--topics", multiple=True, metavar="NAME[,NAME]", help="Only these topics; repeatable (default: all).")
 @msgdef_option
 @json_option
@@ -27,10 +28,21 @@ def export(
 
     Units of columns and the definition of the message stand in the files' metadata. What OUT holds already of the same
     log is left alone.
+
+    Of a dataset, a store or a run OUT is a GeoPackage (a name that ends in .gpkg; needs the extra gis): samples, footprints,
+    regions and where to drive next, or segments, with styles for QGIS.
     """
     import resource
 
-    from tcpipe.cli.output import print_json
+    from tcpipe.cli.output import print_json, say_result
+
+    if out.endswith(GEOPACKAGE):
+        from tcpipe.pipeline.layers import export_layers
+
+        if names or topics:
+            raise UsageError(f"{out}: a GeoPackage holds no topics; give a directory for them")
+        say_result(export_layers(log, Path(out)), as_json=as_json)
+        return 0
     from tcpipe.pipeline.export import export as run
 
     most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]

@@ -60,6 +60,11 @@ SEED = click.IntRange(0, 2**32 - 1)
 """What every generator of random numbers takes."""
 OUTPUT_DIRECTORY = Place(places.output_directory, written=True)
 OUTPUT_FILE = Place(places.output_file, written=True)
+GEOPACKAGE = ".gpkg"
+OUTPUT_EXPORT = Place(
+    lambda path: (places.output_file if path.endswith(GEOPACKAGE) else places.output_directory)(path), written=True
+)
+"""A directory, or a GeoPackage by its name."""
 INPUT_FILE = Place(places.input_file)
 INPUT_DIRECTORY = Place(places.input_directory)
 SEALED = Place(places.input_directory, urls=True)

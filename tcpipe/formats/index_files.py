@@ -94,6 +94,8 @@ class RunFacts:
     track_file: str = ""
     sizes: Mapping[str, int] = field(default_factory=dict)
     """How large the files of the manifest are [byte], by their name beside it."""
+    ledger_m: Mapping[str, float] = field(default_factory=dict)
+    """Where every metre went [m], by entry."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,6 +152,7 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",
         sizes={name: of.size_bytes for name, of in manifest.checksums.items()},
+        ledger_m=manifest.ledger_m,
     )
 
 

@@ -18,6 +18,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
 from tcpipe.formats.record_files import Call
+from tcpipe.motion.remedies import REMEDIES
 from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time, latest_calls
 from tcpipe.pipeline.ingest_task import IngestTask, too_young
 from tcpipe.pipeline.known_runs import KnownRuns, known_runs
@@ -38,6 +39,8 @@ TROUBLE: tuple[State, ...] = ("failed_permanent", "failed_transient", "partial")
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
+_MOST_LOSSES = 10
+_WORTH_M = 0.05
 _IN_WORDS: Mapping[State, str] = {"failed_permanent": "failed for what it holds", "failed_transient": "failed for now"}
 
 
@@ -59,6 +62,24 @@ class Group:
 
 
 @dataclass(frozen=True, slots=True)
+class StoreLoss:
+    """Metres that are in no segment for one reason, and what would win them back."""
+
+    reason: str
+    metres: float
+    share: float
+    """Of all metres driven [1]."""
+    runs: int
+    """Runs that lost metres so."""
+    remedy: str
+
+    def __str__(self) -> str:
+        """Return the loss as one line."""
+        many = "1 run" if self.runs == 1 else f"{self.runs} runs"
+        return f"{self.metres:>9.1f} m ({self.share:.1%}) {self.reason.replace('_', ' ')} in {many}: {self.remedy}"
+
+
+@dataclass(frozen=True, slots=True)
 class Status:
     """Where the logs of a store's sources stand."""
 
@@ -75,6 +96,8 @@ class Status:
     superseded_runs: int
     history: tuple[Call, ...]
     """The latest calls, the last one first."""
+    losses: tuple[StoreLoss, ...]
+    """The ten largest, over the runs under the ruling recipe."""
     exit_code: int
     """3 where somebody should look at a log or a run, else 0."""
 
@@ -84,6 +107,7 @@ class Status:
         lines = [f"{self.store}: {said}", *(str(group) for group in self.groups)]
         lines += [f"to do: {self.to_do}"] if self.to_do else []
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
+        lines += ["losses:", *map(str, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
         return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
 
@@ -147,7 +171,10 @@ def status(
         Group(state, cause, tuple(task.source.name for task in tasks), sum(_bytes(task) for task in tasks))
         for (state, cause), tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
     )
-    return _summed(opened, told, found, known, calls, sources=given, jobs=jobs)
+    current = [run.facts for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling)]
+    return replace(
+        _summed(opened, told, found, known, calls, sources=given, jobs=jobs), losses=tuple(losses_of(current))
+    )
 
 
 def _standing(task: IngestTask, store: Store, known: KnownRuns, passing: Mapping[str, str]) -> tuple[State, str]:
@@ -236,8 +263,23 @@ def _summed(
         problems=problems,
         superseded_runs=len(known.runs.superseded),
         history=tuple(calls),
+        losses=(),
         exit_code=3 if trouble or problems else 0,
     )
+
+
+def losses_of(runs: Sequence[RunFacts]) -> list[StoreLoss]:
+    """Return the largest losses of runs, the largest first."""
+    metres, of_runs = Counter[str](), Counter[str]()
+    for run in runs:
+        metres.update(run.ledger_m)
+        of_runs.update(reason for reason, lost_m in run.ledger_m.items() if lost_m >= _WORTH_M)
+    total = sum(metres.values())
+    lost = [(reason, lost_m) for reason, lost_m in metres.most_common() if reason != "kept" and of_runs[reason]]
+    return [
+        StoreLoss(reason, lost_m, lost_m / total, of_runs[reason], REMEDIES.get(reason, ""))
+        for reason, lost_m in lost[:_MOST_LOSSES]
+    ]
 
 
 def _bytes(task: IngestTask) -> int:

@@ -8,6 +8,7 @@
     reasons.tif                        `Reason` bits: a band a course, then those that all courses share
     height.tif                         of the cells' middles [m]
     duration.{yaml,pgm} energy.{…}     Nav2 maps of the mean over the courses
+    duration.qml energy.qml            how QGIS shows duration.tif and energy.tif: the mean, by colour
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import MapError, StoreError, TcpipeError, UsageError, plain_lines
 from tcpipe.execution import run_all, sound
-from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive
+from tcpipe.formats.atomic import atomic_directory, clear_beside, exclusive, write_text
 from tcpipe.formats.json_files import digest, read_json, write_json
 from tcpipe.formats.maps.geotiff import read_bands, write_cog
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.maps.nav2 import HIGHEST, LETHAL, write_nav2_map
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published import has_card, here, published
+from tcpipe.formats.qgis_styles import raster_style
 from tcpipe.formats.seals import Checksum, broken_checksums, file_checksums, read_sealed_as, write_sealed
 from tcpipe.planning.cost_grid import BARRED, CellFrames, Cells, CostGrid, blocks, empty_grid, grid_over
 from tcpipe.planning.cost_model import CostModel, check_model
@@ -59,6 +61,7 @@ _BLOCKS_KEPT = 8
 
 _QUANTITIES = {"power": "W", "velocity": "m/s", "duration": "s/m", "energy": "J/m"}
 _BAND_NAMES = tuple(f"course {angle:.1f} deg" for angle in ANGLES_DEG)
+_MEAN_BAND = COURSES + 2
 _GREATEST_IS_BEST = "velocity"
 
 
@@ -445,7 +448,10 @@ def _write(directory: Path, costs: CostGrid, origin_m: tuple[float, float]) -> d
         bands=height,
         **layout,
     )
-    return {name: _write_nav2(directory / f"{name}.yaml", costs, name, origin_m) for name in ("duration", "energy")}
+    scales = {name: _write_nav2(directory / f"{name}.yaml", costs, name, origin_m) for name in ("duration", "energy")}
+    for name, scale in scales.items():
+        write_text(directory / f"{name}.qml", raster_style(_MEAN_BAND, scale.lowest, scale.highest))
+    return scales
 
 
 def _values(costs: CostGrid, name: str, first: int, last: int) -> Floats32:

@@ -1,5 +1,6 @@
 """Where every log stands: each state once, told by what ingest did, and the same after it."""
 
+import json
 import os
 import shutil
 from dataclasses import replace
@@ -70,6 +71,22 @@ def test_what_ingest_did_is_what_status_says_and_the_calls_are_remembered(first_
     assert call.wall_s > 0.0
     assert call.cpu_s > 0.0
     assert call.end > call.begin
+
+
+def test_losses_are_the_metres_of_all_manifests_the_largest_first(first_night):
+    found = where(first_night)
+    ledgers = [json.loads(path.read_text())["ledger_m"] for path in (first_night / "store").rglob("manifest-1.json")]
+    assert len(ledgers) == 3
+    driven_m = sum(sum(ledger.values()) for ledger in ledgers)
+    for loss in found.losses:
+        assert loss.metres == pytest.approx(sum(ledger[loss.reason] for ledger in ledgers))
+        assert loss.share == pytest.approx(loss.metres / driven_m)
+    metres = [loss.metres for loss in found.losses]
+    assert metres == sorted(metres, reverse=True)
+    kept_m = sum(ledger["kept"] for ledger in ledgers)
+    assert sum(metres) == pytest.approx(driven_m - kept_m, abs=0.5)
+    assert f" m ({found.losses[0].share:.1%}) {found.losses[0].reason.replace('_', ' ')} in " in str(found)
+    assert not where(first_night, recipe=replace(Recipe(), read=ReadConfig(ignore_topics=["/other"]))).losses
 
 
 def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):

@@ -6,6 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from xml.etree.ElementTree import fromstring
 
 import matplotlib.image
 import numpy as np
@@ -132,6 +133,17 @@ def test_nav2_finds_a_scale_map_with_trees_that_are_lethal(made):
     angle = np.radians(ANGLES_DEG)
     mean = energy_joule(4, (0.2 * np.cos(angle) + 0.1 * np.sin(angle)) * 0.9996).mean()
     assert scale.lowest + cost[12, 12] / 99 * (scale.highest - scale.lowest) == pytest.approx(mean, rel=0.02)
+
+
+def test_qgis_shows_the_mean_from_the_least_to_the_greatest(made):
+    _, result = made
+    text = (Path(result.path) / "energy.qml").read_text()
+    renderer = fromstring(text[text.index("<qgis") :]).find("pipe/rasterrenderer")  # noqa: S314
+    band, scale = int(renderer.get("band")), result.card.nav2_scale["energy"]
+    with rasterio.open(Path(result.path) / "energy.tif") as dataset:
+        assert dataset.descriptions[band - 1] == "mean"
+    values = [float(item.get("value")) for item in renderer.iter("item")]
+    assert values == pytest.approx(np.linspace(scale.lowest, scale.highest, 5))
 
 
 @dataclass(frozen=True)

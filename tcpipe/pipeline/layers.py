@@ -1,0 +1,165 @@
+"""A dataset, a store or a run as a GeoPackage: samples, footprints, regions, where to drive next; segments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import shapely
+from numpy.typing import NDArray
+from pyproj import CRS
+from shapely.geometry.base import BaseGeometry
+
+from tcpipe.errors import UsageError, plain_lines
+from tcpipe.formats.dataset_card import DatasetCard, MapSource
+from tcpipe.formats.dataset_files import DRIVE_NEXT, read_current_card, read_samples
+from tcpipe.formats.geojson import read_polygons
+from tcpipe.formats.geopackage import VectorLayer, write_geopackage
+from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.published import here
+from tcpipe.formats.qgis_styles import VIRIDIS, classes_style, ranges_style
+from tcpipe.store import Store, inside_store, is_store, run_at
+from tcpipe.tables.arrays import texts
+from tcpipe.tables.columns import floats
+from tcpipe.terrain.patches import footprints, patch_frames
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
+
+_SPLITS = {"train": "#1f77b4", "test": "#d62728", "unseen": "#ff7f0e", "buffer": "#999999"}
+_REGIONS = {"train_test": "#1f77b4", "unseen": "#ff7f0e", "exclude": "#555555"}
+_WGS84 = "EPSG:4326"
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ExportedLayers:
+    """A GeoPackage that was written, and the rows of each of its layers."""
+
+    source: str
+    path: Path
+    layers: Mapping[str, int]
+
+    def __str__(self) -> str:
+        """Return its layers, a line each."""
+        return plain_lines((f"{self.path}:", *(f"{rows:>9} {name}" for name, rows in self.layers.items())))
+
+
+def export_layers(source: Path | str, out: Path) -> ExportedLayers:
+    """Write a dataset, a run or all runs of a store, here or in a bucket, as a GeoPackage with styles for QGIS.
+
+    Raises
+    ------
+    UsageError
+        ``source`` is none of these, ``out`` is there and something else, or the extra ``gis`` is not installed.
+    DatasetError, StoreError
+        It cannot be read.
+
+    """
+    stored = is_store(source) or inside_store(source) is not None
+    if stored:
+        layers = [_segments(source)]
+    else:
+        directory = here(source) if is_url(source) else Path(source)
+        if not (directory / "dataset.json").is_file():
+            raise UsageError(f"{source}: is no dataset, run or store; a GeoPackage is made of one of these")
+        layers = list(_of_dataset(directory))
+    write_geopackage(out, layers)
+    return ExportedLayers(str(source), out, {layer.name: layer.table.num_rows for layer in layers})
+
+
+def _segments(source: Path | str) -> VectorLayer:
+    found = run_at(source)
+    runs = found[1] if found else Store(source).runs()
+    crs = {run.manifest.recipe.read.gnss_crs for run in runs}
+    if len(crs) != 1:
+        raise UsageError(
+            f"{source}: its runs are in {', '.join(sorted(crs)) or 'no datum: there are none'}; give one run"
+        )
+    table = pa.concat_tables([run.segments() for run in runs])
+    table = table.filter(table["start_lon_deg"].is_valid())
+    return VectorLayer("segments", "LineString", crs.pop(), table, _lines(table), _by_power(table))
+
+
+def _of_dataset(directory: Path) -> Iterator[VectorLayer]:
+    card, table = read_current_card(directory), read_samples(directory)
+    split = classes_style("split", _SPLITS, "line")
+    yield VectorLayer(
+        "samples", "LineString", card.recipe.read.gnss_crs, table, _lines(table), {"split": split, **_by_power(table)}
+    )
+    named = table.select(["sample_id", "split", "map"])
+    areas = list(shapely.to_wkb(shapely.polygons(_footprints(card, table))))
+    yield VectorLayer("footprints", "Polygon", _WGS84, named, areas, {"split": classes_style("split", _SPLITS, "fill")})
+    if card.split.region:
+        kinds = pa.table({"split": list(card.split.region)})
+        shapes = [
+            shapely.geometry.shape({"type": of.type, "coordinates": of.coordinates})
+            for of in card.split.region.values()
+        ]
+        yield VectorLayer(
+            "regions",
+            "MultiPolygon",
+            _WGS84,
+            kinds,
+            _multi(shapes),
+            {"split": classes_style("split", _REGIONS, "fill")},
+        )
+    if (directory / DRIVE_NEXT).is_file() and (features := read_polygons(directory / DRIVE_NEXT)[0]):
+        facts = pa.Table.from_pylist([dict(feature.properties) for feature in features])
+        rare = dict(zip(dict.fromkeys(texts(facts["class"]).tolist()), VIRIDIS * len(features), strict=False))
+        shapes = [shapely.MultiPolygon(feature.polygons) for feature in features]
+        yield VectorLayer(
+            "drive_next", "MultiPolygon", _WGS84, facts, _multi(shapes), {"class": classes_style("class", rare, "fill")}
+        )
+
+
+def _lines(table: pa.Table) -> list[bytes]:
+    ends = np.stack(
+        [floats(table, f"{end}_{axis}_deg") for end in ("start", "end") for axis in ("lon", "lat")], axis=-1
+    )
+    return list(shapely.to_wkb(shapely.linestrings(ends.reshape(-1, 2, 2))))
+
+
+def _multi(shapes: Sequence[BaseGeometry]) -> list[bytes]:
+    whole = [of if of.geom_type == "MultiPolygon" else shapely.MultiPolygon([of]) for of in shapes]
+    return list(shapely.to_wkb(whole))
+
+
+def _by_power(table: pa.Table) -> dict[str, str]:
+    power = floats(table, "power_watt")
+    power = power[np.isfinite(power)]
+    return (
+        {"power": ranges_style("power_watt", np.quantile(power, np.linspace(0.0, 1.0, 6)).tolist(), "line")}
+        if len(power)
+        else {}
+    )
+
+
+def _footprints(card: DatasetCard, table: pa.Table) -> Floats:
+    """Return the corners of each patch as WGS 84 lon, lat [deg], shape (N, 4, 2)."""
+    names, corners = texts(table["map"]), np.full((table.num_rows, 4, 2), np.nan)
+    for source in card.maps:
+        rows = np.flatnonzero(names == source.name)
+        if len(rows):
+            corners[rows] = _on_map(table.take(rows), source, card)
+    return corners
+
+
+def _on_map(table: pa.Table, source: MapSource, card: DatasetCard) -> Floats:
+    bounds = (
+        source.x_min_m,
+        source.y_max_m - source.rows * source.pitch_m,
+        source.x_min_m + source.cols * source.pitch_m,
+        source.y_max_m,
+    )
+    crs = parse_crs(source.crs, where=f"map {source.name}")
+    area = area_of(crs, bounds)
+    place = Projection(parse_crs(card.recipe.read.gnss_crs, where="gnss_crs"), crs, area)
+    start, end = (
+        place.forward(np.stack([floats(table, f"{name}_{axis}_deg") for axis in ("lon", "lat")], axis=1))
+        for name in ("start", "end")
+    )
+    corners = footprints(patch_frames(start, end, floats(table, "chord_m")), card.patch_m)
+    return Projection(CRS.from_epsg(4326), crs, area).inverse(corners)
