@@ -41,7 +41,8 @@ def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[
     lost += _draw_places(plot, directory, card)
     figure = plot.figure
     ends = {end: np.empty(0) for end in ("x0", "y0", "x1", "y1")}
-    figure.segment(source=ends, color="#ff2d95", line_width=1.5, name="leaks", visible=False)
+    lines = figure.segment(source=ends, color="#ff2d95", line_width=1.5, name="leaks", visible=False)
+    lines.level = "overlay"  # above the points that they join
     rings = _rings(card.split.region, Transformer.from_crs("EPSG:4326", card.maps[0].crs, always_xy=True))
     figure.multi_line(
         [ring[:, 0] for ring in rings],
@@ -64,7 +65,7 @@ def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[
         fill_color="fill",
         line_color="#ffffff",
         line_width=0.4,
-        nonselection_fill_alpha=0.12,
+        nonselection_fill_alpha=0.3,
         nonselection_line_alpha=0.0,
         selection_line_color="#000000",
         selection_line_width=1.2,

@@ -82,4 +82,7 @@ def _to_do(card: DatasetCard) -> Iterator[Verdict]:
     if not any(card.balance.repeatability.values()):
         yield Verdict("do", "Drive some ten metres twice in the same direction.")
     if any(part.overlapping_samples for part in card.split.audit):
-        yield Verdict("do", "Hold out by block or by run (--holdout) with a buffer, or test errors flatter.")
+        if card.split.holdout == "sample":
+            yield Verdict("do", "Hold out by block or by run (--holdout): single samples lie beside what trains.")
+        else:
+            yield Verdict("do", "Larger blocks (split.block_m) or --holdout run leave less of test beside train.")
