@@ -219,7 +219,7 @@ def outcome_of(drive: Drive, sensors: Sensors, fault: Fault) -> Outcome:
     recipe = Recipe()
     try:
         read = read_run(log_of(drive, sensors, fault), recipe.read, robot="husky", known=shipped_profiles())
-        _, _, labelled = run_stages(read, recipe.ingest, run_id="run", name="run")
+        _, _, labelled = run_stages(read, recipe.ingest, run_id="run")
     except TcpipeError as error:
         return Outcome([], _nothing(), _nothing(), [], [], 0.0, true_m, float("nan"), 0.0, list(error.problems))
     except Exception as error:  # noqa: BLE001  the campaign is to find them

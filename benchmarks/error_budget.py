@@ -33,7 +33,7 @@ def budget_of(power: Power) -> EnergyBudget:
     log = log_of(simulated("hills", FIRST_SEED, LENGTH_M), replace(Sensors(), power=power), FAULTS["clean"])
     read_config = replace(recipe.read, power_averaged="yes" if power.averaged else "no")
     streams = read_run(log, read_config, robot="husky", known=shipped_profiles())
-    _, _, labelled = run_stages(streams, recipe.ingest, run_id="run", name="run")
+    _, _, labelled = run_stages(streams, recipe.ingest, run_id="run")
     facts = labelled.info.findings.facts.label
     if facts is None or facts.energy_budget is None:
         raise SystemExit("the drive has no labels")

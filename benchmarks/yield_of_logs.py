@@ -44,7 +44,7 @@ def ladder(path: Path, robot: str | None) -> Ladder:
     try:
         with open_log(path) as log:
             streams = read_run(log, recipe.read, robot=robot, known=shipped_profiles())
-        _, _, labelled = run_stages(streams, recipe.ingest, run_id="run", name=path.name)
+        _, _, labelled = run_stages(streams, recipe.ingest, run_id="run")
     except TcpipeError as error:
         return Ladder((np.nan, *[0.0] * (len(HEAD) - 1)), tuple(error.problems))
     table, ledger_m = labelled.table, labelled.ledger_m

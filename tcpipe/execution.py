@@ -17,13 +17,15 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
+from functools import partial
 from itertools import islice
 from multiprocessing.connection import Connection
-from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Generic, TypeAlias, TypeVar, cast
 
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, UsageError
+from tcpipe.progress import STEP, step_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -32,6 +34,9 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 logger = logging.getLogger("tcpipe")
+
+Said: TypeAlias = tuple[Any, ...]
+"""Arguments of `Logger.log`."""
 
 _LONGEST_SAYING_BYTES = 3000
 """Less than what a pipe takes in one piece: nothing is cut or mixed, whoever dies."""
@@ -156,14 +161,13 @@ def _repeat(heard: Connection) -> None:
     """Log here what workers say, until the last of them is gone."""
     with suppress(EOFError):
         while True:
-            level, text = heard.recv()
-            logger.log(level, "%s", text)
+            logger.log(*heard.recv())
 
 
 def _begin_worker(life: Connection, saying: Connection, level: int) -> None:
     """Prepare a worker: an interrupt is its parent's business, what it logs goes to its parent, and so does its life."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    logger.addHandler(_Saying(saying))
+    logger.addHandler(_Saying(saying.send))
     logger.setLevel(level)
     logger.propagate = False
     threading.Thread(target=_end_with, args=(life,), daemon=True).start()
@@ -176,16 +180,17 @@ def _end_with(life: Connection) -> None:
 
 
 class _Saying(logging.Handler):
-    """Hands what a worker logs to its parent."""
+    """Hands what a worker logs to ``send``, as arguments of `Logger.log`: plain values, what is said as text of one argument."""
 
-    def __init__(self, saying: Connection) -> None:
+    def __init__(self, send: Callable[[Said], object]) -> None:
         super().__init__()
-        self._saying = saying
+        self._send = send
 
     def emit(self, record: logging.LogRecord) -> None:
         text = record.getMessage().encode(errors="backslashreplace")[:_LONGEST_SAYING_BYTES].decode(errors="ignore")
+        told = step_of(record)
         with suppress(OSError):
-            self._saying.send((record.levelno, text))
+            self._send((record.levelno, "%s", text) if told is None else (STEP, str(record.msg), *astuple(told)))
 
 
 _spent = {"cpu_s": 0.0}
@@ -210,12 +215,13 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
     from distributed import KilledWorker  # noqa: PLC0415  most calls stay on this machine
 
     with _client(address) as client:
-        level, todo = logger.getEffectiveLevel(), iter(range(len(tasks)))
+        channel, todo = _Channel(f"tcpipe-{client.id}", logger.getEffectiveLevel()), iter(range(len(tasks)))
+        client.subscribe_topic(channel.topic, lambda event: logger.log(*event[1]))
 
         def submit(count: int) -> dict[Any, int]:
             at_once = islice(todo, count)
             return {
-                client.submit(_on_worker, function, tasks[at], __version__, level, pure=False): at for at in at_once
+                client.submit(_on_worker, function, tasks[at], __version__, channel, pure=False): at for at in at_once
             }
 
         running = submit(_AHEAD * _workers(client, address))
@@ -223,7 +229,7 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
             for future in _ended(client, running, address):
                 index = running.pop(future)
                 try:
-                    said, result, cpu_s = future.result()
+                    result, cpu_s = future.result()
                 except KilledWorker:
                     yield Outcome(index, None, died=True)
                 except ModuleNotFoundError as error:
@@ -238,8 +244,6 @@ def _run_on_cluster(function: Callable[[T], R], tasks: Sequence[T], address: str
                     ) from None
                 else:
                     _spent["cpu_s"] += cpu_s
-                    for record in said:
-                        logger.log(*record)
                     yield Outcome(index, result)
                 running |= submit(1)
 
@@ -315,31 +319,27 @@ def _workers(client: Client, address: str) -> int:
     return len(threads)
 
 
-def _on_worker(
-    function: Callable[[T], R], task: T, version: str, level: int
-) -> tuple[list[tuple[int, str, str]], R, float]:
-    """Run a task on a cluster's worker; return what it logged, its result, and the CPU seconds that it took."""
+@dataclass(frozen=True, slots=True)
+class _Channel:
+    """Where a cluster's workers say what they log, and from which level on."""
+
+    topic: str
+    level: int
+
+
+def _on_worker(function: Callable[[T], R], task: T, version: str, channel: _Channel) -> tuple[R, float]:
+    """Run a task on a cluster's worker; return its result and the CPU seconds that it took; what it logs goes to the client before."""
+    from distributed import get_worker  # noqa: PLC0415  most calls stay on this machine
+
     if version != __version__:
         raise UsageError(
             f"{os.uname().nodename}: a worker has tcpipe {__version__}, wanted {version} as here; install that"
         )
-    said: list[tuple[int, str, str]] = []
-    keeping, began_s = _Keeping(said), time.process_time()
-    logger.addHandler(keeping)
-    logger.setLevel(level)
+    saying, began_s = _Saying(partial(get_worker().log_event, channel.topic)), time.process_time()
+    logger.addHandler(saying)
+    logger.setLevel(channel.level)
     try:
         result = function(task)
-        return said, result, time.process_time() - began_s
+        return result, time.process_time() - began_s
     finally:
-        logger.removeHandler(keeping)
-
-
-class _Keeping(logging.Handler):
-    """Keeps what a task logs, as arguments of `Logger.log`."""
-
-    def __init__(self, said: list[tuple[int, str, str]]) -> None:
-        super().__init__()
-        self._said = said
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._said.append((record.levelno, "%s", record.getMessage()))
+        logger.removeHandler(saying)

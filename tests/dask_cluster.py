@@ -16,6 +16,7 @@ from pathlib import Path
 from distributed import Client
 
 from tcpipe.formats.json_files import read_json
+from tcpipe.progress import step, working_on
 
 _LONGEST_S = 300.0
 """A machine that others use takes its time to start a process."""
@@ -71,6 +72,8 @@ def _ended(process: subprocess.Popen[bytes]) -> None:
 
 def where(value: int) -> tuple[int, int]:
     """Return the square, and which process it is from."""
+    with working_on(f"log {value}"):
+        step("squaring")
     logging.getLogger("tcpipe").info("task %d", value)
     return value * value, os.getpid()
 

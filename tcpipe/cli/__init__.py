@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import logging
 import os
+import platform
+import shlex
 import signal
 import sys
 import traceback
-from collections.abc import Sequence
-from typing import NoReturn
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn, TypeVar
 
 import click
 
@@ -25,7 +28,7 @@ from tcpipe.cli.ingest import ingest
 from tcpipe.cli.init import init
 from tcpipe.cli.inspect import inspect
 from tcpipe.cli.migrate import migrate
-from tcpipe.cli.output import say_failure
+from tcpipe.cli.output import debug_log, say_failure
 from tcpipe.cli.overlay import overlay
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
@@ -41,6 +44,11 @@ from tcpipe.cli.train import train
 from tcpipe.cli.verify import verify
 from tcpipe.errors import TcpipeError, UsageError
 
+_EXTRAS = {"torch": "train", "lightgbm": "tables", "dask": "cluster", "distributed": "cluster", "dagster": "dagster"}
+"""Which extra brings a package that only some commands need."""
+
+C = TypeVar("C", bound=Callable[..., Any])
+
 
 class _InOrder(click.Group):
     """Lists commands in the order a user meets them."""
@@ -49,10 +57,27 @@ class _InOrder(click.Group):
         return list(self.commands)
 
 
+def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -> None:  # noqa: FBT001  click's signature
+    root = context.find_root()
+    if wanted and not root.meta.get("debugging"):
+        root.meta["debugging"] = True
+        root.with_resource(debug_log())
+        where = f"tcpipe {__version__}, Python {platform.python_version()}, {platform.platform()}"
+        logging.getLogger("tcpipe").debug("%s: %s", where, shlex.join(sys.argv[1:]))
+
+
+def _debug_option(*, hidden: bool) -> Callable[[C], C]:
+    """Return ``--debug``, which stands before or after the command's name."""
+    about = "Say what is done and when, and where an error comes from; also after COMMAND."
+    return click.option(
+        "--debug", is_flag=True, is_eager=True, expose_value=False, callback=_begin_debugging, hidden=hidden, help=about
+    )
+
+
 @click.group(cls=_InOrder, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
 @click.version_option(__version__, prog_name="tcpipe")
-@click.option("--debug", is_flag=True, help="Show where an error comes from.")
-def cli(*, debug: bool) -> None:
+@_debug_option(hidden=False)
+def cli() -> None:
     """Turn raw robot logs into datasets that a terrain-cost model can be trained on.
 
     \b
@@ -93,7 +118,7 @@ for command in (
     schemas,
     simulate,
 ):
-    cli.add_command(command)
+    cli.add_command(_debug_option(hidden=True)(command))
 
 
 def main() -> None:
@@ -127,8 +152,16 @@ def _run() -> NoReturn:
         where = f"{error.filename}: " if error.filename else ""
         _fail([f"{where}{error.strerror or error}"], 1)
     except Exception as error:  # noqa: BLE001  the last resort
-        _fail([f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"], 1)
+        _fail([_unforeseen(error)], 1)
     sys.exit(code if isinstance(code, int) else 0)
+
+
+def _unforeseen(error: Exception) -> str:
+    """Return what to say of a package that only an extra brings, or of a bug."""
+    lacking = str(error.name).partition(".")[0] if isinstance(error, ModuleNotFoundError) else ""
+    if extra := _EXTRAS.get(lacking):
+        return f"{lacking} not installed, wanted by this command: pip install 'tcpipe[{extra}]'"
+    return f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"
 
 
 def _refuse_empty(arguments: list[str]) -> None:

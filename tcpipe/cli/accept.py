@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import json_option, store_option
+from tcpipe.cli.options import complete_runs, json_option, store_option
 
 
 @click.command(short_help="Known trouble is no news")
-@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG...")
+@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG...", shell_complete=complete_runs)
 @store_option
 @json_option
 def accept(names: tuple[str, ...], *, store: str, as_json: bool) -> int:

@@ -90,7 +90,7 @@ def add_map(
     tables = _by_name("--categorical", categorical, "wanted one class table a layer")
     if bare := [layer for layer, file in files.items() if not (layer and file)]:
         raise UsageError(f"--layer {bare[0]}: wanted NAME=FILE")
-    with progress(f"map {name}", 1, quiet=quiet):
+    with progress(f"map {name}", quiet=quiet):
         added = run(
             name,
             height=height,

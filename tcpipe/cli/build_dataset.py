@@ -13,6 +13,8 @@ from tcpipe.cli.options import (
     SEALED,
     SEED,
     cluster_option,
+    complete_maps,
+    complete_robots,
     json_option,
     quiet_option,
     recipe_option,
@@ -40,10 +42,11 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
     "--map",
     "map_name",
     metavar="NAME",
+    shell_complete=complete_maps,
     multiple=True,
     help="Map to sample from (default: the only one in the store); repeat it for several, the first rules where they overlap.",
 )
-@click.option("--robot", metavar="NAME", help="Only runs of this robot.")
+@click.option("--robot", metavar="NAME", shell_complete=complete_robots, help="Only runs of this robot.")
 @click.option(
     "--tag",
     "tags",
@@ -121,7 +124,7 @@ def build_dataset(
     ruling, source = ruling_recipe(recipe)
     if not as_json:
         say(f"recipe: {source}")
-    with progress("build-dataset", 1, quiet=quiet) as shown:
+    with progress("build-dataset", quiet=quiet) as shown:
         result = run(
             out,
             store=store,

@@ -71,7 +71,7 @@ def cost_map(
     from tcpipe.cli.output import progress, say_result
     from tcpipe.planning.cost_map import Cluster, make_cost_map
 
-    with progress("cost-map", 1, quiet=quiet) as shown:
+    with progress("cost-map", quiet=quiet) as shown:
         paths = (model, store) if cluster is None else (_anywhere(model), _anywhere(store))
         inputs = partial(_inputs, *paths, map_name, speed_mps)
         elsewhere = None if cluster is None else Cluster(cluster, inputs)

@@ -21,6 +21,6 @@ def demo(directory: str, *, seed: int, quiet: bool) -> None:
     from tcpipe.cli.output import progress, say_lines
     from tcpipe.pipeline.demo import run_demo
 
-    with progress("demo", 1, quiet=quiet) as shown:
+    with progress("demo", quiet=quiet) as shown:
         result = run_demo(Path(directory), seed=seed, say=shown.line)
     say_lines(result)

@@ -72,7 +72,7 @@ def evaluate(
     from tcpipe.learning.evaluation_files import run_evaluation
 
     config = EvaluateConfig(draws=draws, baselines=baselines, retrain=retrain, seed=seed)
-    with progress("evaluate", 1, quiet=quiet):
+    with progress("evaluate", quiet=quiet):
         result = run_evaluation(model, dataset, out, config=config)
     if as_json:
         print_json(result.values)
@@ -98,7 +98,7 @@ def _on_drives(
     from tcpipe.planning.drive_files import evaluate_drives
     from tcpipe.planning.inputs import chosen_map
 
-    with progress("evaluate", 1, quiet=quiet):
+    with progress("evaluate", quiet=quiet):
         asked, data = load_model(model), open_dataset(dataset)
         check_origin(asked.card, data, model)
         result = evaluate_drives(asked, data, chosen_map(store, map_name), drives, store=store, out=out)

@@ -25,7 +25,7 @@ def explain(sample_id: str, *, dataset: str, store: str, as_json: bool, quiet: b
     from tcpipe.cli.output import progress, say_result
     from tcpipe.pipeline.explain import explain as run
 
-    with progress("explain", 1, quiet=quiet):
+    with progress("explain", quiet=quiet):
         found = run(sample_id, dataset=dataset, store=store)
     say_result(found, as_json=as_json)
     return 1 if found.differences else 0

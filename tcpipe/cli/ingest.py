@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,6 +11,7 @@ import click
 from tcpipe.cli.options import (
     ONE_OF_SEVERAL,
     cluster_option,
+    complete_robots,
     duration_value,
     msgdef_option,
     quiet_option,
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 @click.option(
     "--robot",
     metavar="NAME",
+    shell_complete=complete_robots,
     help="Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise).",
 )
 @click.option(
@@ -84,7 +87,7 @@ def ingest(
 
     A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, or a folder of such, searched downward, or the s3:// URL of
     one. What is in the store already (same content, same recipe) is left alone, and what failed for its content is not
-    tried again. A line is printed as each log ends.
+    tried again. A line is printed as each log ends; of several logs, warnings follow by cause.
 
     Exit code 3: some logs failed or are damaged, and that is news: it was not told before, and not accepted (tcpipe
     accept).
@@ -119,18 +122,23 @@ def ingest(
         )
         say_result(replace(planned, history=()), as_json=as_json)
         return 0
-    with progress("ingest", 1, quiet=quiet) as shown:
+    with progress("ingest", quiet=quiet, as_json=as_json) as shown:
+        several = False
+
+        def on_found(sizes: Mapping[str, int]) -> None:
+            nonlocal several
+            several = len(sizes) > 1
+            shown.expect(sizes)
 
         def on_result(result: IngestResult) -> None:
-            shown.step()
+            shown.end(result.log, worked=result.status in ("done", "damaged") or not (result.known or result.transient))
             if as_json:
                 print_json_line(recast(result, LogLine))
             else:
-                _print_one(result)
+                for line in _of_one(result, several=several):
+                    shown.result(line)
             for problem in result.problems if result.is_news else ():
                 shown.problem(problem)
-            if result.traceback and click.get_current_context().find_root().params["debug"]:
-                shown.problem(*result.traceback.splitlines())
 
         summary = run(
             logs,
@@ -146,40 +154,55 @@ def ingest(
             shard=shard,
             min_age_s=min_age_s,
             message_definitions=Path(msgdef) if msgdef else None,
-            on_found=shown.expect,
+            on_found=on_found,
             on_result=on_result,
         )
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
     else:
+        if several:
+            _print_warnings(summary)
         _print_sum(summary)
     return summary.exit_code
 
 
-def _print_one(result: IngestResult) -> None:
+def _of_one(result: IngestResult, *, several: bool) -> Iterator[str]:
+    """Yield what became of a log: of one alone with its warnings, of several one line each, and what is broken."""
     from tcpipe.cost.budget import in_words
 
     aside = " (accepted)" if result.accepted else ""
+    warnings = result.warnings if result.status != "unchanged" else ()
+    budget = result.energy_budget if result.status != "unchanged" else None
     if result.status in ("failed", "waiting"):
         known = " (known, not tried again)" if result.known else ""
-        say(f"{result.status:<10} {result.log}{aside or known}")
+        yield f"{result.status:<10} {result.log}{aside or known}"
     else:
         known = " (damaged, known)" if result.damage and not result.is_news else ""
-        say(
+        told = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
+        told += f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if several and warnings else ""
+        yield (
             f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
-            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{aside or known}"
+            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{told}{aside or known}"
         )
     if result.same_as:
-        say(f"  {result.log} is the same recording as {result.same_as}: one run")
-    if result.energy_budget is not None and result.status != "unchanged":
-        say(f"  {in_words(result.energy_budget)}")
-    for note in result.notes:
-        say(f"  {note}")
-    for damage in result.damage if result.is_news or result.status == "damaged" else ():
-        say(f"  damage:  {damage}")
-    for warning in result.warnings if result.status != "unchanged" else ():
-        say(f"  warning: {warning}")
+        yield f"  {result.log} is the same recording as {result.same_as}: one run"
+    if budget is not None and not several:
+        yield f"  {in_words(budget)}"
+    yield from (f"  {note}" for note in result.notes)
+    yield from (f"  damage:  {line}" for line in result.damage if result.is_news or result.status == "damaged")
+    yield from (f"  warning: {line}" for line in warnings if not several)
+
+
+def _print_warnings(summary: IngestSummary) -> None:
+    """Print a line for each cause of warnings, that of most runs first."""
+    from tcpipe.pipeline.dataset.findings import by_cause
+
+    made = [result for result in summary.results if result.run_id and result.status != "unchanged"]
+    causes = by_cause((str(result.run_id), result.warnings) for result in made)
+    for told in sorted(causes, key=lambda of: -len(of)):
+        run, line = next(iter(told.items()))
+        say(f"warning: {f'{len(told)} runs' if len(told) > 1 else run}: {line}")
 
 
 def _print_sum(summary: IngestSummary) -> None:

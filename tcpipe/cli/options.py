@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from math import isfinite, nan
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
+from click.shell_completion import CompletionItem
 
+from tcpipe.errors import TcpipeError
 from tcpipe.formats import places
+
+if TYPE_CHECKING:
+    from tcpipe.store import Store
 
 
 class Place(click.ParamType[str]):
@@ -29,6 +37,10 @@ class Place(click.ParamType[str]):
         if not (self.urls and "://" in value):
             self._check(value)
         return value
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002  click's signature
+        """Let the shell complete it as a path."""
+        return [CompletionItem(incomplete, type="file")]
 
 
 class FloatRange(click.FloatRange):
@@ -55,6 +67,51 @@ class LonLat(click.ParamType[tuple[float, float]]):
             self.fail(f"{value!r}: wanted LON,LAT in degrees, as 15.45,47.07", param, ctx)
         return lon, lat
 
+
+Complete: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]]
+
+
+def _completing(names: Callable[[click.Context], Iterable[str]]) -> Complete:
+    """Return what offers the names that go on as typed; what is broken offers none."""
+
+    def complete(context: click.Context, _: click.Parameter, typed: str) -> list[str]:
+        with suppress(TcpipeError, OSError):
+            return [name for name in names(context) if name.startswith(typed)]
+        return []
+
+    return complete
+
+
+def _robots(context: click.Context) -> Iterable[str]:
+    from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+    from tcpipe.formats.robot_files import profiles_of
+
+    given = context.params.get("recipe")
+    return sorted(profiles_of(load_recipe(find_recipe(given and Path(given), Path.cwd()))).robots)
+
+
+def _store(context: click.Context) -> Store | None:
+    """Return the store of a command line that is being typed; None where asking it could take long."""
+    from tcpipe.store import Store
+
+    place = context.params.get("store") or os.environ.get("TCPIPE_STORE") or "tcpipe-store"
+    return None if "://" in place else Store(Path(place))
+
+
+def _scenarios(_: click.Context) -> Iterable[str]:
+    from tcpipe.simulation.scenarios import SCENARIOS
+
+    return SCENARIOS
+
+
+complete_robots = _completing(_robots)
+"""Offers the robots that the recipe knows."""
+complete_scenarios = _completing(_scenarios)
+"""Offers the sites that can be simulated."""
+complete_runs = _completing(lambda context: store.run_ids() if (store := _store(context)) else ())
+"""Offers the store's runs."""
+complete_maps = _completing(lambda context: store.maps() if (store := _store(context)) else ())
+"""Offers the store's maps."""
 
 SEED = click.IntRange(0, 2**32 - 1)
 """What every generator of random numbers takes."""
@@ -119,7 +176,11 @@ quiet_option = click.option("--quiet", "-q", is_flag=True, help="No progress on 
 """``--quiet``: no progress on stderr."""
 
 map_option = click.option(
-    "--map", "map_name", metavar="NAME", help="Map to look at (default: the only one in the store)."
+    "--map",
+    "map_name",
+    metavar="NAME",
+    shell_complete=complete_maps,
+    help="Map to look at (default: the only one in the store).",
 )
 """``--map``: the map to look at."""
 

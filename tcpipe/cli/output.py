@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import logging
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import click
 
 from tcpipe.errors import plain_line
+from tcpipe.progress import STEP, Step, step_of
 
 if TYPE_CHECKING:
+    from tcpipe.cli.bars import Bars
     from tcpipe.recipe import Recipe
 
 
@@ -27,14 +30,16 @@ def ruling_recipe(explicit: str | None) -> tuple[Recipe, str]:
 
 
 @contextmanager
-def progress(what: str, total: int, *, quiet: bool) -> Iterator[Progress]:
-    """Show progress on stderr: a bar on a terminal, plain lines otherwise, nothing with ``quiet``."""
-    shown = Progress(what, total, quiet=quiet)
-    handler = _Lines(shown)
+def progress(what: str, *, quiet: bool, as_json: bool = False) -> Iterator[Progress]:
+    """Show progress on stderr: bars on a terminal, else plain lines, nothing with ``quiet``; with ``--debug`` its log says all."""
     logger = logging.getLogger("tcpipe")
+    debugging = logger.isEnabledFor(logging.DEBUG)
+    shown = Progress(what, quiet=quiet, bars=None if quiet or debugging else _bars(what, as_json=as_json))
+    handler = _Lines(shown)
     before = logger.level
-    logger.setLevel(logging.ERROR if quiet else logging.INFO)
-    logger.addHandler(handler)
+    if not debugging:
+        logger.setLevel(logging.ERROR if quiet else STEP)
+        logger.addHandler(handler)
     try:
         with shown:
             yield shown
@@ -43,31 +48,37 @@ def progress(what: str, total: int, *, quiet: bool) -> Iterator[Progress]:
         logger.setLevel(before)
 
 
-class Progress:
-    """A bar, lines, or silence; ``line`` says something, ``step`` counts one done."""
+def _bars(what: str, *, as_json: bool) -> Bars | None:
+    """Return bars where stderr is a terminal that can draw them, and no JSON goes to it."""
+    if not sys.stderr.isatty() or (as_json and sys.stdout.isatty()):
+        return None
+    from rich.console import Console
 
-    def __init__(self, what: str, total: int, *, quiet: bool) -> None:
+    from tcpipe.cli.bars import Bars
+
+    console = Console(stderr=True)
+    return Bars(what, console) if console.is_terminal and not console.is_dumb_terminal else None
+
+
+class Progress:
+    """Bars, lines, or silence; ``line`` says something on stderr, ``result`` on stdout."""
+
+    def __init__(self, what: str, *, quiet: bool, bars: Bars | None) -> None:
         self._what = what
         self._quiet = quiet
-        self._bar: Any = None
-        if not quiet and sys.stderr.isatty():
-            from rich.console import Console
-            from rich.markup import escape
-            from rich.progress import Progress as Bar
-
-            self._bar = Bar(console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
-            self._task = self._bar.add_task(escape(plain_line(what)), total=total)
+        self._bars = bars
+        self._stages: dict[str, str] = {}
 
     def __enter__(self) -> Self:
-        """Start the bar."""
-        if self._bar is not None:
-            self._bar.start()
+        """Start the bars."""
+        if self._bars is not None:
+            self._bars.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Remove the bar."""
-        if self._bar is not None:
-            self._bar.stop()
+        """Remove the bars."""
+        if self._bars is not None:
+            self._bars.stop()
 
     def line(self, text: str) -> None:
         """Say one line."""
@@ -79,29 +90,44 @@ class Progress:
         for text in lines:
             self._say(f"tcpipe: {text}")
 
+    def result(self, text: str) -> None:
+        """Say a line of the result on stdout, above the bars where both are on one terminal."""
+        if self._bars is not None and sys.stdout.isatty():
+            self._bars.print(plain_line(text))
+        else:
+            say(text)
+
     def _say(self, text: str) -> None:
         with suppress(OSError):  # nobody listening is no reason to stop
-            if self._bar is not None:
-                self._bar.console.print(plain_line(text), markup=False, highlight=False)
+            if self._bars is not None:
+                self._bars.print(plain_line(text))
             else:
                 say(text, err=True)
 
-    def expect(self, total: int) -> None:
-        """Say how many there are."""
-        if self._bar is not None:
-            self._bar.update(self._task, total=total)
+    def expect(self, sizes: Mapping[str, int]) -> None:
+        """Begin with logs of these sizes [byte]."""
+        if self._bars is not None:
+            self._bars.expect(sizes)
+
+    def end(self, task: str, *, worked: bool) -> None:
+        """Count a log that is done, and whether there was something to do."""
+        if self._bars is not None:
+            self._bars.end(task, worked=worked)
 
     def count(self, done: int, total: int) -> None:
         """Say how many of how many are done: lines come at every tenth."""
-        if self._bar is not None:
-            self._bar.update(self._task, total=total, completed=done)
+        if self._bars is not None:
+            self._bars.count(done, total)
         elif done * 10 // total > (done - 1) * 10 // total:
             self.line(f"{self._what}: {100 * done // total} %")
 
-    def step(self) -> None:
-        """Count one done."""
-        if self._bar is not None:
-            self._bar.advance(self._task)
+    def step(self, step: Step) -> None:
+        """Show how far a task is; without bars a line at each stage of a log."""
+        if self._bars is not None:
+            self._bars.step(step)
+        elif step.task and self._stages.get(step.task) != step.stage:
+            self._stages[step.task] = step.stage
+            self.line(f"{step.task}: {step.stage}")
 
 
 class _Lines(logging.Handler):
@@ -112,8 +138,36 @@ class _Lines(logging.Handler):
         self._shown = shown
 
     def emit(self, record: logging.LogRecord) -> None:
-        said = self._shown.problem if record.levelno >= logging.ERROR else self._shown.line
-        said(record.getMessage())
+        if step := step_of(record):
+            self._shown.step(step)
+        else:
+            said = self._shown.problem if record.levelno >= logging.ERROR else self._shown.line
+            said(record.getMessage())
+
+
+@contextmanager
+def debug_log() -> Iterator[None]:
+    """Say on stderr what is done and when, and what is behind each error."""
+    logger, handler = logging.getLogger("tcpipe"), _DebugLog()
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+
+
+class _DebugLog(logging.Handler):
+    def emit(self, record: logging.LogRecord) -> None:
+        step = step_of(record)
+        if step is not None and (step.done or not step.task):
+            return
+        text = record.getMessage() if step is None else f"{step.task}: {step.stage}"
+        when = datetime.fromtimestamp(record.created, UTC).strftime("%H:%M:%S.%f")[:-3]
+        with suppress(OSError):
+            say(f"{when} {text}", err=True)
 
 
 def say(text: str, *, err: bool = False) -> None:

@@ -12,6 +12,7 @@ from tcpipe.cli.options import (
     SEALED,
     FloatRange,
     LonLat,
+    complete_maps,
     json_option,
     physics_option,
     quiet_option,
@@ -31,7 +32,13 @@ from tcpipe.cli.options import (
     type=click.Choice(["energy", "time", "distance"]),
     help="What is to be least.",
 )
-@click.option("--map", "map_name", metavar="NAME", help="Map to plan on (default: the only one in the store).")
+@click.option(
+    "--map",
+    "map_name",
+    metavar="NAME",
+    shell_complete=complete_maps,
+    help="Map to plan on (default: the only one in the store).",
+)
 @click.option(
     "--out", default="plan.geojson", show_default=True, type=OUTPUT_FILE, metavar="FILE", help="The path as GeoJSON."
 )
@@ -88,7 +95,7 @@ def plan_path(
     from tcpipe.planning.plan_files import PlanRequest, plan
 
     request = PlanRequest(start, goal, objective, step_m, allow_unseen, here(cost_map) if cost_map else None)
-    with progress("plan-path", 1, quiet=quiet) as shown:
+    with progress("plan-path", quiet=quiet) as shown:
         source = chosen_map(store, map_name)
         drawn = Path(picture) if picture else None
         result = plan(

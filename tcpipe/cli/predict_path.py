@@ -58,7 +58,7 @@ def predict_path(
     from tcpipe.planning.inputs import chosen_map
     from tcpipe.planning.path_files import predict_path as run
 
-    with progress("predict-path", 1, quiet=quiet):
+    with progress("predict-path", quiet=quiet):
         source = chosen_map(store, map_name)
         result = run(
             chosen_model(model, physics=physics, speed_mps=speed_mps),

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import LOG, json_option, msgdef_option, quiet_option, recipe_option
+from tcpipe.cli.options import LOG, complete_robots, json_option, msgdef_option, quiet_option, recipe_option
 
 
 @click.command(short_help="What a minute of recording promises")
 @click.argument("log", type=LOG, metavar="LOG")
-@click.option("--robot", metavar="NAME", help="Robot profile.")
+@click.option("--robot", metavar="NAME", shell_complete=complete_robots, help="Robot profile.")
 @recipe_option
 @msgdef_option
 @json_option
@@ -29,7 +29,7 @@ def preflight(
     from tcpipe.cli.output import progress, ruling_recipe, say_result
     from tcpipe.pipeline.preflight import preflight as run
 
-    with progress("preflight", 1, quiet=quiet):
+    with progress("preflight", quiet=quiet):
         found = run(
             log, recipe=ruling_recipe(recipe)[0], robot=robot, message_definitions=Path(msgdef) if msgdef else None
         )

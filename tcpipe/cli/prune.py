@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import duration_value, json_option, recipe_option, store_option
+from tcpipe.cli.options import complete_runs, duration_value, json_option, recipe_option, store_option
 
 
 @click.command(short_help="Remove what a store no longer needs")
 @store_option
 @recipe_option
-@click.option("--keep", multiple=True, metavar="RUN|RECIPE", help="Nothing of this run or recipe goes; repeatable.")
+@click.option(
+    "--keep",
+    multiple=True,
+    metavar="RUN|RECIPE",
+    shell_complete=complete_runs,
+    help="Nothing of this run or recipe goes; repeatable.",
+)
 @click.option(
     "--min-age",
     "min_age_s",

@@ -45,6 +45,6 @@ def reproduce(
     from tcpipe.cli.output import progress, say_result
     from tcpipe.learning.reproduction import reproduce as run
 
-    with progress("reproduce", 1, quiet=quiet):
+    with progress("reproduce", quiet=quiet):
         result = run(directory, quick=quick, seeds=seeds, jobs=jobs, hidden=hidden, baselines=baselines)
     say_result(result, as_json=as_json)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, complete_scenarios, json_option, quiet_option
 
 
 @click.command(short_help="A simulated site with its truth")
@@ -16,6 +16,7 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, json_option, quiet_option
     default="demo",
     show_default=True,
     metavar="NAME",
+    shell_complete=complete_scenarios,
     help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
 )
 @click.option("--seed", default=1, show_default=True, type=SEED, help="Same seed, same site.")
@@ -26,7 +27,7 @@ def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) 
     from tcpipe.cli.output import print_json, progress, say
     from tcpipe.simulation import simulate as run
 
-    with progress("simulate", 1, quiet=quiet):
+    with progress("simulate", quiet=quiet):
         site = run(Path(out), scenario=scenario, seed=seed)
     if as_json:
         print_json(site)

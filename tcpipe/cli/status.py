@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import ONE_OF_SEVERAL, duration_value, json_option, recipe_option, store_option
+from tcpipe.cli.options import ONE_OF_SEVERAL, complete_robots, duration_value, json_option, recipe_option, store_option
 from tcpipe.cli.output import say
 
 
@@ -12,7 +12,7 @@ from tcpipe.cli.output import say
 @click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
 @store_option
 @recipe_option
-@click.option("--robot", metavar="NAME", help="Robot profile that ingest is given.")
+@click.option("--robot", metavar="NAME", shell_complete=complete_robots, help="Robot profile that ingest is given.")
 @click.option(
     "--min-age",
     "min_age_s",

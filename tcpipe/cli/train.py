@@ -77,7 +77,7 @@ def train(
     from tcpipe.learning.training import train as run
 
     given = {name for name in options if context.get_parameter_source(name) is not ParameterSource.DEFAULT}
-    with progress("train", 1, quiet=quiet):
+    with progress("train", quiet=quiet):
         if options["model"] is None:
             options["model"] = "resnet18" if given & _OF_THE_NETWORK else model_for(dataset)
         result = run(dataset, out, config=FitConfig(**options), fresh=fresh)

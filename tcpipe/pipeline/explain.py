@@ -363,7 +363,7 @@ def _made_again(
         segments = run.segments()
     else:
         try:
-            segments = run_stages(streams, recipe.ingest, run_id=run.run_id, name=run.run_id)[2].table
+            segments = run_stages(streams, recipe.ingest, run_id=run.run_id)[2].table
         except TcpipeError as error:
             return "; ".join(error.problems)
     row = pc.index(segments.column("segment_id"), sample.sample_id).as_py()

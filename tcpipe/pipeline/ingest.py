@@ -90,7 +90,7 @@ def ingest(
     shard: tuple[int, int] | None = None,
     min_age_s: float = 0.0,
     message_definitions: Path | None = None,
-    on_found: Callable[[int], None] | None = None,
+    on_found: Callable[[Mapping[str, int]], None] | None = None,
     on_result: Callable[[IngestResult], None] | None = None,
 ) -> IngestSummary:
     """Ingest logs (files, ROS 2 bag directories, folders of them) into the store; what is there already is left alone.
@@ -121,7 +121,7 @@ def ingest(
     message_definitions
         A directory of .msg or .idl files for types that the logs do not define.
     on_found
-        Called once with the number of logs.
+        Called once with the size [byte] of every log by its name.
     on_result
         Called as each log ends, in the order of ending.
 
@@ -153,7 +153,8 @@ def ingest(
         sources = with_hashes(mine, lambda lineage: known.seen.get(lineage, ()))
         tasks = [IngestTask(source, *common, *how) for source in sources]
         if on_found:
-            on_found(len(tasks) + len(found.problems))
+            sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
+            on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
         results = {}
         for index, source, result in _results(opened, tasks, found, known, jobs=jobs, cluster=cluster):
             results[index] = result

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -22,10 +21,9 @@ from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, Status, result
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.outlines import known_as, remember_outline
 from tcpipe.pipeline.run_stages import run_stages
+from tcpipe.progress import step, working_on
 from tcpipe.store import Store
 from tcpipe.tables.levels import Streams
-
-logger = logging.getLogger("tcpipe")
 
 
 def ingest_one(task: IngestTask) -> tuple[LogSource, IngestResult]:
@@ -35,7 +33,8 @@ def ingest_one(task: IngestTask) -> tuple[LogSource, IngestResult]:
     young = too_young(task)
     if young is not None:
         return task.source, young
-    result = told(task, partial(_ingest, hashed=hashed))
+    with working_on(task.source.name):
+        result = told(task, partial(_ingest, hashed=hashed))
     if task.source.has_changed():
         note = "it changed while it was looked at; it is ingested when its recording has ended"
         return task.source, IngestResult(task.source.name, "waiting", notes=(note,))
@@ -54,7 +53,7 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
         if named and before and not task.force and (made := made_before(store, named, task, sha256)):
             return made
         log = opened or _opened(task, stack)
-        logger.info("%s: reading", source.name)
+        step("reading")
         same_as = _twin(before, source)
         streams, known = _read(store, named, before, log, task, sha256=sha256)
         known = replace(known, tags={**_tags(store, named, before), **task.tags})
@@ -93,7 +92,7 @@ def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
 
 
 def _fuse_and_label(store: Store, run_id: str, streams: Streams, known: RunJson, task: IngestTask) -> Manifest:
-    track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id, name=task.source.name)
+    track, gated, labelled = run_stages(streams, task.recipe.ingest, run_id=run_id)
     manifest = manifest_of(task, known, streams, track, labelled)
     settled = (lambda _: False) if task.force else task.is_made_by
     return store.write_run(manifest, track=track, gated=gated, labelled=labelled, settled=settled)

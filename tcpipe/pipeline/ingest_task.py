@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 import traceback
 from collections.abc import Callable, Mapping
@@ -21,6 +22,8 @@ from tcpipe.recipe import Recipe
 from tcpipe.tables.findings import EnergyBudget
 
 R = TypeVar("R")
+
+logger = logging.getLogger("tcpipe")
 
 Status = Literal["done", "unchanged", "damaged", "failed", "waiting"]
 
@@ -139,6 +142,8 @@ def told(task: IngestTask, act: Callable[[IngestTask], R]) -> R | IngestResult:
     try:
         return act(task)
     except Exception as error:  # noqa: BLE001  at last a bug that one log meets
+        for line in "".join(traceback.format_exception(error)).splitlines():
+            logger.debug("%s: %s", task.source.name, line)
         problems, trace = _in_words(error, task.source)
         transient = is_transient(error) or not task.source.files
         return IngestResult(task.source.name, "failed", problems=problems, transient=transient, traceback=trace)

@@ -187,7 +187,7 @@ def preflight(
         }
         try:
             streams = read_run(found, recipe.read_of(found.topics), robot=robot, known=profiles_of(recipe))
-            labelled = run_stages(streams, recipe.ingest, run_id="preflight", name=seen.path)[2]
+            labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
             return _told(seen, None, missing, record, problems=error.problems)
     return _told(seen, labelled, missing, record, problems=())

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import logging
-
 from tcpipe.formats.robot_files import profiles_of
+from tcpipe.progress import step
 from tcpipe.recipe import IngestSections
 from tcpipe.tables.levels import GatedTrack, LabelledSegments, Streams, Track
 
-logger = logging.getLogger("tcpipe")
-
 
 def run_stages(
-    streams: Streams, sections: IngestSections, *, run_id: str, name: str
+    streams: Streams, sections: IngestSections, *, run_id: str
 ) -> tuple[Track, GatedTrack, LabelledSegments]:
-    """Run fuse, gate, segment and label over the streams of one run (``name`` is for progress only).
+    """Run fuse, gate, segment and label over the streams of one run.
 
     A stage gets its own section, and of the others nothing but the chord; no section that `recipe_id` is not the hash of is in reach.
     """
@@ -24,9 +21,9 @@ def run_stages(
     from tcpipe.stages.segment import segment_track  # noqa: PLC0415
 
     profile = profiles_of(sections).robots[streams.robot]
-    logger.info("%s: fusing", name)
+    step("fusing")
     track = fuse_run(streams, sections.fuse, run_id=run_id)
-    logger.info("%s: cutting and labelling", name)
+    step("cutting and labelling")
     gated = gate_track(
         track, sections.gate, max_velocity_mps=profile.max_velocity_mps, chord_m=sections.segment.chord_m
     )

@@ -71,7 +71,7 @@ def read(drive: Drive, out: Path, config: ReadConfig | None = None) -> Streams:
 
 
 def run(drive: Drive, out: Path, config: ReadConfig | None = None) -> LabelledSegments:
-    return run_stages(read(drive, out, config), Recipe().ingest, run_id="run", name="run")[2]
+    return run_stages(read(drive, out, config), Recipe().ingest, run_id="run")[2]
 
 
 def assert_labels_hold(labelled: LabelledSegments, truth: Truth, *, at_least: int = 30, within: float = 0.03) -> None:

@@ -17,6 +17,7 @@ import tcpipe
 from tcpipe import execution
 from tcpipe.errors import TcpipeError, UsageError
 from tcpipe.execution import cluster_cpu_s, run_all
+from tcpipe.progress import STEP, Step, step_of
 
 
 @pytest.fixture(scope="module")
@@ -27,14 +28,14 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[DaskCluster]:
 
 def test_workers_do_all_tasks_and_what_they_say_is_said_here(cluster, caplog, monkeypatch):
     monkeypatch.setattr(logging.getLogger("tcpipe"), "disabled", False)
-    with caplog.at_level(logging.INFO, "tcpipe"):
+    with caplog.at_level(STEP, "tcpipe"):
         outcomes = sorted(run_all(where, range(9), jobs=1, cluster=cluster.address), key=lambda outcome: outcome.index)
     assert [outcome.result[0] for outcome in outcomes] == [value * value for value in range(9)]
     assert os.getpid() not in {outcome.result[1] for outcome in outcomes}
     assert len({outcome.result[1] for outcome in outcomes}) == 2
-    assert sorted(record.getMessage() for record in caplog.records if record.name == "tcpipe") == [
-        f"task {value}" for value in range(9)
-    ]
+    said = [record for record in caplog.records if record.name == "tcpipe"]
+    assert sorted(filter(None, map(step_of, said)), key=str) == [Step(f"log {n}", "squaring", 0, 0) for n in range(9)]
+    assert sorted(record.getMessage() for record in said if step_of(record) is None) == [f"task {n}" for n in range(9)]
 
 
 def test_no_tasks_are_no_outcomes(cluster):

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 from tcpipe.execution import run_all
+from tcpipe.progress import STEP, step, step_of, working_on
 
 
 def _square(value: int) -> int:
@@ -39,6 +40,8 @@ def test_a_killed_worker_costs_only_its_own_task() -> None:
 
 
 def _say(value: int) -> int:
+    with working_on("/long" * 100):
+        step("reading", value, 10)
     logging.getLogger("tcpipe").info("task %d", value)
     return os.getpid()
 
@@ -47,9 +50,10 @@ def test_what_workers_log_is_said_here(caplog: pytest.LogCaptureFixture, monkeyp
     monkeypatch.setattr(
         logging.getLogger("tcpipe"), "disabled", False
     )  # the linter of the architecture tests disables it
-    with caplog.at_level(logging.INFO, "tcpipe"):
+    with caplog.at_level(STEP, "tcpipe"):
         outcomes = list(run_all(_say, [1, 2, 3], jobs=2))
-    assert sorted(record.getMessage() for record in caplog.records) == ["task 1", "task 2", "task 3"]
+    assert sorted(of.done for of in map(step_of, caplog.records) if of) == [1, 2, 3]
+    assert sorted(of.getMessage() for of in caplog.records if not step_of(of)) == ["task 1", "task 2", "task 3"]
     assert os.getpid() not in {outcome.result for outcome in outcomes}
 
 

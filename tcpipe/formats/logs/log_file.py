@@ -30,6 +30,7 @@ from tcpipe.formats.logs.rosbag2 import (
 )
 from tcpipe.formats.object_storage import StoredObject, is_url, laid_out
 from tcpipe.logs.topics import Damage, Topic, condensed
+from tcpipe.progress import Meter
 
 _READ_BY_RANGE = (".mcap", ".bag")
 LOG_SUFFIXES = (".mcap", ".bag", ".bag.active", ".db3", ".mcap.zstd", ".db3.zstd")
@@ -230,12 +231,13 @@ class Log:
             return self.outline
         for fetched in self._fetched:
             fetched.whole()
-        digest = hashlib.sha256()
+        digest, meter = hashlib.sha256(), Meter("hashing", self.size_bytes)
         for file in sorted(self._files, key=lambda file: file.name):
             try:
                 with file.open("rb") as stream:
                     while block := stream.read(_HASH_BYTES):
                         digest.update(block)
+                        meter.add(len(block))
             except OSError as error:
                 raise LogError(
                     f"{file}: it cannot be read to its end ({error.strerror}); rescue what can be read into a copy "
@@ -315,9 +317,11 @@ class Log:
         collected = self._collectors(topics, in_pieces=batch_bytes is not None)
         most = math.inf if batch_bytes is None else batch_bytes
         given = dict.fromkeys(collected, 0)
-        held = 0
+        held, size = 0, self.size_bytes
+        meter, messages = Meter("reading", size), sum(self.topics[name].message_count or 0 for name in collected)
         for index in range(len(self._parts)):
             for topic_table, block in self._blocks(index, collected, threads):
+                meter.add(size * len(block.offsets) / max(messages, 1))
                 held -= topic_table.held_bytes
                 topic_table.add(block)
                 held += topic_table.held_bytes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -16,15 +16,21 @@ _FIGURES = re.compile(r"(?<!\w)/\w[\w/]*|[-+]?\d[\d.,]*(e[-+]?\d+)?")
 _MOST_SHOWN = 8
 
 
-def findings_of_runs(runs: Sequence[RunSource]) -> tuple[RunFinding, ...]:
-    """Return what ingest warned of, lines that differ by figures and topics alone together; what most samples are from comes first."""
+def by_cause(warnings: Iterable[tuple[str, Sequence[str]]]) -> list[dict[str, str]]:
+    """Return the warnings of runs, by run, lines that differ by figures and topics alone together."""
     told: dict[str, dict[str, str]] = {}
-    for run in runs:
-        for line in run.warnings:
-            told.setdefault(_FIGURES.sub("#", line), {}).setdefault(run.run_id, line)
+    for run_id, lines in warnings:
+        for line in lines:
+            told.setdefault(_FIGURES.sub("#", line), {}).setdefault(run_id, line)
+    return list(told.values())
+
+
+def findings_of_runs(runs: Sequence[RunSource]) -> tuple[RunFinding, ...]:
+    """Return what ingest warned of by cause; what most samples are from comes first."""
     samples = {run.run_id: run.samples for run in runs}
     found = (
-        RunFinding(next(iter(of.values())), tuple(of), sum(samples[run_id] for run_id in of)) for of in told.values()
+        RunFinding(next(iter(of.values())), tuple(of), sum(samples[run_id] for run_id in of))
+        for of in by_cause((run.run_id, run.warnings) for run in runs)
     )
     return tuple(sorted(found, key=lambda finding: -finding.samples))
 

@@ -22,6 +22,7 @@ from tcpipe.formats.dataset_files import LayerPixels
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.place import Place
 from tcpipe.formats.published import FetchedShards
+from tcpipe.progress import Meter
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled
 from tcpipe.stages.sample_maps import check_alike, sample_on_maps
@@ -231,10 +232,12 @@ def sample_all_segments(
     lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     warnings: dict[int, tuple[str, ...]] = {}
+    meter = Meter("sampling", segments.num_rows)
     try:
         with closing(run_all(_sample_batch, batches, jobs=workers.jobs, cluster=workers.cluster)) as outcomes:
             for outcome in outcomes:
                 part, batch = sound(outcome), outcome.index
+                meter.add(len(rows[batch]))
                 kept = rows[batch][part.kept]
                 lost_by[rows[batch]] = part.lost_by
                 slots[kept[_in_order(ranks[kept])]] = (batch << _ROW_BITS) + np.arange(len(kept))

@@ -31,7 +31,7 @@ def stages(tmp_path_factory):
     hills = scenario("hills12")
     drive = replace(hills.drives[0], plan=Wander(400.0, (14.0, 34.0), climbing=0.5), faults=Faults(), robot=ROBOT)
     streams = streams_of(log_of(hills, drive, tmp_path_factory.mktemp("hills"), seed=3))
-    return run_stages(streams, Recipe().ingest, run_id="run", name="run")
+    return run_stages(streams, Recipe().ingest, run_id="run")
 
 
 def test_the_fit_is_the_robot(stages):

@@ -1,0 +1,66 @@
+"""How far work is, told as records of the log, so that worker processes and clusters pass it on with whatever else they say."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+
+STEP = 15
+"""The level of such records: below INFO, so that only a display asks for them."""
+
+_LONGEST_NAME = 200
+_TEXT = "%s: %s, %d of %d"
+
+_logger = logging.getLogger("tcpipe")
+_task: ContextVar[str] = ContextVar("task", default="")
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """How far a task is: its name ("" of the command itself), its stage, and how much of that is done (of a log: bytes)."""
+
+    task: str
+    stage: str
+    done: int
+    total: int
+    """0 where it is not known."""
+
+
+@contextmanager
+def working_on(task: str) -> Iterator[None]:
+    """Let what is told inside be of this task."""
+    before = _task.set(task[-_LONGEST_NAME:])
+    try:
+        yield
+    finally:
+        _task.reset(before)
+
+
+def step(stage: str, done: int = 0, total: int = 0) -> None:
+    """Tell how far the task is that this thread works on."""
+    _logger.log(STEP, _TEXT, _task.get(), stage, done, total)
+
+
+def step_of(record: logging.LogRecord) -> Step | None:
+    """Return what a record tells; None of any other."""
+    return Step(*record.args) if record.levelno == STEP and isinstance(record.args, tuple) else None  # type: ignore[arg-type]
+
+
+@dataclass(slots=True)
+class Meter:
+    """Tells how far one stage is, hundredth by hundredth."""
+
+    stage: str
+    total: int
+    _done: float = field(default=0.0, init=False)
+    _told: float = field(default=0.0, init=False)
+
+    def add(self, count: float) -> None:
+        """Count what is done."""
+        self._done += count
+        if self._done - self._told >= self.total / 100:
+            self._told = self._done
+            step(self.stage, min(round(self._done), self.total), self.total)
