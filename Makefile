@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-object-storage test-dagster test-pages test-mutants check check-and-train kernels lock schemas docs clean
+.PHONY: help demo test test-object-storage test-dagster test-pages test-mutants check check-and-train kernels lock schemas docs release clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -110,8 +110,25 @@ lock:
 schemas: .venv/installed
 	$(BIN)/tcpipe schemas schemas
 
-docs: .venv/installed
+# The reference from the code, then the site, whose tools have an environment of their own.
+.venv-docs/installed: Makefile
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/python -m pip --disable-pip-version-check install --quiet mkdocs==1.6.1 mkdocs-material==9.8.1
+	@touch $@
+
+docs: .venv/installed .venv-docs/installed
 	$(BIN)/python docs/generate.py
+	NO_MKDOCS_2_WARNING=1 .venv-docs/bin/mkdocs build --strict --quiet
+
+# Wheel and sdist into dist/, proved as a newcomer would: the wheel alone in a fresh environment, elsewhere, runs the demo.
+release: .venv/installed
+	rm -rf dist build/release
+	$(BIN)/python -m hatchling build -d dist
+	$(PYTHON) -m venv build/release/env
+	build/release/env/bin/python -m pip --disable-pip-version-check install --quiet --require-hashes -r requirements.lock
+	build/release/env/bin/python -m pip --disable-pip-version-check install --quiet --no-deps dist/*.whl
+	cd build/release && env/bin/tcpipe demo --quiet && env/bin/tcpipe verify tcpipe-demo/dataset
+	@ls dist
 
 clean:
-	rm -rf .venv .venv-dagster .venv-pages .venv-mutants tcpipe-demo
+	rm -rf .venv .venv-dagster .venv-docs .venv-pages .venv-mutants build dist tcpipe-demo

@@ -1,0 +1,81 @@
+"""The documentation as a site, as MkDocs asks for it: the README in front, a catalogue of errors, links into the code as text."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+CATALOGUE = "reference/error-catalogue.md"
+_LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
+_HEAD = """# Every error and its cure
+
+What tcpipe says when something cannot be done, by error and module, as it stands in the code (`{…}` is filled in). The line itself says
+what to do; [exit codes and the tree of errors](errors.md) say what a script can go by. Made anew with the site.
+"""
+
+
+def on_files(files: Any, config: Any) -> Any:
+    """Add the pages that lie elsewhere or are made here."""
+    from mkdocs.structure.files import File  # noqa: PLC0415  of the site's own environment
+
+    front = (ROOT / "README.md").read_text(encoding="utf-8").replace("](docs/", "](").replace('src="docs/', 'src="')
+    for name, text in (("index.md", front), (CATALOGUE, catalogue())):
+        files.append(File.generated(config, name, content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> str:  # noqa: ARG001  MkDocs' signature
+    """Return a page whose links out of the documentation are text."""
+    here = (ROOT / "docs" / page.file.src_uri).parent
+
+    def link(found: re.Match[str]) -> str:
+        target = found[2]
+        if re.match(r"[a-z]+:", target) or (here / target).resolve().is_relative_to(ROOT / "docs"):
+            return found[0]
+        return found[1]
+
+    return _LINK.sub(link, markdown)
+
+
+def catalogue() -> str:
+    """Return the page of every error that the code raises, with its words."""
+    parts = [_HEAD]
+    found: dict[str, dict[str, list[str]]] = {}
+    for path in sorted((ROOT / "tcpipe").rglob("*.py")):
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for error, text in _raised(ast.parse(path.read_text(encoding="utf-8"))):
+            found.setdefault(error, {}).setdefault(module, []).append(text)
+    for error, modules in sorted(found.items()):
+        parts.append(f"\n## {error}\n")
+        for module, texts in modules.items():
+            parts += [f"\n`{module}`\n", *(f"- `{text.replace('`', chr(39))}`" for text in dict.fromkeys(texts))]
+    return "\n".join(parts) + "\n"
+
+
+def _raised(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield each error's name and the text it is raised with."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id.endswith("Error"):
+            for argument in node.args:
+                text = _text(argument).strip()
+                if re.search(r"[a-z]{3}", re.sub(r"\{.*?\}", "", text)):
+                    yield node.func.id, text
+
+
+def _text(node: ast.expr) -> str:
+    """Return a string expression with its parts in braces; "" of anything else."""
+    match node:
+        case ast.Constant(value=str(value)):
+            return value
+        case ast.JoinedStr(values=values):
+            return "".join(_text(value) for value in values)
+        case ast.FormattedValue(value=value):
+            return f"{{{re.sub(r'[^a-zA-Z0-9_. ]', '', ast.unparse(value))[:30] or '…'}}}"
+        case ast.BinOp(left=left, op=ast.Add(), right=right):
+            return _text(left) + _text(right)
+        case _:
+            return ""
