@@ -88,6 +88,11 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
     metavar="N",
     help="Build nothing from fewer runs; so many are enough: that others are left out or gone is a warning then.",
 )
+@click.option(
+    "--redact",
+    is_flag=True,
+    help="For the public: moved to 0 N 0 E as a whole, and no log, run, topic, path, host or user is named.",
+)
 @click.option("--dry-run", is_flag=True, help="Say what would be done, and what it would take; do nothing.")
 @json_option
 @quiet_option
@@ -108,6 +113,7 @@ def build_dataset(
     seed: int | None,
     keep_split: str | None,
     min_runs: int | None,
+    redact: bool,
     dry_run: bool,
     as_json: bool,
     quiet: bool,
@@ -141,6 +147,7 @@ def build_dataset(
             keep_split=keep_split,
             covariates=covariates,
             min_runs=min_runs,
+            redact=redact,
             dry_run=dry_run,
         )
         for problem in result.problems:

@@ -67,6 +67,7 @@ _ENCODING_BY_SUFFIX = {
     ".json": "application/json",
     ".parquet": "application/x-parquet",
     ".html": "text/html",
+    ".md": "text/markdown",
     ".png": "image/png",
     ".geojson": "application/geo+json",
 }

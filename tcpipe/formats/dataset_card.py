@@ -211,6 +211,25 @@ class Shard:
     rows: int
 
 
+@dataclass(frozen=True, slots=True)
+class Redacted:
+    """What a redacted dataset does not tell, and what it does not hide."""
+
+    moved: str = "to 0 N 0 E as a whole, grid north up: lon, lat, course, heights, regions; distances in the maps' plane are as they were"
+    cut: str = (
+        "names of logs, runs and maps; topics, paths, hosts, users; checksums of rasters; the recipe's sections read, robots, "
+        "power_sources and tables"
+    )
+    not_hidden: str = (
+        "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
+        "power, tags and covariates as they were given, the sha256 of each log, and what name, description and creator say"
+    )
+
+    def lines(self) -> tuple[str, str, str]:
+        """Return it in words."""
+        return f"Moved {self.moved}.", f"Cut: {self.cut}.", f"Not hidden: {self.not_hidden}."
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetCard:
     """All of dataset.json but its seal."""
@@ -263,6 +282,8 @@ class DatasetCard:
     covariates: tuple[Covariate, ...] = field(default=(), metadata=LEFT_OUT)
     added_columns: Mapping[str, str] = field(default_factory=dict, metadata=LEFT_OUT)
     """Columns of samples.parquet beyond its schema: run tags and covariates, each with its meaning."""
+    redaction: Redacted | None = field(default=None, metadata=LEFT_OUT)
+    """What is not told; None of a dataset that tells all."""
     shards: tuple[Shard, ...]
     checksums: Mapping[str, Checksum]
     """By path inside the dataset."""

@@ -2,7 +2,7 @@
 
 ::
 
-    dataset.json  croissant.json  samples.parquet  report.html
+    dataset.json  croissant.json  README.md  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
     drive-next.geojson                                       where to drive for what is thin
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
@@ -41,6 +41,7 @@ LayerPixels = NDArray[np.uint8 | np.uint16 | np.float32]
 
 CARD = "dataset.json"
 CROISSANT = "croissant.json"
+HUB_CARD = "README.md"
 SAMPLES = "samples.parquet"
 PATCHES = "patches.zarr"
 SHARDS = "data"

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from tcpipe.errors import TcpipeError, UsageError, plain_lines
 from tcpipe.formats.atomic import left_beside
-from tcpipe.formats.dataset_files import CARD
+from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published import anew, others_beside
 from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
 from tcpipe.store import Store, inside_store, is_store
+from tcpipe.tables.findings import LEFT_OUT
 
 Finding = tuple[str, int] | str
 """What was read and how much of it, or a problem."""
@@ -37,6 +39,8 @@ class Verified:
     """``dataset``, ``run``, ``store``, ``map``, ``model`` or ``cost map``."""
     read: Mapping[str, int]
     problems: tuple[str, ...]
+    notes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
+    """What a redacted dataset does not tell."""
 
     def __str__(self) -> str:
         """Return the lines as one text."""
@@ -47,7 +51,7 @@ class Verified:
         read = ", ".join(f"{count} {what}" for what, count in self.read.items()) or "nothing"
         count = len(self.problems)
         verdict = f"{count} problem{'s' if count > 1 else ''}" if count else "all as it was written"
-        return [f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems]
+        return [f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes]
 
 
 def verify(path: Path | str) -> Verified:
@@ -83,7 +87,17 @@ def verify(path: Path | str) -> Verified:
         problems += [
             f"{left}: was left behind by a command that was killed; {again}" for left in left_beside(Path(path))
         ]
-    return Verified(str(path), kind, read, tuple(dict.fromkeys(problems)))
+    return Verified(
+        str(path), kind, read, tuple(dict.fromkeys(problems)), _notes(Path(path)) if kind == "dataset" else ()
+    )
+
+
+def _notes(dataset: Path) -> tuple[str, ...]:
+    """Return what a dataset says that it does not tell; nothing where its card cannot be read, which is a problem already."""
+    with suppress(TcpipeError):
+        redaction = read_card(dataset, proved=False).redaction
+        return () if redaction is None else ("It is redacted.", *redaction.lines())
+    return ()
 
 
 def _stored(path: str) -> tuple[str, Iterator[Finding]] | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -17,12 +18,13 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, pla
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.croissant import croissant
-from tcpipe.formats.dataset_card import DatasetCard, Doubtful, RunFinding
+from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, RunFinding
 from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
     CROISSANT,
     DRIVE_NEXT,
+    HUB_CARD,
     OVERVIEW,
     RELIEF,
     REPORT,
@@ -34,6 +36,7 @@ from tcpipe.formats.dataset_files import (
     read_samples,
 )
 from tcpipe.formats.geojson import read_regions
+from tcpipe.formats.hub_card import hub_card
 from tcpipe.formats.json_files import digest, write_json
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.object_storage import is_url
@@ -58,6 +61,13 @@ from tcpipe.pipeline.dataset.content import gather_content
 from tcpipe.pipeline.dataset.findings import doubt_in_words, findings_in_words
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
+from tcpipe.pipeline.dataset.redaction import (
+    redacted_card,
+    redacted_content,
+    redacted_features,
+    redacted_inputs,
+    redaction_of,
+)
 from tcpipe.pipeline.dataset.runs import gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
@@ -100,6 +110,8 @@ class BuildResult:
     """How many samples carry a quality flag."""
     findings: tuple[RunFinding, ...] = ()
     """What ingest found of the runs, by cause."""
+    redacted: bool = False
+    """Whether names and places are not told."""
     estimate: Estimate | None = None
     """What a dry run expects of the work: of all segments, as if each became a sample."""
 
@@ -121,7 +133,9 @@ class BuildResult:
         doubt = [] if self.doubtful is None else [doubt_in_words(self.doubtful, self.samples)]
         said = [f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s")]
         said += findings_in_words(self.findings)
-        return plain_lines((head, *doubt, *audit_lines(self.audit), ledger, *floor, *said))
+        publish = f"to publish it: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
+        told = [*Redacted().lines(), publish] if self.redacted else []
+        return plain_lines((head, *doubt, *audit_lines(self.audit), ledger, *floor, *said, *told))
 
 
 def build_dataset(
@@ -141,6 +155,7 @@ def build_dataset(
     keep_split: str | Path | None = None,
     covariates: str | Path | Sequence[str | Path] = (),
     min_runs: int | None = None,
+    redact: bool = False,
     dry_run: bool = False,
 ) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
@@ -179,6 +194,8 @@ def build_dataset(
         Tables (CSV or Parquet) whose columns are joined to the samples by time, as the recipe's section ``covariates`` says.
     min_runs
         Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
+    redact
+        For the public: everything is moved by one offset that is kept nowhere, and no log, topic, path, host or user is named.
     dry_run
         Choose the runs, look whether there is something to do, and estimate what it takes; write nothing.
 
@@ -210,7 +227,14 @@ def build_dataset(
         earlier=earlier,
         covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
     )
-    problems, warnings = _left_out(inputs, known, robot=robot, tags=tags or {}, min_runs=min_runs)
+    inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if redact else inputs
+    problems, warnings = _left_out(
+        inputs,
+        None if known is not None and known.redaction else known,
+        robot=robot,
+        tags=tags or {},
+        min_runs=min_runs,
+    )
     inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
     if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
         result = _result(place, "unchanged", known, problems)
@@ -227,7 +251,8 @@ def build_dataset(
                 earlier,
                 file_format=file_format,
                 workers=workers,
-                beside=place.absolute().parent if isinstance(place, Path) else None,
+                beside=place.absolute().parent if isinstance(place, Path) and not redact else None,
+                redact=redact,
             )
         for entry in workers.waiting.entries():
             workers.waiting.delete(entry.name)
@@ -304,6 +329,7 @@ def _result(place: Path | str, status: str, card: DatasetCard, problems: Sequenc
         exit_code=3 if said else 0,
         doubtful=card.doubtful,
         findings=card.findings,
+        redacted=card.redaction is not None,
     )
 
 
@@ -374,11 +400,15 @@ def _build(
     file_format: FileFormat,
     workers: Workers,
     beside: Path | None,
+    redact: bool,
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
     waiting = directory / SPOOL
     waiting.mkdir()
     content = gather_content(waiting, inputs, recipe, regions, earlier, workers=workers)
+    redaction = redaction_of(content, inputs, recipe) if redact else None
+    if redaction is not None:
+        content, inputs = redacted_content(content, redaction), redacted_inputs(inputs, redaction)
     logger.info("writing %d samples", len(content.samples))
     with parquet_rows(directory / SAMPLES, content.samples.schema) as write:
         for piece in content.samples.pieces(ROWS_PER_GROUP):
@@ -395,11 +425,7 @@ def _build(
         regions=regions,
         buffer_m=content.drawn.buffer_m,
     )
-    write_json(directory / DRIVE_NEXT, drive_next)
-    files = file_checksums(directory)
-    spool = content.spool
-    patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
-    write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches, samples=content.samples.schema))
+    write_json(directory / DRIVE_NEXT, drive_next if redaction is None else redacted_features(drive_next, redaction))
     card = dataset_card(
         read_samples(directory, (*CARD_COLUMNS, *PHYSICS_COLUMNS)),
         recipe,
@@ -409,8 +435,17 @@ def _build(
         regions=regions,
         balance=balance,
         shards=shards,
-        checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)},
     )
+    card = card if redaction is None else redacted_card(card, redaction)
+    spool, schema = content.spool, content.samples.schema
+    files = file_checksums(directory)
+    write_text(
+        directory / HUB_CARD, hub_card(replace(card, checksums=files), schema, samples_file=SAMPLES, picture=OVERVIEW)
+    )
+    files = {**files, HUB_CARD: file_checksum(directory / HUB_CARD)}
+    patches = {name: (spool.patch_px**2, layer.stored.kind) for name, layer in spool.layers.items()} if shards else None
+    write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches, samples=schema))
+    card = replace(card, checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
     write_text(directory / REPORT, sealed_page(dataset_report(directory, beside)))
     return card

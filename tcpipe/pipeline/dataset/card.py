@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypedDict
@@ -28,7 +28,6 @@ from tcpipe.formats.dataset_files import FileFormat
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.layer_descriptions import described
 from tcpipe.formats.maps.map_files import MapFile
-from tcpipe.formats.seals import Checksum
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.findings import doubtful, findings_of_runs
 from tcpipe.pipeline.dataset.inputs import Inputs
@@ -71,9 +70,8 @@ def dataset_card(
     regions: Regions | None,
     balance: Balance,
     shards: Sequence[Shard],
-    checksums: Mapping[str, Checksum],
 ) -> DatasetCard:
-    """Return the card; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
+    """Return the card without checksums; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
     about, drawn, classes = recipe.dataset, content.drawn, content.sources[0].classes
     layers, has_terrain = content.spool.layers, "terrain" in content.spool.layers
     runs = tuple(replace(run, samples=_count(samples, "run_id", run.run_id)) for run in inputs.sources)
@@ -114,7 +112,7 @@ def dataset_card(
         covariates=content.covariates,
         added_columns={field.name: field.metadata[b"doc"].decode() for field in content.samples.added.schema},
         shards=tuple(shards),
-        checksums=checksums,
+        checksums={},
     )
 
 

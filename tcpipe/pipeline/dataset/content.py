@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -43,6 +43,16 @@ _ROWS = 1 << 17
 """Whose centres are looked for at once."""
 
 
+class Tells(Protocol):
+    """What redacts samples (`tcpipe.pipeline.dataset.redaction.Redaction`)."""
+
+    def table(self, samples: pa.Table) -> pa.Table:
+        """Return samples with the places and names that are told."""
+
+    def segment_id(self, name: str, run_id: str) -> str:
+        """Return what a run's segment is called."""
+
+
 @dataclass(frozen=True, slots=True)
 class SampleTable:
     """The samples in the dataset's order, made piece by piece: their segments are mapped from a file, not held.
@@ -60,6 +70,8 @@ class SampleTable:
     patch: NDArray[np.int64]
     added: pa.Table
     """Columns beyond SAMPLES, in the segments' order."""
+    redaction: Tells | None = None
+    """How names and places are told; None: as they are."""
 
     @property
     def schema(self) -> pa.Schema:
@@ -101,7 +113,8 @@ class SampleTable:
         )
         for field in self.added.schema:
             table = table.append_column(field, self.added.column(field.name).take(rows_of_segments))
-        return located(table, "Point", centres)
+        told = table if self.redaction is None else self.redaction.table(table)
+        return located(told, "Point", centres)
 
     def pieces(self, rows: int) -> Iterator[pa.Table]:
         """Yield the table in pieces of so many rows; at least one, which may be empty."""
@@ -112,7 +125,10 @@ class SampleTable:
         """Return the ids of rows ``first:last``."""
         rows = pa.array(self.sampled.kept[self.patch[first:last]])
         found: list[str] = self.segments.column("segment_id").take(rows).to_pylist()
-        return found
+        if self.redaction is None:
+            return found
+        runs = self.segments.column("run_id").take(rows).to_pylist()
+        return [self.redaction.segment_id(name, run_id) for name, run_id in zip(found, runs, strict=True)]
 
     def centres_xy_m(self) -> NDArray[np.float64]:
         """Return the centre of every footprint in the first map's plane [m], shape (N, 2)."""

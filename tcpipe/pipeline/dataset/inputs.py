@@ -133,7 +133,10 @@ def _digest_of(files: Mapping[str, Checksum], below: str = "") -> str:
 def earlier_splits(dataset: str | Path) -> pa.Table:
     """Return ``sample_id``, ``split`` and, where there is one, ``fold`` of a dataset of any data model; `DatasetError` if it is none."""
     directory, _ = here_by_range(dataset, by_range=is_shard)
-    read_card(directory)
+    if read_card(directory).redaction is not None:
+        raise DatasetError(
+            f"{directory}: is redacted, its samples have other names; give the dataset that is not (--keep-split)"
+        )
     there = sample_columns(directory)
     missing = [name for name in ("sample_id", "split") if name not in there]
     if missing:

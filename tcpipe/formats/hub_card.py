@@ -1,0 +1,182 @@
+"""README.md of a dataset: its card on the Hugging Face Hub, by which ``datasets.load_dataset`` knows configs, splits and columns.
+
+The YAML head is https://github.com/huggingface/hub-docs/blob/main/datasetcard.md?plain=1.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+
+import pyarrow as pa
+
+from tcpipe.errors import plain_line
+from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.formats.json_files import Json
+
+_LICENCES = {
+    "apache-2.0", "mit", "bsd-3-clause", "cc0-1.0", "cc-by-2.0", "cc-by-3.0", "cc-by-4.0", "cc-by-sa-3.0", "cc-by-sa-4.0",
+    "cc-by-nc-3.0", "cc-by-nc-4.0", "cc-by-nd-4.0", "cc-by-nc-nd-4.0", "cc-by-nc-sa-4.0", "odbl", "pddl", "odc-by", "gpl-3.0",
+}  # fmt: skip
+"""Those of which the Hub knows the name; others are told by theirs."""
+_SIZES = {10**3: "n<1K", 10**4: "1K<n<10K", 10**5: "10K<n<100K", 10**6: "100K<n<1M", 10**7: "1M<n<10M"}
+_DTYPES = {"double": "float64", "float": "float32", "halffloat": "float16"}
+_SHOWN_LAYERS = 12
+
+
+def hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, picture: str) -> str:
+    """Return the document: a YAML head (as JSON, which is YAML) and what a reader wants to know.
+
+    Parameters
+    ----------
+    card
+        The dataset's, with the checksums of its files so far.
+    samples
+        Schema of its table of samples.
+    samples_file, picture
+        Where that table and an overview lie in the dataset.
+
+    """
+    return f"---\n{_yaml(_head(card, samples, samples_file))}---\n\n{_body(card, picture)}"
+
+
+def _head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict[str, Json]:
+    columns = [_feature(field.name, field.type) for field in samples]
+    table: Json = {"config_name": "samples", "data_files": [{"split": "full", "path": samples_file}]}
+    configs: list[Json] = [table]
+    infos: list[Json] = [
+        {"config_name": "samples", "features": columns, "splits": [_split(card, "full", card.samples, [samples_file])]}
+    ]
+    if card.shards:
+        files: dict[str, list[str]] = {}
+        for shard in card.shards:
+            files.setdefault(shard.split, []).append(shard.path)
+        data: list[Json] = [{"split": split, "path": list(paths)} for split, paths in files.items()]
+        configs.insert(0, {"config_name": "patches", "default": True, "data_files": data})
+        of_layers: list[Json] = [
+            {"name": name, "list": str(layer["dtype"]), "length": card.patch_px**2}
+            for name, layer in card.layers.items()
+        ]
+        splits: list[Json] = [_split(card, split, card.splits[split], paths) for split, paths in files.items()]
+        infos.insert(0, {"config_name": "patches", "features": [*columns, *of_layers], "splits": splits})
+    known = card.licence.lower() if card.licence.lower() in _LICENCES else "other" if card.licence else "unknown"
+    return {
+        "pretty_name": card.name,
+        "license": known,
+        **({"license_name": card.licence} if known == "other" else {}),
+        "size_categories": [next((name for most, name in _SIZES.items() if card.samples < most), "n>10M")],
+        "task_categories": ["tabular-regression", "robotics"],
+        "tags": ["robotics", "terrain", "traversability", "energy", "geospatial", "tcpipe", "croissant"],
+        "configs": configs,
+        "dataset_info": infos,
+    }
+
+
+def _split(card: DatasetCard, name: str, samples: int, files: Sequence[str]) -> Json:
+    return {"name": name, "num_examples": samples, "num_bytes": sum(card.checksums[file].size_bytes for file in files)}
+
+
+def _feature(name: str, dtype: pa.DataType) -> Json:
+    if pa.types.is_fixed_size_list(dtype):
+        return {"name": name, "list": _name_of(dtype.value_type), "length": dtype.list_size}
+    return (
+        {"name": name, "list": _name_of(dtype.value_type)}
+        if pa.types.is_list(dtype)
+        else {"name": name, "dtype": _name_of(dtype)}
+    )
+
+
+def _name_of(dtype: pa.DataType) -> str:
+    if pa.types.is_dictionary(dtype):
+        return _name_of(dtype.value_type)
+    return _DTYPES.get(str(dtype), str(dtype))
+
+
+def _yaml(head: dict[str, Json]) -> str:
+    """Return the head as YAML: a key a line, its value as JSON, which YAML holds as it is."""
+    return "".join(f"{key}: {json.dumps(value, ensure_ascii=True)}\n" for key, value in head.items())
+
+
+def _text(value: str) -> str:
+    """Return text as Markdown shows it, and nothing else: no HTML, no markup."""
+    escaped = plain_line(value).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return "".join(f"\\{c}" if c in "\\`*_[]|#{}" else c for c in escaped)
+
+
+def _body(card: DatasetCard, picture: str) -> str:
+    return "\n".join(_lines(card, picture)) + "\n"
+
+
+def _lines(card: DatasetCard, picture: str) -> Iterator[str]:
+    """Yield the lines of what a reader wants to know."""
+    splits = ", ".join(f"{count} {split}" for split, count in card.splits.items())
+    side = f"{card.patch_px} × {card.patch_px} pixels of {card.patch_m:g} m × {card.patch_m:g} m"
+    yield from (f"# {_text(card.name)}", "")
+    if card.description:
+        yield from (_text(card.description), "")
+    yield (
+        f"{card.samples} samples ({splits}) of what driving a metre of ground costs a robot "
+        f"({', '.join(map(_text, card.robots)) or 'none'}): power, velocity, duration and energy, each with its standard deviation, "
+        f"beside a patch of the ground under it: {side}."
+    )
+    yield from ("", f"![the maps from above]({picture})", "", "## Labels, over train alone", "")
+    yield from ("| label | mean | standard deviation | least | most |", "|---|---|---|---|---|")
+    for name, of in card.label_statistics_of_train.items():
+        figures = (of.mean, of.std, of.min, of.max)
+        yield f"| `{name}` | " + " | ".join("–" if value is None else f"{value:.4g}" for value in figures) + " |"
+    yield from ("", "## Layers of a patch", "", "| layer | stored as | unit |", "|---|---|---|")
+    for name, layer in list(card.layers.items())[:_SHOWN_LAYERS]:
+        yield f"| {_text(name)} | {layer['dtype']} | {_text(str(layer.get('units', '')))} |"
+    yield from (
+        "",
+        "`dataset.json` says how each is decoded.",
+        "",
+        "## Reading it",
+        "",
+        "```python",
+        *_reading(card),
+        "```",
+        "",
+    )
+    yield from ("## Splits", "", _splits_in_words(card), "")
+    if card.redaction is not None:
+        yield from ("## Redacted", "", *map(_text, card.redaction.lines()), "")
+    yield from (
+        "## Licence and citation",
+        "",
+        f"Licence: {_text(card.licence) or 'not stated; ask before you use it'}.",
+        "",
+    )
+    yield from ("```bibtex", *_bibtex(card), "```", "")
+    yield f"Made with tcpipe {card.tcpipe_version}, data model {card.data_model_version}. `tcpipe verify` proves every file."
+
+
+def _reading(card: DatasetCard) -> Iterator[str]:
+    if card.shards:
+        yield from (
+            "from datasets import load_dataset",
+            'load_dataset("PATH")             # the patches with their samples, by split',
+        )
+    yield from ("import tcpipe", 'tcpipe.open_dataset("PATH")["train"].patches  # float32 (N, px, px, layers), decoded')
+
+
+def _splits_in_words(card: DatasetCard) -> str:
+    rules = card.split
+    return (
+        f"`test` is drawn by {rules.holdout} ({100 * rules.test_fraction:g} % of the samples inside the region), `unseen` lies "
+        f"outside of it, `buffer` within {rules.buffer_m:.2f} m of its edge, and is in no other split; `train` has "
+        f"{len(card.folds_of_train)} folds. "
+        "`dataset.json` has the audit of what overlaps."
+    )
+
+
+def _bibtex(card: DatasetCard) -> Iterator[str]:
+    def braced(text: str) -> str:
+        return "".join(c for c in plain_line(text) if c not in "{}\\`")
+
+    yield f"@misc{{tcpipe-{card.inputs[:12]},"
+    yield f"  title = {{{braced(card.name)}}},"
+    if card.creator:
+        yield f"  author = {{{braced(card.creator)}}},"
+    yield f"  note = {{{card.samples} samples, version {card.data_model_version}.0+{card.inputs[:12]}}},"
+    yield "}"

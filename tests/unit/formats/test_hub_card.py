@@ -1,0 +1,66 @@
+"""README.md of a dataset: what its YAML head promises is there, and no name in it is markup."""
+
+import json
+import re
+from dataclasses import replace
+
+import pyarrow.parquet as pq
+import pytest
+from synthetic_store import box, region_file, small_store
+
+from tcpipe.formats.dataset_files import read_card
+from tcpipe.formats.hub_card import hub_card
+from tcpipe.pipeline.dataset.build import build_dataset
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    here = tmp_path_factory.mktemp("hub")
+    small_store(here)
+    region = region_file(here / "region.geojson", box(-18, -18, 18, 0))
+    build_dataset(here / "dataset", store=here / "store", split=region, file_format="parquet")
+    return here / "dataset"
+
+
+def head_of(text):
+    """YAML's own subset that JSON is: a key a line."""
+    head = re.fullmatch(r"---\n(.*?)---\n.*", text, re.DOTALL)[1]
+    return {key: json.loads(value) for key, value in (line.split(": ", 1) for line in head.splitlines())}
+
+
+def test_each_config_has_the_files_rows_and_columns_that_the_head_says(built):
+    head = head_of((built / "README.md").read_text())
+    infos = {info["config_name"]: info for info in head["dataset_info"]}
+    assert set(infos) == {"patches", "samples"}
+    for config in head["configs"]:
+        info = infos[config["config_name"]]
+        counts = {split["name"]: split["num_examples"] for split in info["splits"]}
+        for files in config["data_files"]:
+            paths = files["path"] if isinstance(files["path"], list) else [files["path"]]
+            assert sum(pq.read_metadata(built / path).num_rows for path in paths) == counts[files["split"]]
+            schema = pq.read_schema(built / paths[0])
+            assert [column["name"] for column in info["features"]] == schema.names
+    assert head["size_categories"] == ["n<1K"]
+
+
+def test_names_are_text(built):
+    card, schema = read_card(built), pq.read_schema(built / "samples.parquet")
+    hostile = '<script>a</script>](x)\n---\n"b: [c]\x1b[31m'
+    card = replace(card, name=hostile, description=hostile, licence=hostile, creator=hostile + "}")
+    text = hub_card(card, schema, samples_file="samples.parquet", picture="overview.png")
+    head = head_of(text)
+    assert (head["pretty_name"], head["license"], head["license_name"]) == (hostile, "other", hostile)
+    body, citation = text.split("---\n", 2)[2].split("```bibtex")
+    assert citation.count("```") == 1
+    assert citation.count("{") == citation.count("}")
+    assert "<script>" not in body
+    assert "](x)" not in body.replace("\\](x)", "")
+    assert all(c.isprintable() or c == "\n" for c in body)
+
+
+def test_a_known_licence_is_told_by_the_name_the_hub_has_for_it(built):
+    card, schema = read_card(built), pq.read_schema(built / "samples.parquet")
+    for given, told in (("CC-BY-4.0", "cc-by-4.0"), ("", "unknown")):
+        text = hub_card(replace(card, licence=given), schema, samples_file="samples.parquet", picture="p")
+        assert head_of(text)["license"] == told
+        assert "license_name" not in head_of(text)

@@ -1,0 +1,154 @@
+"""A redacted dataset: the same metres and labels elsewhere, and nothing that names where and by whom."""
+
+import hashlib
+import json
+import re
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from pyproj import Transformer
+from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+
+from tcpipe.errors import DatasetError
+from tcpipe.formats.dataset_files import read_card, read_samples
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.dataset.redaction import _PLACES, PLANE, what_is_told
+from tcpipe.pipeline.verify import verify
+from tcpipe.store import open_store
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    here = tmp_path_factory.mktemp("redaction")
+    store = open_store(here / "store", create=True)
+    add_world(store, here / "rasters")
+    for run_id, first in (("north", 1.0), ("south", -15.5)):
+        start, end = lanes(first + 2.0 * np.arange(8), -14.0, 14.0)
+        sha256 = hashlib.sha256(run_id.encode()).hexdigest()
+        name = f"{run_id}-{sha256[:8]}"
+        told = (f"gnss: /{run_id}/fix: 3 of 9 messages are not used",)
+        add_run(
+            store, name, segments(name, start, end, start_ns=int(1e18 + first * 1e12)), sha256=sha256, warnings=told
+        )
+    how = {
+        "store": here / "store",
+        "split": region_file(here / "region.geojson", box(-18, -18, 18, 0)),
+        "file_format": "parquet",
+    }
+    told = build_dataset(here / "told", **how)
+    return here, told, build_dataset(here / "redacted", redact=True, **how)
+
+
+def places_m(directory, gnss_crs, plane):
+    samples = pq.read_table(directory / "samples.parquet")
+    to_plane = Transformer.from_crs(gnss_crs, plane, always_xy=True)
+    ends = [
+        np.stack(to_plane.transform(*(samples[f"{end}_{axis}_deg"].to_numpy() for axis in ("lon", "lat"))), -1)
+        for end in ("start", "end")
+    ]
+    return samples, np.concatenate(ends)
+
+
+def test_all_of_it_is_moved_by_one_offset_in_the_plane_of_the_map(built):
+    here, *_ = built
+    crs = read_card(here / "told").maps[0].crs
+    told, was_m = places_m(here / "told", "EPSG:4326", crs)
+    redacted, is_m = places_m(here / "redacted", "EPSG:4326", PLANE)
+    moved_m = was_m - is_m
+    assert np.hypot(*moved_m[0]) > 1e5
+    np.testing.assert_allclose(moved_m, np.broadcast_to(moved_m[0], moved_m.shape), atol=1e-6)
+    assert np.abs(is_m).max() < 100.0
+    start, end = np.split(is_m, 2)
+    np.testing.assert_allclose(redacted["course_rad"], np.arctan2(*(end - start).T[::-1]), atol=1e-9)
+    grid = read_card(here / "redacted").maps[0]
+    before = read_card(here / "told").maps[0]
+    np.testing.assert_allclose([before.x_min_m - grid.x_min_m, before.y_max_m - grid.y_max_m], moved_m[0], atol=1e-6)
+    lift_m = told["height_min_m"].to_numpy() - redacted["height_min_m"].to_numpy()
+    assert np.ptp(lift_m) < 1e-9
+    assert 0.0 <= redacted["height_min_m"].to_numpy().min() < 1.0
+
+
+def test_samples_patches_splits_and_labels_are_as_they_were(built):
+    here, *_ = built
+    for old, new in zip(
+        sorted((here / "told/data").iterdir()), sorted((here / "redacted/data").iterdir()), strict=True
+    ):
+        was, now = pq.read_table(old), pq.read_table(new)
+        changed = {"sample_id", "segment_id", "run_id", "map", "course_rad", "height_min_m", "geometry"}
+        same = [name for name in was.column_names if name not in changed and not name.endswith("_deg")]
+        assert {"ortho", "power_watt", "split", "start_ns", "slope_rad"} <= set(same)
+        assert now.select(same).equals(was.select(same))
+
+
+def test_nothing_names_logs_maps_places_or_paths(built):
+    here, *_ = built
+    crs = read_card(here / "told").maps[0].crs
+    secrets = ("north-", "/north", "south-", str(here), "/logs/", ".mcap", crs, "site", "15.43", "47.07")
+    for file in (
+        path
+        for path in (here / "redacted").rglob("*")
+        if path.is_file() and path.suffix in (".json", ".md", ".geojson")
+    ):
+        text = re.sub(r"[0-9a-f]{64}|composite|\\d+\\.\\d{4,}", "", file.read_text())
+        assert [secret for secret in secrets if secret in text] == [], file.name
+    page = (here / "redacted/report.html").read_text()
+    assert [
+        secret for secret in ("north-", "south-", "/north/", str(here), "/logs/", ".mcap", crs) if secret in page
+    ] == []
+    for file in (here / "redacted").rglob("*.parquet"):
+        columns = pq.read_table(file)
+        texts = {value for name in ("sample_id", "segment_id", "run_id", "map") for value in columns[name].to_pylist()}
+        assert not [text for text in texts if not re.fullmatch(r"run000\d-[0-9a-f]{8}(-\d+)?|map1", text)]
+    card = read_card(here / "redacted")
+    assert [run.run_id for run in card.runs] == [f"run000{n}-{run.sha256[:8]}" for n, run in enumerate(card.runs, 1)]
+
+
+def test_a_column_of_geometry_is_moved_too(built):
+    here, *_ = built
+    samples = pq.read_table(here / "redacted/samples.parquet")
+    if "geometry" in samples.column_names:
+        points = np.array([struct.unpack("<BI2d", value)[2:] for value in samples["geometry"].to_pylist()])
+        assert np.abs(points).max() < 0.01
+        geo = json.loads(samples.schema.metadata[b"geo"])
+        assert np.abs(geo["columns"]["geometry"]["bbox"]).max() < 0.01
+
+
+def test_verify_says_that_it_is_redacted_and_finds_what_is_told_all_the_same(built):
+    here, *_ = built
+    found = verify(here / "redacted")
+    assert found.problems == ()
+    assert found.notes[0] == "It is redacted."
+    assert verify(here / "told").notes == ()
+    card, samples = read_card(here / "redacted"), read_samples(here / "redacted")
+    assert list(what_is_told(card, samples)) == []
+    assert len(list(what_is_told(card, read_samples(here / "told")))) == 4
+    assert list(what_is_told(replace(card, warnings=("see /data/anna/x.bag",)), samples)) == [
+        "it is said to be redacted, but tells '/data/anna/x.bag'"
+    ]
+    assert list(what_is_told(replace(card, maps=read_card(here / "told").maps), samples))
+
+
+def test_the_line_that_publishes_it_is_printed_and_a_second_build_has_nothing_to_do(built):
+    here, told, redacted = built
+    assert f"to publish it: hf upload OWNER/NAME {here}/redacted . --repo-type dataset" in str(redacted)
+    assert "hf upload" not in str(told)
+    how = {"store": here / "store", "split": here / "region.geojson", "file_format": "parquet"}
+    assert build_dataset(here / "redacted", redact=True, **how).status == "unchanged"
+    with pytest.raises(DatasetError, match="is redacted, its samples have other names"):
+        build_dataset(here / "other", keep_split=here / "redacted", **how)
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("gnss: /a200_0000/sensors/gps_0/fix: 53 of 2266 messages", "gnss: …: 53 of 2266 messages"),
+        ("left in ~/logs/x.bag by anna@robot-7", "left in … by …"),
+        (r"C:\logs\anna\x.bag, s3://bucket/key", "…, …"),
+        ("3 W/m and 0.5/s", "3 W/m and 0.5/s"),
+    ],
+)
+def test_paths_topics_hosts_and_users_are_found_in_a_line(line, said):
+    assert _PLACES.sub("…", line) == said
