@@ -41,7 +41,7 @@ _PAGE = "report.html"
 def dataset_report(directory: Path, beside: Path | None = None) -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
 
-    ``beside`` is the directory in which the dataset lies, or will lie: the page leads to runs of stores that lie there too.
+    ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
     card, samples = read_current_card(directory), read_samples(directory, COLUMNS)
@@ -258,7 +258,12 @@ def _table_sections(card: DatasetCard, hrefs: Mapping[str, str]) -> list[Section
         )
         for run in card.runs
     ]
-    text = "Each leads to the run's own page, once 'tcpipe report STORE' has written it." if hrefs else ""
+    led = "Each leads to the run's own page, once 'tcpipe report STORE' has written it."
+    text = (
+        led
+        if hrefs
+        else "'tcpipe report DATASET' makes them lead to the runs' pages, where the store lies beside the dataset."
+    )
     header = ("run", "robot", "log", "samples", "noise floor of E")
     sections.append(Section("Runs", text, header=header, rows=runs, figures_from=3))
     return sections

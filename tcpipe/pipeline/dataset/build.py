@@ -251,7 +251,6 @@ def build_dataset(
                 earlier,
                 file_format=file_format,
                 workers=workers,
-                beside=place.absolute().parent if isinstance(place, Path) and not redact else None,
                 redact=redact,
             )
         for entry in workers.waiting.entries():
@@ -399,7 +398,6 @@ def _build(
     *,
     file_format: FileFormat,
     workers: Workers,
-    beside: Path | None,
     redact: bool,
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
@@ -447,7 +445,7 @@ def _build(
     write_text(directory / CROISSANT, _croissant(files, recipe, inputs.digest, patches, samples=schema))
     card = replace(card, checksums={**files, CROISSANT: file_checksum(directory / CROISSANT)})
     write_sealed(directory / CARD, card)
-    write_text(directory / REPORT, sealed_page(dataset_report(directory, beside)))
+    write_text(directory / REPORT, sealed_page(dataset_report(directory)))
     return card
 
 

@@ -37,6 +37,9 @@ def built(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def page(built):
+    as_built = (built / "report.html").read_text()
+    assert "../store" not in as_built  # the same bytes wherever the store is
+    assert report(built)[0].changed
     return (built / "report.html").read_text()
 
 
