@@ -27,6 +27,7 @@ from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
 from tcpipe.store import Store, run_at
 from tcpipe.tables.arrays import numbers, text_column, texts
 from tcpipe.tables.bits import DropReason, Quality, name_of
+from tcpipe.tables.segment_columns import GEOMETRY
 
 GEOJSON = "foxglove_msgs/msg/GeoJSON"
 _FRAME = "tcpipe_enu"
@@ -113,7 +114,7 @@ def _refuse_others(out: Path) -> None:
 def _streams(store: Store, run: RunDirectory) -> Iterator[MessageStream]:
     """Yield every topic's messages."""
     clock = _recorder_clock(store, run)
-    track, segments, refused = run.track(), run.segments(), run.rejections()
+    track, segments, refused = run.track(), run.segments().drop_columns([GEOMETRY]), run.rejections()
     rows = _named(track.table, "dropped_by", DropReason, "reasons", "kept")
     cut = _named(segments, "quality", Quality, "quality_names", "clean")
     times = clock(_column(rows, "stamp_ns"), _column(rows, "epoch"))

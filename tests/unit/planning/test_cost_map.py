@@ -200,6 +200,7 @@ def sent(monkeypatch):
 
 def test_a_cluster_makes_the_same_bytes(made, sent, tmp_path):
     source, whole = made
+    source = replace(source, reads=Counter())
     result = make_cost_map(
         MODEL, source, tmp_path / "costs", step_m=1.0, cluster=Cluster("tcp://nowhere:1", partial(_sloping, 0.2))
     )
@@ -211,7 +212,13 @@ def test_a_cluster_makes_the_same_bytes(made, sent, tmp_path):
 def test_a_worker_that_finds_another_model_is_refused(made, sent, tmp_path):
     other = replace(MODEL, checksum="1" * 64)
     with pytest.raises(UsageError, match=r"^[^:]+: a worker finds another map .* or model .* than the caller"):
-        make_cost_map(other, made[0], tmp_path / "costs", step_m=1.0, cluster=Cluster("tcp://nowhere:1", _sloping))
+        make_cost_map(
+            other,
+            replace(made[0], reads=Counter()),
+            tmp_path / "costs",
+            step_m=1.0,
+            cluster=Cluster("tcp://nowhere:1", _sloping),
+        )
     assert len(sent) == 1
 
 
@@ -281,6 +288,7 @@ def test_the_nav2_frame_begins_at_the_robots_datum_and_nothing_is_predicted_anew
 
 def test_a_cost_map_goes_to_a_bucket_whole_and_is_not_replaced(made, tmp_path, monkeypatch):
     source, result = made
+    source = replace(source, reads=Counter())
     (tmp_path / "served" / "maps").mkdir(parents=True)
     with object_store(tmp_path / "served") as (environment, _):
         in_environment(monkeypatch, environment, tmp_path / "cache")
