@@ -130,9 +130,9 @@ def add_map(
                 )
                 write_quick_look(path.with_suffix(".png"), quick_look(open_map(path)), seal_of(path))
         except StoreError:
-            if force or opened.map_number(name) == before:
+            if before or opened.map_number(name) == before:
                 raise
-            return _unchanged(opened, name, inputs)  # another process was faster
+            return _unchanged(opened, name, inputs)  # another process was faster, or its own answer was lost
         return _added(opened, name, "done")
 
 
