@@ -79,7 +79,7 @@ test-dagster: .venv-dagster/installed
 # Pages opened, clicked and read in Debian's Chromium; playwright wants an environment of its own.
 .venv-pages/installed: pyproject.toml
 	$(PYTHON) -m venv .venv-pages
-	.venv-pages/bin/python -m pip --disable-pip-version-check install --quiet --no-compile playwright axe-core-python pytest pytest-randomly --editable .
+	.venv-pages/bin/python -m pip --disable-pip-version-check install --quiet --no-compile playwright axe-core-python hypothesis pytest pytest-randomly --editable .
 	@touch $@
 
 test-pages: .venv-pages/installed
