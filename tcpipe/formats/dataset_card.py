@@ -163,6 +163,12 @@ class MapSource:
     warnings: tuple[str, ...] = ()
     registration: tuple[MapRegistration, ...] = ()
 
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """Least x and y, greatest x and y in its plane [m]."""
+        width_m, height_m = self.cols * self.pitch_m, self.rows * self.pitch_m
+        return self.x_min_m, self.y_max_m - height_m, self.x_min_m + width_m, self.y_max_m
+
 
 @dataclass(frozen=True, slots=True)
 class Removal:

@@ -106,7 +106,8 @@ def run_evaluation(
 
 def _in_bucket(url: str) -> Evaluation | None:
     """Return the evaluation at a URL; None where there is none."""
-    data, where = open_place(url).read(JSON), Path(url, JSON)
+    place = open_place(url)
+    data, where = place.read(JSON), place.where(JSON)
     return None if data is None else typed(parse_json(data, where), Evaluation, where)
 
 

@@ -15,7 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.dataset_card import DatasetCard, MapSource
-from tcpipe.formats.dataset_files import DRIVE_NEXT, read_current_card, read_samples
+from tcpipe.formats.dataset_files import CARD, DRIVE_NEXT, read_current_card, read_samples
 from tcpipe.formats.geojson import read_polygons
 from tcpipe.formats.geopackage import VectorLayer, write_geopackage
 from tcpipe.formats.object_storage import is_url
@@ -23,7 +23,8 @@ from tcpipe.formats.published import here
 from tcpipe.formats.qgis_styles import VIRIDIS, classes_style, ranges_style
 from tcpipe.store import Store, inside_store, is_store, run_at
 from tcpipe.tables.arrays import texts
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import floats, lonlat_deg
+from tcpipe.tables.wkb import line_column
 from tcpipe.terrain.patches import footprints, patch_frames
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 
@@ -63,7 +64,7 @@ def export_layers(source: Path | str, out: Path) -> ExportedLayers:
         layers = [_segments(source)]
     else:
         directory = here(source) if is_url(source) else Path(source)
-        if not (directory / "dataset.json").is_file():
+        if not (directory / CARD).is_file():
             raise UsageError(f"{source}: is no dataset, run or store; a GeoPackage is made of one of these")
         layers = list(_of_dataset(directory))
     write_geopackage(out, layers)
@@ -116,10 +117,8 @@ def _of_dataset(directory: Path) -> Iterator[VectorLayer]:
 
 
 def _lines(table: pa.Table) -> list[bytes]:
-    ends = np.stack(
-        [floats(table, f"{end}_{axis}_deg") for end in ("start", "end") for axis in ("lon", "lat")], axis=-1
-    )
-    return list(shapely.to_wkb(shapely.linestrings(ends.reshape(-1, 2, 2))))
+    found: list[bytes] = line_column(*(lonlat_deg(table, end) for end in ("start", "end"))).to_pylist()
+    return found
 
 
 def _multi(shapes: Sequence[BaseGeometry]) -> list[bytes]:
@@ -148,18 +147,9 @@ def _footprints(card: DatasetCard, table: pa.Table) -> Floats:
 
 
 def _on_map(table: pa.Table, source: MapSource, card: DatasetCard) -> Floats:
-    bounds = (
-        source.x_min_m,
-        source.y_max_m - source.rows * source.pitch_m,
-        source.x_min_m + source.cols * source.pitch_m,
-        source.y_max_m,
-    )
     crs = parse_crs(source.crs, where=f"map {source.name}")
-    area = area_of(crs, bounds)
+    area = area_of(crs, source.bounds_m)
     place = Projection(parse_crs(card.recipe.read.gnss_crs, where="gnss_crs"), crs, area)
-    start, end = (
-        place.forward(np.stack([floats(table, f"{name}_{axis}_deg") for axis in ("lon", "lat")], axis=1))
-        for name in ("start", "end")
-    )
+    start, end = (place.forward(lonlat_deg(table, name)) for name in ("start", "end"))
     corners = footprints(patch_frames(start, end, floats(table, "chord_m")), card.patch_m)
     return Projection(CRS.from_epsg(4326), crs, area).inverse(corners)

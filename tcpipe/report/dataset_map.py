@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pyproj import Transformer
 
 from tcpipe.errors import TcpipeError
-from tcpipe.formats.dataset_card import DatasetCard, MapSource
+from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import CLASSES, DRIVE_NEXT, OVERVIEW, RELIEF
 from tcpipe.formats.geojson import PolygonGeometry, read_polygons
 from tcpipe.report.dataset_samples import SamplesShown
@@ -25,7 +25,7 @@ _MOST_PLACES = 200
 
 def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[list[Plot], list[str]]:
     """Return the map and the plot to brush on, and what of the map is lost, in words."""
-    bounds = joint_bounds_m([(grid.crs, _bounds_m(grid)) for grid in card.maps])
+    bounds = joint_bounds_m([(grid.crs, grid.bounds_m) for grid in card.maps])
     tools = "pan,wheel_zoom,box_select,lasso_select,tap,reset,save"
     height_px = int(np.clip(110 + 500 * (bounds[3] - bounds[1]) / max(bounds[2] - bounds[0], 1e-9), 330, 600))
     plot = new_plot(
@@ -152,11 +152,6 @@ def _draw_places(plot: Plot, directory: Path, card: DatasetCard) -> list[str]:
         visible=False,
     )
     return list(problems)
-
-
-def _bounds_m(grid: MapSource) -> Bounds:
-    width_m, height_m = grid.cols * grid.pitch_m, grid.rows * grid.pitch_m
-    return grid.x_min_m, grid.y_max_m - height_m, grid.x_min_m + width_m, grid.y_max_m
 
 
 def _rings(region: Mapping[str, PolygonGeometry] | None, to_map: Transformer) -> list[NDArray[np.float64]]:

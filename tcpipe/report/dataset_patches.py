@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.dataset_files import PatchFiles, open_patches, rows_in_files
 from tcpipe.formats.json_files import Json
-from tcpipe.report.dataset_samples import floats
 from tcpipe.report.pictures import ACROSS, class_picture, picture_uri, relief_picture, sheet
+from tcpipe.tables.columns import floats
 
 MOST_PATCHES = 500
 _PX = 48

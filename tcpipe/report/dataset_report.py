@@ -23,8 +23,6 @@ from tcpipe.report.dataset_samples import (
     QUALITY_WORDS,
     SamplesShown,
     first_starts_ns,
-    floats,
-    nearest_train_m,
     samples_shown,
 )
 from tcpipe.report.dataset_verdict import verdict
@@ -34,6 +32,7 @@ from tcpipe.report.physics import physics_sections
 from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
 from tcpipe.report.quality import quality_sections
 from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.columns import floats
 
 _PAGE = "report.html"
 
@@ -161,8 +160,7 @@ def _apart(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
     split = samples.column("split").to_numpy(zero_copy_only=False).astype(np.str_)
     if shown.cell_m is not None:
         return
-    apart_m, _ = nearest_train_m(shown.xy_m, split)
-    there = [name for name in ("test", "unseen") if np.isfinite(apart_m[split == name]).any()]
+    there = [name for name in ("test", "unseen") if np.isfinite(shown.apart_m[split == name]).any()]
     if not there:
         return
     plot = new_plot(
@@ -174,7 +172,7 @@ def _apart(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
         tools="save",
     )
     for name in there:
-        sorted_m = np.sort(apart_m[split == name])
+        sorted_m = np.sort(shown.apart_m[split == name])
         kept = np.unique(np.linspace(0, len(sorted_m) - 1, 400).astype(int))
         plot.figure.step(
             sorted_m[kept], (kept + 1) / len(sorted_m), mode="after", color=SPLIT_COLOURS[name], line_width=2

@@ -17,6 +17,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.bits import Quality
+from tcpipe.tables.columns import floats, lonlat_deg
 
 MOST_SAMPLES = 100_000
 """Samples that can each be clicked; more are means over cells."""
@@ -62,26 +63,22 @@ Ints = NDArray[np.int64]
 class SamplesShown:
     """What the page holds: a row a sample, or one a cell.
 
-    ``xy_m`` are middles in the first map's plane, (N, 2); ``row_of`` is where each sample of the table went, (T,).
+    ``xy_m`` are middles in the first map's plane, (N, 2); ``row_of`` is where each sample of the table went, ``apart_m`` how far its
+    nearest train sample lies, NaN of those that are not held out, (T,) each.
     """
 
     xy_m: Floats
     row_of: Ints
+    apart_m: Floats
     cell_m: float | None
     json: Json
-
-
-def floats(table: pa.Table, name: str) -> Floats:
-    """Return a column as floats; null is NaN."""
-    values: Floats = table.column(name).to_numpy(zero_copy_only=False).astype(float)
-    return values
 
 
 def middles_m(card: DatasetCard, table: pa.Table) -> Floats:
     """Return the middle of every sample's chord in the first map's plane [m], shape (N, 2)."""
     to_map = Transformer.from_crs(card.recipe.read.gnss_crs, card.maps[0].crs, always_xy=True)
-    lon, lat = (0.5 * (floats(table, f"start_{a}_deg") + floats(table, f"end_{a}_deg")) for a in ("lon", "lat"))
-    return np.column_stack(to_map.transform(lon, lat)).reshape(-1, 2)
+    middle_deg = 0.5 * (lonlat_deg(table, "start") + lonlat_deg(table, "end"))
+    return np.column_stack(to_map.transform(*middle_deg.T)).reshape(-1, 2)
 
 
 def nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints]:
@@ -116,7 +113,7 @@ def samples_shown(card: DatasetCard, table: pa.Table) -> SamplesShown:
         near = apart_m < np.sqrt(2.0) * card.patch_m
         columns["nearest"] = ("u32", np.where(near, nearest, np.arange(len(near))))
     told: dict[str, Json] = {"packed": packed(columns), "cell_m": cell_m, "ids": _ids_if_odd(table)}
-    return SamplesShown(xy_m, row_of, cell_m, told)
+    return SamplesShown(xy_m, row_of, apart_m, cell_m, told)
 
 
 def _values(card: DatasetCard, table: pa.Table, apart_m: Floats) -> dict[str, Floats]:

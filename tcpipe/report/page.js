@@ -21,6 +21,5 @@ const page = (() => {
     ready,
     plots,
     model: (name) => Bokeh.documents[0].get_model_by_name(name),
-    ink: () => getComputedStyle(document.documentElement).getPropertyValue("--ink").trim(),
   };
 })();

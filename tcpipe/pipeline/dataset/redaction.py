@@ -20,7 +20,7 @@ from tcpipe.formats.geojson import FeatureCollection, PolygonGeometry
 from tcpipe.pipeline.dataset.content import Content
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import floats, lonlat_deg
 
 PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs"
 """Where a redacted dataset lies: the plane of its maps, laid down at 0° N 0° E with its grid north up."""
@@ -64,10 +64,7 @@ class Redaction:
 
     def table(self, samples: pa.Table) -> pa.Table:
         """Return samples with the places and names that are told; their courses are from the east of the maps' grid."""
-        ends = {
-            end: self.in_plane(np.stack([floats(samples, f"{end}_{axis}_deg") for axis in _AXES], axis=-1))
-            for end in _ENDS
-        }
+        ends = {end: self.in_plane(lonlat_deg(samples, end)) for end in _ENDS}
         columns: dict[str, Any] = {
             f"{end}_{axis}_deg": _laid_down(xy_m)[:, at] for end, xy_m in ends.items() for at, axis in enumerate(_AXES)
         }
