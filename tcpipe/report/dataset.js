@@ -2,29 +2,12 @@
 // The dataset's page: samples on the map and in the plot, one of them in words with its patch, and the gallery.
 page.ready.then(async () => {
   const told = page.data;
-  const at = (id) => document.getElementById(id);
-  const make = (tag, text = "", more = {}) => Object.assign(document.createElement(tag), { textContent: text }, more);
-
-  async function unpack({ columns, data }) {
-    const raw = Uint8Array.from(atob(data), (c) => c.charCodeAt(0));
-    const buffer = await new Response(new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
-    const whole = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array };
-    return Object.fromEntries(columns.map(({ name, kind, at: first, bytes, low, step }) => {
-      const part = buffer.slice(first, first + bytes);
-      if (kind in whole) return [name, new whole[kind](part)];
-      const halves = new Uint16Array(part);
-      if (kind === "steps") return [name, Float64Array.from(halves, (n) => (n === 65535 ? NaN : low + step * n))];
-      const count = kind === "half" ? halves.length : halves.length / 2;
-      const bits = new Uint32Array(count);
-      for (let i = 0; i < count; i++) bits[i] = ((halves[i] << 16) | (kind === "half" ? 0 : halves[count + i])) >>> 0;
-      return [name, new Float32Array(bits.buffer)];
-    }));
-  }
+  const { at, make, fillSelect, pairs } = page;
 
   const below = [at("chosen"), at("stepping")];
   at("chosen").closest("section").append(...below);
 
-  const c = await unpack(told.samples.packed);
+  const c = await page.unpack(told.samples.packed);
   const n = c.x.length;
   const source = page.model("samples").data_source;
   const kinds = {
@@ -85,9 +68,6 @@ page.ready.then(async () => {
     return fill;
   }
 
-  function fillSelect(select, names, text = (name) => name) {
-    select.append(...names.map((name) => make("option", text(name), { value: name })));
-  }
   const there = (names) => names.filter((name) => name in c && (name !== "apart" || c.apart.some(Number.isFinite)));
   fillSelect(at("colour"), there(Object.keys(kinds)), (name) => kinds[name][0]);
   fillSelect(at("across"), there(["slope", "velocity", "turn", "residual"]), (name) => kinds[name][0]);
@@ -120,24 +100,8 @@ page.ready.then(async () => {
   // One sample in words.
   const sheets = told.patches;
   const cell = new Map((sheets?.rows ?? []).map((row, i) => [row, i]));
-  function patch(layer, i, side) {
-    const shown = make("span", "", { className: "patch", role: "img", ariaLabel: `${layer.name} patch` });
-    const scale = side / sheets.px;
-    shown.style.cssText = `width:${side}px;height:${side}px;background-image:url(${layer.uri});background-size:${sheets.across * side}px auto;`
-      + `background-position:${-(i % sheets.across) * sheets.px * scale}px ${-Math.floor(i / sheets.across) * sheets.px * scale}px`;
-    return shown;
-  }
   const start = (i) => BigInt(told.runs[c.run[i]].first_ns) + BigInt(c.after_s[i]) * 1000000000n + BigInt(c.after_ns[i]);
   const idOf = (i) => told.samples.ids ? told.samples.ids[i] : `${told.runs[c.run[i]].id}-${start(i)}`;
-  function pairs(rows) {
-    const list = make("dl");
-    for (const [name, value] of rows) {
-      const shown = make("dd");
-      shown.append(value);
-      list.append(make("dt", name), shown);
-    }
-    return list;
-  }
   function inWords(i) {
     const flags = told.quality.filter(([bit]) => c.quality[i] & bit).map(([, words]) => words);
     const rows = ["power", "velocity", "duration", "energy"].map((name) => {
@@ -179,7 +143,7 @@ page.ready.then(async () => {
       const room = make("div", "", { className: "patches" });
       for (const layer of sheets.layers) {
         const figure = make("figure");
-        figure.append(patch(layer, cell.get(i), 96), make("figcaption", layer.name));
+        figure.append(page.patch(sheets, layer, cell.get(i), 96), make("figcaption", layer.name));
         room.append(figure);
       }
       right.append(room, make("p", "Travel is to the right; height is over the patch's own range.", { className: "note" }));
@@ -213,7 +177,7 @@ page.ready.then(async () => {
       const rows = sheets.rows.filter((i) => (!kind || named(c.class[i]) === kind) && (!split || told.splits[c.split[i]].name === split));
       gallery.replaceChildren(...rows.slice(0, most).map((i) => {
         const button = make("button", "", { type: "button" });
-        button.append(patch(layer, cell.get(i), 92), `${named(c.class[i])} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${told.splits[c.split[i]].name}`);
+        button.append(page.patch(sheets, layer, cell.get(i), 92), `${named(c.class[i])} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${told.splits[c.split[i]].name}`);
         button.onclick = () => { choose([i]); at("chosen").scrollIntoView({ block: "nearest" }); };
         return button;
       }));

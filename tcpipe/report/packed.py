@@ -9,7 +9,7 @@ kind       what a reader gets
 ``steps``  ``low + step * number`` over the column's range in 65 534 steps, for coordinates and labels
 =========  ======================================================================================
 
-NaN stays NaN; among ``steps`` it is 65 535. ``dataset.js`` reads it.
+NaN stays NaN; among ``steps`` it is 65 535. ``page.js`` reads it.
 """
 
 from __future__ import annotations

@@ -16,7 +16,48 @@ const page = (() => {
   const repaint = () => plots.forEach((plot) => plot.request_paint());
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
   matchMedia("print").addEventListener("change", repaint);
+
+  // What the pages' own scripts share.
+  const at = (id) => document.getElementById(id);
+  const make = (tag, text = "", more = {}) => Object.assign(document.createElement(tag), { textContent: text }, more);
+  function fillSelect(select, names, text = (name) => name) {
+    select.append(...names.map((name) => make("option", text(name), { value: name })));
+  }
+  function pairs(rows) {
+    const list = make("dl");
+    for (const [name, value] of rows) {
+      const shown = make("dd");
+      shown.append(value);
+      list.append(make("dt", name), shown);
+    }
+    return list;
+  }
+  // Patch number i of sheets as a square, by one of their layers.
+  function patch(sheets, layer, i, side) {
+    const shown = make("span", "", { className: "patch", role: "img", ariaLabel: `${layer.name} patch` });
+    const scale = side / sheets.px;
+    shown.style.cssText = `width:${side}px;height:${side}px;background-image:url(${layer.uri});background-size:${sheets.across * side}px auto;`
+      + `background-position:${-(i % sheets.across) * sheets.px * scale}px ${-Math.floor(i / sheets.across) * sheets.px * scale}px`;
+    return shown;
+  }
+  // Columns as `tcpipe.report.packed` wrote them.
+  async function unpack({ columns, data }) {
+    const raw = Uint8Array.from(atob(data), (c) => c.charCodeAt(0));
+    const buffer = await new Response(new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+    const whole = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array };
+    return Object.fromEntries(columns.map(({ name, kind, at: first, bytes, low, step }) => {
+      const part = buffer.slice(first, first + bytes);
+      if (kind in whole) return [name, new whole[kind](part)];
+      const halves = new Uint16Array(part);
+      if (kind === "steps") return [name, Float64Array.from(halves, (n) => (n === 65535 ? NaN : low + step * n))];
+      const count = kind === "half" ? halves.length : halves.length / 2;
+      const bits = new Uint32Array(count);
+      for (let i = 0; i < count; i++) bits[i] = ((halves[i] << 16) | (kind === "half" ? 0 : halves[count + i])) >>> 0;
+      return [name, new Float32Array(bits.buffer)];
+    }));
+  }
   return {
+    at, make, fillSelect, pairs, patch, unpack,
     data: read("page-data"),
     ready,
     plots,
