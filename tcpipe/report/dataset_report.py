@@ -20,7 +20,6 @@ from tcpipe.report.dataset_patches import patches_shown
 from tcpipe.report.dataset_samples import (
     COLUMNS,
     MOST_SAMPLES,
-    QUALITY_WORDS,
     SamplesShown,
     first_starts_ns,
     samples_shown,
@@ -30,7 +29,7 @@ from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
 from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
-from tcpipe.report.quality import quality_sections
+from tcpipe.report.quality import QUALITY_WORDS, quality_sections
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats
 

@@ -16,7 +16,6 @@ from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import Json
 from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats, lonlat_deg
 
 MOST_SAMPLES = 100_000
@@ -39,21 +38,6 @@ COLUMNS = (
     *_STD.values(),
 )
 """Of samples.parquet that the page needs."""
-
-QUALITY_WORDS = {
-    Quality.LOW_POWER_RATE: "power was sampled too slowly",
-    Quality.NEAR_GAP: "a gap in the data is less than a chord away",
-    Quality.HIGH_SLIP: "wheels and ground differ by more than 20 %",
-    Quality.WEAK_GNSS: "position is uncertain",
-    Quality.CURVED: "the path bends",
-    Quality.MEAN_POWER_DIFFERS: "mean power and energy over time differ by more than 5 %",
-    Quality.NO_COMMAND: "no command topic: full speed is not proved",
-    Quality.VOLTAGE_OUT_OF_RANGE: "voltage leaves the robot's range",
-    Quality.CLOCK_DOUBTFUL: "a clock is doubtful",
-    Quality.PHYSICS_OUTLIER: "power is far from what physics predicts",
-    Quality.NOT_AT_LIMIT: "commanded below full speed",
-    Quality.SENSORS_DISAGREE: "sensors disagree",
-}
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

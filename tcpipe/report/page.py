@@ -87,6 +87,8 @@ class Section:
     """File beside this one with the HTML that stands above the figures."""
     folded: bool = False
     """Whether the table waits behind a line to click."""
+    stacked: bool = False
+    """Whether the figures stand one below the other on wide pages too, as those of one axis do."""
 
 
 def render_page(

@@ -18,7 +18,8 @@ from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.report import report
 from tcpipe.report import dataset_samples
 from tcpipe.report.dataset_report import dataset_report
-from tcpipe.report.dataset_samples import COLUMNS, QUALITY_WORDS, nearest_train_m, samples_shown
+from tcpipe.report.dataset_samples import COLUMNS, nearest_train_m, samples_shown
+from tcpipe.report.quality import QUALITY_WORDS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
 
