@@ -18,14 +18,15 @@ def made(
     classes=("grass", "paved"),
     speeds=(0.6, 1.0),
     drivetrain_newton=0.0,
+    steeper=0.0,
 ):
     """Power of metres driven over slopes and round bends, computed from force times speed and torque times rate."""
     rng = np.random.default_rng(seed)
     terrain = np.array(classes)[np.arange(count) // 25 % len(classes)]
-    angle, speed = np.arctan(rng.uniform(-steepest, steepest, count)), rng.uniform(*speeds, count)
+    angle, speed = np.arctan(rng.uniform(-steepest, steepest, count) + steeper), rng.uniform(*speeds, count)
     rate = np.abs(rng.normal(0.0, 0.2, count))
     rolling, turning = (np.array([of[name] for name in terrain]) for of in (RESISTANCE, TURNING))
     work = NEWTON * (rolling * np.cos(angle) + np.sin(angle)) * speed / np.cos(angle) + turning * rate
-    always = STANDING_WATT + drivetrain_newton * speed
+    always = STANDING_WATT + drivetrain_newton * speed / np.cos(angle)
     power = always + np.where(work > 0, work, RECOVERED * work) + noise_watt * rng.standard_normal(count)
     return Metres(power, speed, np.tan(angle), rate, terrain)

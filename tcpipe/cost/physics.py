@@ -7,13 +7,14 @@ On a slope that rises by tan(s) a robot of weight m g at horizontal speed v does
 a second, and a skid-steered one drags its wheels sideways with a torque that hardly depends on how fast it turns. The drive needs
 1 / efficiency of both, and gives back a share of what is negative (the slope drives the wheels)::
 
-    P = P0 + D v + g(F v + N v tan(s) + M |yaw rate|),   g(x) = x for x > 0, k x for x < 0
+    P = P0 + D v / cos(s) + g(F v + N v tan(s) + M |yaw rate|),   g(x) = x for x > 0, k x for x < 0
 
-P0 is what is drawn while the robot stands, D [N] what motors and gears take as soon as they turn, on any grade, N = m g / efficiency [N],
-F = N c [N] and M [W per rad/s] are of a terrain class, or of all ground where classes are not known. All are sizes, none negative. D is
-told from F by where the slope begins to drive the robot, and is a term only where that is seen; else F holds it. They are fitted to the
-force P / v with Huber's weights (Huber 1964; k = 1.345), so that a minority of odd metres bends nothing. Their deviations count that
-neighbours err alike (White's sandwich over blocks of consecutive segments; Cameron and Miller, J. Human Resources 50, 2015).
+P0 is what is drawn while the robot stands, D [N] what motors and gears take as soon as they turn, on any grade and by the way along the
+surface (of rolling the cosine cancels), N = m g / efficiency [N], F = N c [N] and M [W per rad/s] are of a terrain class, or of all ground
+where classes are not known. All are sizes, none negative. D is told from F by where the slope begins to drive the robot, and is a term only
+where that is seen; else F holds it. They are fitted to the force P / v with Huber's weights (Huber 1964; k = 1.345), so that a minority of
+odd metres bends nothing. Their deviations count that neighbours err alike (White's sandwich over blocks of consecutive segments; Cameron
+and Miller, J. Human Resources 50, 2015).
 """
 
 from __future__ import annotations
@@ -34,9 +35,10 @@ _LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling ca
 _SURE = 0.005  # standard deviation of what halts tell of standing, of itself: looser, it takes over what rolling does
 _SUREST_WATT = 0.1  # and no less than this
 _FEWEST_DOWNHILL = 10  # segments that drive the robot: fewer tell no recovery
-_MOST_RECOVERED = (
-    0.9  # where nearly all comes back, power is as straight downhill as uphill, and no bend tells the drivetrain
-)
+# Where nearly all comes back, power is as straight downhill as uphill, and no bend tells the drivetrain.
+_MOST_RECOVERED = 0.9
+# Metres whose rise is nearer to the bend count less: slope varies within a metre, and there the mean of a bent line lies above it.
+_BEND = 0.1
 _STEPS = 100  # of reweighting at most
 _HUBER = 1.345  # 95 % efficient for normal errors (Huber, Robust Statistics, 1981)
 _NORMAL = 1.4826  # standard deviation over median absolute deviation of a normal variate
@@ -197,7 +199,7 @@ def _design(metres: Metres, terms: Sequence[tuple[str, str]]) -> Floats:
     """Return what each coefficient is multiplied with, shape (M, J)."""
     of = {
         "standing": np.ones_like(metres.velocity_mps),
-        "drivetrain": metres.velocity_mps,
+        "drivetrain": metres.velocity_mps * np.sqrt(1.0 + metres.rise**2),  # wheels run along the surface
         "rolling": metres.velocity_mps,
         "grade": metres.velocity_mps * metres.rise,
         "turning": metres.turn_rate_radps,
@@ -224,14 +226,17 @@ def _fitted(metres: Metres, terms: Sequence[tuple[str, str]], standing_watt: flo
         prior[terms.index(("standing", ALL))] = 1.0 / max(_SURE * standing_watt, _SUREST_WATT)
     made, off, weight, scale = design, force, np.ones_like(force), 1.0
     for _ in range(_STEPS):
-        traction = np.minimum(design[:, ~always] @ value[~always], 0.0)
+        wanted = design[:, ~always] @ value[~always]
+        traction, clear = np.minimum(wanted, 0.0), np.ones_like(force)
         driven = traction == 0.0
         if (~driven).sum() < _FEWEST_DOWNHILL:
             traction, recovered = np.zeros_like(force), 0.0
+        elif ("grade", ALL) in terms:
+            clear = np.minimum(1.0, np.abs(wanted) / max(_BEND * value[terms.index(("grade", ALL))], 1e-9)) ** 2
         made = np.column_stack([np.where(always | driven[:, None], design, recovered * design), traction])
         off = force - made[:, :count] @ value
         scale = max(_NORMAL * float(np.median(np.abs(off))), 1e-9)
-        weight = np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(off), 1e-12))
+        weight = clear * np.minimum(1.0, _HUBER * scale / np.maximum(np.abs(off), 1e-12))
         by = made * np.sqrt(weight)[:, None] / scale
         seen = (force + recovered * traction) * np.sqrt(weight) / scale
         if prior is not None and standing_watt is not None:

@@ -24,7 +24,7 @@ _CLASSES = 256
 
 @dataclass(frozen=True, slots=True)
 class PhysicsModel:
-    """P = P0 + D v + g(F v + N v tan(s) + M v |turn|), and v as a curve over the slope s."""
+    """P = P0 + D v / cos(s) + g(F v + N v tan(s) + M v |turn|), and v as a curve over the slope s."""
 
     speed: Curves
     """One output [m/s], straight in each third of the slopes."""
@@ -49,7 +49,7 @@ class PhysicsModel:
         turn = np.where(np.isfinite(beside.turn_radpm), beside.turn_radpm, self.usual_turn_radpm)
         force = self.rolling_newton[beside.class_id] + self.grade_newton * np.tan(beside.slope_rad)
         work = velocity * (force + self.turning_joule_per_rad[beside.class_id] * turn)
-        always = self.no_load_watt + self.drivetrain_newton * velocity
+        always = self.no_load_watt + self.drivetrain_newton * velocity / np.cos(beside.slope_rad)
         return np.column_stack([always + np.where(work > 0.0, 1.0, self.recovered) * work, velocity])
 
     def arrays(self) -> dict[str, NDArray[np.generic]]:

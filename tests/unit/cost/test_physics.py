@@ -42,9 +42,19 @@ def test_what_motors_take_on_any_grade_is_no_rolling(speeds, standing_watt):
     found = fit_physics(metres, standing_watt=standing_watt)
     unseen = 0.0 if found.of("standing") else STANDING_WATT / np.mean(speeds)  # at one speed a force as any other
     assert found.of("drivetrain")[0] == pytest.approx(80.0 + unseen, rel=0.01)
-    assert [found.rolling_resistance(name)[0] for name in RESISTANCE] == pytest.approx([*RESISTANCE.values()], rel=0.01)
-    assert found.recovered == pytest.approx(RECOVERED, rel=0.01)
-    np.testing.assert_allclose(found.power_watt(metres), metres.power_watt, atol=0.5)
+    near = 0.02 if unseen else 0.01  # as a force along the surface it is 14 W at one slope alone
+    assert [found.rolling_resistance(name)[0] for name in RESISTANCE] == pytest.approx([*RESISTANCE.values()], rel=near)
+    assert found.recovered == pytest.approx(RECOVERED, rel=near)
+    np.testing.assert_allclose(found.power_watt(metres), metres.power_watt, atol=1.5 if unseen else 0.5)
+
+
+def test_slopes_that_vary_within_a_metre_round_the_bend_and_move_nothing():
+    """Means over pieces of each metre, 3 degrees rms apart: near the bend they lie above what the mean slope takes."""
+    pieces = [made(3, 800, drivetrain_newton=80.0, steeper=by) for by in (-0.08, -0.05, -0.02, 0.0, 0.02, 0.05, 0.08)]
+    power, rise = (np.mean([getattr(of, name) for of in pieces], axis=0) for name in ("power_watt", "rise"))
+    found = fit_physics(replace(pieces[0], power_watt=power, rise=rise), standing_watt=STANDING_WATT)
+    assert found.of("drivetrain")[0] == pytest.approx(80.0, rel=0.03)
+    assert [found.rolling_resistance(name)[0] for name in RESISTANCE] == pytest.approx([*RESISTANCE.values()], rel=0.02)
 
 
 def test_where_the_slope_never_drives_the_robot_rolling_holds_all_that_is_paid_always():
