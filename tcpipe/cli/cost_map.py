@@ -83,7 +83,9 @@ def cost_map(
 
 
 def _anywhere(path: str) -> str:
-    return path if "://" in path else str(Path(path).absolute())
+    from tcpipe.formats.object_storage import is_url
+
+    return path if is_url(path) else str(Path(path).absolute())
 
 
 def _inputs(model: str, store: str, map_name: str | None, speed_mps: float | None) -> tuple[CostModel, MapFile]:

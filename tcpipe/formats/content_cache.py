@@ -41,9 +41,8 @@ def cached(key: str, fetch: Callable[[Path], object]) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         fetch(temporary)
         put = temporary.stat()
-        temporary.replace(
-            path
-        )  # nothing is synced, and what a killed process leaves goes in its turn: whoever reads it proves it
+        # Nothing is synced, and what a killed process leaves goes in its turn: whoever reads it proves it.
+        temporary.replace(path)
     except OSError as error:
         raise StoreError(f"{path}: cannot be written ({error.strerror or error})") from error
     finally:

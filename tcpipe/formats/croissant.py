@@ -168,9 +168,8 @@ def _records(name: str, about: str, columns: pa.Schema, source: Mapping[str, Jso
         "name": name,
         "description": about,
         "key": {"@id": f"{name}/sample_id"},
-        "field": [
-            _field(name, field, source) for field in columns if not pa.types.is_binary(field.type)
-        ],  # no such type
+        # Croissant has no type for binary columns.
+        "field": [_field(name, field, source) for field in columns if not pa.types.is_binary(field.type)],
     }
 
 

@@ -37,7 +37,7 @@ from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.store import Store, open_store
-from tcpipe.tables.bits import DropReason, Quality, name_of
+from tcpipe.tables.bits import DropReason, Quality, names_of
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import PLACED_SEGMENTS, Streams
 from tcpipe.tables.segment_columns import GEOMETRY
@@ -217,7 +217,7 @@ def _history(
     return History(
         sample={**sample.values, "row": sample.row},
         labels=sample.labels,
-        quality=tuple(name_of(bit) for bit in Quality if sample.quality & bit),
+        quality=names_of(sample.quality, Quality),
         log=_log(store, run),
         messages={} if streams is None else dict(_messages(streams, *window)),
         gates=tuple(_gates(run, *window)),
@@ -314,7 +314,7 @@ def _gates(run: RunDirectory, start_ns: int, end_ns: int) -> Iterator[NearbyGate
     stamps, bits = stamps[near], bits[near]
     for part in np.split(np.arange(len(bits)), np.flatnonzero(np.diff(bits)) + 1):
         if len(part) and bits[part[0]]:
-            names = tuple(name_of(reason) for reason in DropReason if int(bits[part[0]]) & reason)
+            names = names_of(int(bits[part[0]]), DropReason)
             before = stamps[part[0]] < start_ns
             offset_ns = start_ns - stamps[part[-1]] if before else stamps[part[0]] - end_ns
             yield NearbyGate(names, "before" if before else "after", float(offset_ns) / 1e9, len(part))

@@ -21,6 +21,7 @@ from tcpipe.formats.geopackage import VectorLayer, write_geopackage
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published import here
 from tcpipe.formats.qgis_styles import VIRIDIS, classes_style, ranges_style
+from tcpipe.report.colours import SPLIT_COLOURS
 from tcpipe.store import Store, inside_store, is_store, run_at
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.columns import floats, lonlat_deg
@@ -28,8 +29,7 @@ from tcpipe.tables.wkb import line_column
 from tcpipe.terrain.patches import footprints, patch_frames
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 
-_SPLITS = {"train": "#1f77b4", "test": "#d62728", "unseen": "#ff7f0e", "buffer": "#999999"}
-_REGIONS = {"train_test": "#1f77b4", "unseen": "#ff7f0e", "exclude": "#555555"}
+_REGIONS = {"train_test": SPLIT_COLOURS["train"], "unseen": SPLIT_COLOURS["unseen"], "exclude": SPLIT_COLOURS["buffer"]}
 _WGS84 = "EPSG:4326"
 
 Floats = NDArray[np.float64]
@@ -86,13 +86,15 @@ def _segments(source: Path | str) -> VectorLayer:
 
 def _of_dataset(directory: Path) -> Iterator[VectorLayer]:
     card, table = read_current_card(directory), read_samples(directory)
-    split = classes_style("split", _SPLITS, "line")
+    split = classes_style("split", SPLIT_COLOURS, "line")
     yield VectorLayer(
         "samples", "LineString", card.recipe.read.gnss_crs, table, _lines(table), {"split": split, **_by_power(table)}
     )
     named = table.select(["sample_id", "split", "map"])
     areas = list(shapely.to_wkb(shapely.polygons(_footprints(card, table))))
-    yield VectorLayer("footprints", "Polygon", _WGS84, named, areas, {"split": classes_style("split", _SPLITS, "fill")})
+    yield VectorLayer(
+        "footprints", "Polygon", _WGS84, named, areas, {"split": classes_style("split", SPLIT_COLOURS, "fill")}
+    )
     if card.split.region:
         kinds = pa.table({"split": list(card.split.region)})
         shapes = [

@@ -26,7 +26,7 @@ from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
 from tcpipe.store import Store, run_at
 from tcpipe.tables.arrays import numbers, text_column, texts
-from tcpipe.tables.bits import DropReason, Quality, name_of
+from tcpipe.tables.bits import DropReason, Quality, names_of
 from tcpipe.tables.segment_columns import GEOMETRY
 
 GEOJSON = "foxglove_msgs/msg/GeoJSON"
@@ -180,9 +180,7 @@ def _column(table: pa.Table, name: str) -> NDArray[Any]:
 def _named(table: pa.Table, column: str, flags: type[DropReason | Quality], name: str, none: str) -> pa.Table:
     """Return the table with the names of its bits as a text column."""
     bits = _column(table, column)
-    told = {
-        int(value): ", ".join(name_of(bit) for bit in flags if int(value) & bit) or none for value in np.unique(bits)
-    }
+    told = {int(value): ", ".join(names_of(int(value), flags)) or none for value in np.unique(bits)}
     return table.append_column(name, text_column([told[int(value)] for value in bits]))
 
 

@@ -20,7 +20,7 @@ from tcpipe.planning.reasons import Reason
 from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
 from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
 from tcpipe.store import Store
-from tcpipe.tables.bits import name_of
+from tcpipe.tables.bits import names_of
 from tcpipe.tables.columns import floats
 from tcpipe.terrain.patches import patch_frames
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
@@ -189,9 +189,7 @@ def _reasons(model: CostModel, segments: pa.Table, said: Verdicts, data: Dataset
     uncertain = floats(segments, "position_std_m") > data.card.recipe.sample.max_position_std_m
     unlabelled = ~np.isfinite(floats(segments, ENERGIES[model.label_energy].energy) + floats(segments, "duration_s"))
     return [
-        [name_of(reason) for reason in Reason if bits & reason]
-        + [UNCERTAIN] * bool(unsure)
-        + [UNLABELLED] * bool(without)
+        [*names_of(bits, Reason), *[UNCERTAIN] * bool(unsure), *[UNLABELLED] * bool(without)]
         for bits, unsure, without in zip(said.reasons, uncertain, unlabelled, strict=True)
     ]
 

@@ -16,9 +16,10 @@ from tcpipe.geometry.angles import wrap_to_pi
 from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_table import PIECES
 from tcpipe.planning.pieces import Pieces, cut_path, ground_scale
-from tcpipe.planning.reasons import Reason, counts_of, names_of
+from tcpipe.planning.reasons import Reason, counts_of
 from tcpipe.planning.turning import turning_of, turns_between
 from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
+from tcpipe.tables.bits import names_of
 from tcpipe.terrain.patches import corners_on, footprints
 from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.tiles import MapReader

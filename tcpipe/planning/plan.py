@@ -23,12 +23,13 @@ from tcpipe.planning.bounds import could_be_better, probe_cells
 from tcpipe.planning.cost_grid import BARRED
 from tcpipe.planning.courses import COURSES
 from tcpipe.planning.path_cost import PathCost, PathTotals, cost_of_path, off_map_text, projection_of
-from tcpipe.planning.reasons import names_of
+from tcpipe.planning.reasons import Reason
 from tcpipe.planning.search import Found, Steps, least_cost_path, steps_of
 from tcpipe.planning.straight import straightened
 from tcpipe.planning.survey import Mask, Survey
 from tcpipe.planning.turning import turning_of
 from tcpipe.planning.turning_search import least_turning_path
+from tcpipe.tables.bits import names_of
 from tcpipe.terrain.classes import NODATA_ID
 from tcpipe.terrain.point_classes import classes_at
 
@@ -184,7 +185,7 @@ class _Search:
         for label, own in zip(("--from", "--to"), (bits & (BARRED if self.allow_unseen else 0xFFFF)).T, strict=True):
             if own.all():
                 common = int(np.bitwise_and.reduce(own)) or int(np.bitwise_or.reduce(own))
-                words = ", ".join(name.replace("_", " ") for name in names_of(common))
+                words = ", ".join(name.replace("_", " ") for name in names_of(common, Reason))
                 hint = "" if self.allow_unseen or common & BARRED else ", or cross such ground with --allow-unseen"
                 problems.append(
                     f"{label}: no course can be driven from there on map {self.survey.source.name} ({words}); choose another point{hint}"

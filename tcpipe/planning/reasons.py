@@ -57,11 +57,6 @@ NO_COST = Reason.OUTSIDE_MAP | Reason.NODATA | Reason.NOT_TRAVERSABLE | Reason.N
 Bits = NDArray[np.uint16]
 
 
-def names_of(bits: int) -> tuple[str, ...]:
-    """Return the names of the reasons in a number, lower case."""
-    return tuple(name_of(reason) for reason in Reason if bits & reason)
-
-
 def counts_of(bits: Bits) -> dict[str, int]:
     """Return how often each reason occurs; those that never do are left out."""
     counts = {name_of(reason): int(np.count_nonzero(bits & reason)) for reason in Reason}

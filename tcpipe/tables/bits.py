@@ -13,6 +13,11 @@ def name_of(bit: IntFlag) -> str:
     return str(bit.name).lower()
 
 
+def names_of(bits: int, flags: type[IntFlag]) -> tuple[str, ...]:
+    """Return the names of the flags that are set in a number, in their order."""
+    return tuple(name_of(bit) for bit in flags if int(bits) & bit)
+
+
 class DropReason(IntFlag):
     """Why a row of the track is not used; 0 means kept. Order is precedence in the loss ledger."""
 
