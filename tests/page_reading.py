@@ -18,6 +18,8 @@ def unpacked(told, name):
     data = zlib.decompress(base64.b64decode(told["data"]))
     (of,) = [column for column in told["columns"] if column["name"] == name]
     part = data[of["at"] : of["at"] + of["bytes"]]
+    if of["kind"] == "text":
+        return json.loads(part)
     if of["kind"] in {"u8", "u16", "u32"}:
         return np.frombuffer(part, {"u8": "<u1", "u16": "<u2", "u32": "<u4"}[of["kind"]])
     halves = np.frombuffer(part, "<u2").astype(np.uint32)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -166,23 +167,46 @@ def beside(
         )  # fmt: skip
 
 
+@dataclass(frozen=True, slots=True)
+class Standing:
+    """How a model stands beside the simplest: the best of them, what is sure, and the same in words."""
+
+    best: str
+    beats_all: bool
+    beats_curves: bool | None
+    """Whether it is surely better than every curve over class and slope; None of too few groups to say."""
+    is_worse: bool
+    text: str
+
+
 def verdicts(found: Sequence[Compared]) -> list[str]:
     """Return in words, for energy and time of each split, whether the model is better than the simplest, and by how much."""
-    lines = []
-    for split in SPLITS:
-        for quantity, called in (("E", "energy E"), ("T", "time T")):
-            rows = [
-                row
-                for row in found
-                if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None
-            ]
-            if rows:
-                lines.append(f"{split}, {called}: {_verdict(rows)}")
-    return lines
+    return [
+        f"{split}, {called}: {of.text}"
+        for split in SPLITS
+        for quantity, called in (("E", "energy E"), ("T", "time T"))
+        if (of := standing(found, split, quantity)) is not None
+    ]
 
 
-def _verdict(rows: Sequence[Compared]) -> str:
+def standing(found: Sequence[Compared], split: str, quantity: str) -> Standing | None:
+    """Return how the model stands in a quantity of a split; None where no ratio is known."""
+    rows = [row for row in found if (row.split, row.quantity) == (split, quantity) and row.rmse_ratio.value is not None]
+    if not rows:
+        return None
     best = min(rows, key=lambda row: row.errors.rmse or 0.0)
+    ratio = best.rmse_ratio
+    worse = ratio.low is not None and ratio.low > 1.0 and (ratio.value or 0.0) > _ALIKE
+    curves = [row for row in rows if row.baseline in CURVES.values()]
+    beats = None if ratio.high is None else all(map(_is_better, curves))
+    return Standing(best.baseline, _is_better(best), beats, worse, _verdict(rows, best, is_worse=worse))
+
+
+def _is_better(row: Compared) -> bool:
+    return row.rmse_ratio.high is not None and row.rmse_ratio.high < 1.0
+
+
+def _verdict(rows: Sequence[Compared], best: Compared, *, is_worse: bool) -> str:
     ratio = best.rmse_ratio
     if ratio.low is None or ratio.high is None:
         return (
@@ -192,16 +216,16 @@ def _verdict(rows: Sequence[Compared]) -> str:
     sure = (
         f"RMSE {ratio.value:.2f} of its, 95 %: {ratio.low:.2f} to {ratio.high:.2f} over {best.groups} {best.drawn_by}"
     )
-    if ratio.high < 1.0:
+    if _is_better(best):
         by = 100.0 * (1.0 - (ratio.value or 0.0))
         return f"the model is better than every baseline, than the best, '{best.baseline}', by {by:.0f} % ({sure})"
     equal = next(
         name for name in SIMPLEST_FIRST for row in rows
-        if row.baseline == name and not (row.rmse_ratio.high is not None and row.rmse_ratio.high < 1.0)
+        if row.baseline == name and not _is_better(row)
     )  # fmt: skip
     simplest = (
         "" if equal == best.baseline else f"; already '{equal}' is no worse than the model, as far as can be told"
     )
-    if ratio.low > 1.0 and (ratio.value or 0.0) > _ALIKE:
+    if is_worse:
         return f"'{best.baseline}' is better than the model by {100.0 * (1.0 - 1.0 / (ratio.value or 1.0)):.0f} % ({sure}){simplest}"
     return f"the model and '{best.baseline}' cannot be told apart ({sure}){simplest}"

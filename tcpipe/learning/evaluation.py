@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.balance.repeats import Floor
@@ -40,6 +41,7 @@ from tcpipe.learning.metrics import (
     mean_of_draws,
 )
 from tcpipe.learning.models import Model, load_model
+from tcpipe.learning.predicted_samples import predictions_table
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs, spreads_of
 from tcpipe.learning.training import Variant, dataset_checksum, train, training_task
 from tcpipe.learning.wei_isler import FEWEST, OURS, PER_CLASS, Trained, energy_table
@@ -75,8 +77,10 @@ def evaluate(
     *,
     key: str,
     plant: PlantCosts | None = None,
-) -> Evaluation:
+) -> tuple[Evaluation, pa.Table]:
     """Measure a model on a dataset and return everything that was found, which ``key`` tells from any other evaluation.
+
+    Beside it stands what was measured and predicted of every sample (`tcpipe.learning.predicted_samples`).
 
     Networks that it needs beside it are trained into ``out`` and kept there. ``plant`` is the best that can be predicted where the
     samples were simulated.
@@ -98,6 +102,7 @@ def evaluate(
             f"{data.path}: no labelled samples in test nor unseen: nothing to evaluate on; build it with a --split"
         )
     said = {name: predicted_costs(ours, found.split) for name, found in sets.items()}
+    spreads = {name: spreads_of(ours, said[name], found.class_ids) for name, found in sets.items()}
     for name, found in sets.items():
         logger.info("%s: %d samples of %s", name, len(found.split), ", ".join(found.names.values()))
 
@@ -113,13 +118,13 @@ def evaluate(
     with_networks = config.baselines and fitting.model == "resnet18"
     energy = energy_table(ours, data, sets, said, trained if with_networks else None, seed=config.seed)
     baselines, lacking = compared(ours, data, sets, said, seed=config.seed)
-    return Evaluation(
+    evaluation = Evaluation(
         tcpipe_version=__version__,
         key=key,
         model=EvaluatedModel(ours.name, ours.checksum, ours.card.training, ours.card.label_energy),
         dataset=EvaluatedDataset(data.card.name, dataset_checksum(data.card), data.card.splits),
         config=config,
-        splits={name: _split_errors(ours, data, found, said[name], plant) for name, found in sets.items()},
+        splits={name: _split_errors(data, part, said[name], spreads[name], plant) for name, part in sets.items()},
         ablation=tuple(ablation),
         energy=energy.errors,
         networks=tuple(energy.compared),
@@ -128,8 +133,9 @@ def evaluate(
         blocks=by_blocks(ours, names),
         repeatability=_repeatability(data.card, ENERGIES[ours.label_energy]),
         warnings=(*lacking, *_warnings(ours, data, sets), *_left_out(data, sets, energy.errors)),
-        plots={name: _plotted(found, said[name], config.plotted) for name, found in sets.items()},
+        plots={name: _plotted(part, said[name], config.plotted) for name, part in sets.items()},
     )
+    return evaluation, predictions_table(sets, said, spreads)
 
 
 def _how_it_was_trained(model: Model) -> tuple[FitConfig, int]:
@@ -145,7 +151,7 @@ def _repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]
 
 
 def _split_errors(
-    ours: Model, data: Dataset, found: Measured, said: Mapping[str, Array], plant: PlantCosts | None
+    data: Dataset, found: Measured, said: Mapping[str, Array], spreads: Mapping[str, Spread], plant: PlantCosts | None
 ) -> SplitErrors:
     def errors_of(costs: Mapping[str, Array], spreads: Mapping[str, Spread] | None = None) -> ErrorsByClass:
         return errors_by_class(costs, found.costs, found.class_ids, found.names, spreads)
@@ -155,7 +161,7 @@ def _split_errors(
         samples=len(found.split),
         classes=counts,
         class_order=tuple(counts),
-        errors=errors_of(said, spreads_of(ours, said, found.class_ids)),
+        errors=errors_of(said, spreads),
         leakage=leakage_of(data, found.split),
         label_floor=label_floor(found.deviations, found.costs, found.class_ids, found.names),
         simulation_floor=None if plant is None else errors_of(plant(found.split)),

@@ -1,4 +1,4 @@
-"""The files of an evaluation: ``evaluation.json``, ``evaluation.csv``, ``evaluation.html``, and the networks that it trained."""
+"""The files of an evaluation: ``evaluation.json``, ``.csv`` and ``.html``, ``predictions.parquet``, and the networks that it trained."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from tcpipe import __version__
+from tcpipe.dataset import open_dataset
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import clear, write_text
@@ -15,19 +16,22 @@ from tcpipe.formats.bucket import open_place
 from tcpipe.formats.dataset_files import is_shard, read_card
 from tcpipe.formats.json_files import digest, parse_json, read_as, read_json, typed, write_json
 from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.published import here, here_by_range, published
 from tcpipe.formats.seals import sealed
 from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import NETWORKS, PlantCosts, evaluate
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation
+from tcpipe.learning.evaluation_figures import EvaluatedSamples, evaluated_samples
 from tcpipe.learning.evaluation_page import COLUMNS, evaluation_page, evaluation_rows, leakage_line
+from tcpipe.learning.evaluation_verdict import verdict
 from tcpipe.learning.metrics import ALL, QUANTITIES
 from tcpipe.learning.models import read_model_card
 from tcpipe.learning.training import dataset_checksum
 
 SIMULATED = "The data are simulated: what can be compared with the paper is the pattern, not the figures."
 
-JSON, CSV, PAGE = "evaluation.json", "evaluation.csv", "evaluation.html"
+JSON, CSV, PAGE, SAMPLES = "evaluation.json", "evaluation.csv", "evaluation.html", "predictions.parquet"
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,7 @@ class EvaluationResult:
                 lines.append(f"{split}: 90 % intervals hold {energy.held_percent:.1f} % of E, CRPS {energy.crps:.2f} J")
             lines.append(f"{split}: {leakage_line(part.leakage)}")
         lines += verdicts(self.values.baselines)
+        lines += [line.text for line in verdict(self.values) if line.kind == "doubtful"]
         return plain_lines((*lines, f"open {self.path}/{PAGE}"))
 
 
@@ -84,13 +89,15 @@ def run_evaluation(
         return replace(result, path=str(out))
     place = Path(out)
     clear(place)
-    ours = {JSON, CSV, PAGE, NETWORKS, "drives.json", "drives.html"}
+    ours = {JSON, CSV, PAGE, SAMPLES, NETWORKS, "drives.json", "drives.html"}
     if place.exists() and (
         not place.is_dir() or {entry.name for entry in place.iterdir() if entry.name[0] != "."} - ours
     ):
         raise UsageError(f"{place}: exists and is no evaluation; it is left alone; give another OUT")
-    if not (place / JSON).is_file() or read_json(place / JSON).get("key") != key:
-        write_json(place / JSON, evaluate(model, dataset, place, rules, key=key, plant=plant))
+    if not ((place / JSON).is_file() and (place / SAMPLES).is_file()) or read_json(place / JSON).get("key") != key:
+        found, table = evaluate(model, dataset, place, rules, key=key, plant=plant)
+        write_table(table, place / SAMPLES)
+        write_json(place / JSON, found)  # last: with it the evaluation is whole
     values = read_as(place / JSON, Evaluation)  # in the order of the file, as the next call will read it
     name = values.dataset.name
     of = "" if values.model.label_energy == "total" else f" (w and E {ENERGIES[values.model.label_energy].words})"
@@ -100,8 +107,16 @@ def run_evaluation(
     writer = csv.writer(table, lineterminator="\n")
     writer.writerows([COLUMNS, *evaluation_rows(values)])
     write_text(place / CSV, table.getvalue())
-    write_text(place / PAGE, evaluation_page(values, title=f"Evaluation on {name}", lead=lead, warnings=warnings))
+    samples = samples_of(place, dataset)
+    write_text(
+        place / PAGE, evaluation_page(values, samples, title=f"Evaluation on {name}", lead=lead, warnings=warnings)
+    )
     return EvaluationResult(place, values)
+
+
+def samples_of(place: Path, dataset: str | Path) -> EvaluatedSamples:
+    """Return what the page of the evaluation in ``place`` shows of the samples of its dataset."""
+    return evaluated_samples(read_table(place / SAMPLES), open_dataset(dataset))
 
 
 def _in_bucket(url: str) -> Evaluation | None:

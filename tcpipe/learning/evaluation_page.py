@@ -1,4 +1,4 @@
-"""The page of an evaluation: every table of the paper beside its own."""
+"""The page of an evaluation: a verdict, its samples to be asked one by one, and every table of the paper beside its own."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, fields
 from typing import Literal
 
-import numpy as np
-
 from tcpipe.learning import paper_tables as paper
 from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
+from tcpipe.learning.evaluation_figures import EvaluatedSamples, page_data, paper_pictures, sample_sections
+from tcpipe.learning.evaluation_verdict import verdict
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
 from tcpipe.learning.wei_isler import GRASS_ONLY, OURS, PER_CLASS
-from tcpipe.report.page import Number, Section, render_page
-from tcpipe.report.prediction_figures import MOST_PERCENT, predictions_by_patch
+from tcpipe.report.page import Number, Section, Verdict, render_page
 
 FLOORS = {"label_floor": "label noise alone", "simulation_floor": "simulation's own floor"}
 """What an error can hardly be less than, and what the page calls it."""
@@ -34,21 +33,32 @@ _CALLED = {"test": "test samples of the known area", "unseen": "the unseen area"
 
 
 def evaluation_page(
-    found: Evaluation, *, title: str, lead: str, before: Sequence[Section] = (), warnings: Sequence[str] = ()
+    found: Evaluation,
+    samples: EvaluatedSamples,
+    *,
+    title: str,
+    lead: str,
+    before: Sequence[Section] = (),
+    warnings: Sequence[str] = (),
+    claimed: Sequence[Verdict] = (),
 ) -> str:
-    """Return the HTML page of what `evaluate` found; ``before`` and ``warnings`` come first."""
+    """Return the HTML page of what `evaluate` found; ``before``, ``warnings`` and what is ``claimed`` come first."""
+    audits = {split: leakage_line(found.splits[split].leakage) for split in found.ordered_splits}
+    drawn = sample_sections(samples, audits)
     sections = [
         *before,
         _baselines(found),
+        *drawn,
         *_by_class(found),
         _ablation(found),
         _energy(found),
         _time(found),
-        *_pictures(found),
+        *paper_pictures(found.plots),
     ]
     return render_page(
         title=title,
         lead=lead,
+        verdict=[*claimed, *verdict(found)],
         numbers=[
             Number(
                 f"{found.splits[name].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",
@@ -58,7 +68,9 @@ def evaluation_page(
             for quantity in ("E", "T")
         ],
         warnings=[*warnings, *found.warnings],
-        sections=[section for section in sections if section.rows or section.svg or section.text],
+        sections=[section for section in sections if section.rows or section.text],
+        script="evaluation.js" if drawn else "",
+        data=page_data(samples) if drawn else None,
     )
 
 
@@ -320,20 +332,3 @@ def _energy(found: Evaluation) -> Section:
 def _time(found: Evaluation) -> Section:
     text = "The expected time is d / v at the robot's greatest speed."
     return _compared("Table V: time against the expected time", text, found, paper.TIME, "T")
-
-
-def _pictures(found: Evaluation) -> list[Section]:
-    """Return the paper's pictures: E of test samples and T of the unseen area, each with its error."""
-    sections = []
-    for split, quantity, label in (("test", "E", "energy E [J]"), ("unseen", "T", "time T [s]")):
-        if split in found.plots:
-            plot = found.plots[split]
-            svg = predictions_by_patch(
-                np.asarray(plot["E_measured" if quantity == "E" else "T_measured"], np.float64),
-                np.asarray(plot["E_predicted" if quantity == "E" else "T_predicted"], np.float64),
-                plot["class"],
-                label=label,
-            )
-            text = f"Below: the absolute percentage error; an arrow is one of more than {MOST_PERCENT:.0f} %."
-            sections.append(Section(f"{label}, {split}: measured and predicted", text, svg=svg))
-    return sections

@@ -19,6 +19,9 @@ from tcpipe.learning.training import class_table, dataset_checksum
 from tcpipe.terrain.classes import ClassTable
 
 _TOGETHER = 1024
+CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
+"""What columns of tables call the quantities."""
+
 _UNKNOWN = (0, "unknown")
 
 
@@ -111,9 +114,6 @@ def predicted_costs(
     return costs(power, np.maximum(velocity, LEAST_VELOCITY_MPS), model.chord_m)
 
 
-_CALLED = {"w": "power", "v": "velocity", "T": "duration", "E": "energy"}
-
-
 def spreads_of(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.int64]) -> dict[str, Spread]:
     """Return what a model states of the errors of its costs, by quantity; nothing if it has too few held-out samples."""
     stated = errors_of(model.residuals)
@@ -122,7 +122,7 @@ def spreads_of(model: Model, said: Mapping[str, Array], class_ids: NDArray[np.in
     scale = {"w": 1.0, "v": 1.0, "T": model.chord_m, "E": model.chord_m}  # of a metre's errors
     found = {}
     for quantity, costs_of in said.items():
-        errors, d = stated[_CALLED[quantity]], scale[quantity]
+        errors, d = stated[CALLED[quantity]], scale[quantity]
         low, high = errors.of_pieces(costs_of / d, class_ids)
         found[quantity] = Spread(d * errors.spread(costs_of / d, class_ids), d * low, d * high)
     return found

@@ -19,7 +19,7 @@ from tcpipe.formats.atomic import clear, write_text
 from tcpipe.formats.json_files import write_json
 from tcpipe.learning.claims import Claim, checked_claims
 from tcpipe.learning.evaluation_facts import EvaluateConfig, Evaluation, SplitErrors
-from tcpipe.learning.evaluation_files import run_evaluation
+from tcpipe.learning.evaluation_files import run_evaluation, samples_of
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.plant_floor import plant_costs, shown, variance_shares
 from tcpipe.learning.reproduction_page import reproduction_page
@@ -224,6 +224,7 @@ def _write(result: Reproduction, plan: Experiment, hidden: float) -> None:
         result.directory / PAGE,
         reproduction_page(
             result.runs,
+            samples_of(result.directory / "seed-0" / "evaluation", result.directory / "dataset"),
             result.claims,
             splits=result.counts.splits,
             terrain=result.counts.terrain,

@@ -4,24 +4,33 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 from tcpipe.learning.claims import Claim
 from tcpipe.learning.evaluation_facts import Evaluation
+from tcpipe.learning.evaluation_figures import EvaluatedSamples
 from tcpipe.learning.evaluation_files import SIMULATED
 from tcpipe.learning.evaluation_page import audit_lines, evaluation_page
 from tcpipe.learning.fidelity import differences
 from tcpipe.learning.metrics import ALL, QUANTITIES, UNITS
 from tcpipe.learning.plant_floor import CLASS_AND_SLOPE
-from tcpipe.report.page import Section
+from tcpipe.report.page import Section, Verdict
 from tcpipe.simulation.paper_site import paper_parameters
 
 _QUICK = "This is a quick run: a small site, a narrow network, few epochs. It shows that everything runs; believe no figure of it."
+_KINDS: Mapping[str, Literal["good", "thin", "doubtful"]] = {
+    "held": "good",
+    "NOT held": "doubtful",
+    "open": "thin",
+    "not measured": "thin",
+}
 _PAPER_SHARES = {"grass": 51, "mud": 9, "unpaved road": 20, "paved road": 20}
 _PAPER_COUNTS = {"train": 5142, "test": 1286, "unseen": 4458}
 
 
 def reproduction_page(
     runs: Sequence[Evaluation],
+    samples: EvaluatedSamples,
     claims: Sequence[Claim],
     *,
     splits: Mapping[str, int],
@@ -32,13 +41,14 @@ def reproduction_page(
 ) -> str:
     """Return the HTML page.
 
-    ``splits`` and ``terrain`` count the samples by split, and by split and class; ``shares`` are of the variance of E, and ``hidden`` is
-    the variance of the hidden resistance over the frozen site's.
+    ``samples`` are those of the first run. ``splits`` and ``terrain`` count the samples by split, and by split and class; ``shares`` are
+    of the variance of E, and ``hidden`` is the variance of the hidden resistance over the frozen site's.
     """
     verdicts = Counter(claim.verdict for claim in claims)
     told = ", ".join(f"{count} {name}" for name, count in verdicts.items())
     return evaluation_page(
         runs[0],
+        samples,
         title="The paper's experiment on a simulated site",
         lead=f"Of {len(claims)} claims: {told}; {len(runs)} training{'s' if len(runs) > 1 else ''}.",
         before=[
@@ -51,6 +61,7 @@ def reproduction_page(
             _sources(quick=quick),
         ],
         warnings=[SIMULATED, *([_QUICK] if quick else [])],
+        claimed=[Verdict(_KINDS[claim.verdict], f"{claim.says}, {claim.split}: {claim.verdict}.") for claim in claims],
     )
 
 

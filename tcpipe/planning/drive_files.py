@@ -1,10 +1,11 @@
-"""``tcpipe evaluate --drive``: drives measured against predicted, as ``drives.json`` and a page with a picture of each."""
+"""``tcpipe evaluate --drive``: drives measured against predicted, as ``drives.json`` and a page with figures of each."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -17,12 +18,17 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published import published
 from tcpipe.planning.cost_model import CostModel
 from tcpipe.planning.drives import Against, DriveCost, drive_cost, drive_in, in_words
-from tcpipe.report.page import Number, Section, render_page
-from tcpipe.report.prediction_figures import sums_along
+from tcpipe.report.colours import DROPPED, SPLIT_COLOURS
+from tcpipe.report.page import Number, Section, Verdict, render_page
+from tcpipe.report.plots import Plot, new_plot
 from tcpipe.store import open_store
 from tcpipe.terrain.tiles import MapReader
 
 JSON, PAGE = "drives.json", "drives.html"
+
+_NO_USE_PERCENT = 50.0
+_HELD = 0.7
+"""Share of drives whose intervals of 90 % hold them, from which on nothing speaks against these: drives are few."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,24 +103,71 @@ def _sum(parts: Sequence[Against]) -> Against:
 
 
 def _page(values: Drives) -> str:
-    sections = []
-    for drive in values.drives:
-        svg = ""
-        if drive.along.distance_m:
-            panels = {"time T [s]": drive.along.duration_s, "energy E [J]": drive.along.energy_joule}
-            svg = sums_along(np.array(drive.along.distance_m), {name: _columns(of) for name, of in panels.items()})
-        sections.append(Section(drive.run_id, " ".join(f"{line}." for line in in_words(drive)), svg=svg))
     return render_page(
         title="Drives, measured and predicted",
         lead=f"Model {Path(values.model).name}: sums along each drive over the metres that can be compared, with 90 % intervals.",
+        verdict=list(_verdict(values)),
         numbers=[
             Number(f"{of.off_percent:+.1f} %", f"{called} of all drives held back, predicted less measured")
             for called, of in (("time", values.duration_s), ("energy", values.energy_joule))
             if of.measured
         ],
         warnings=[line for drive in values.drives for line in in_words(drive) if line.startswith("warning: ")],
-        sections=sections,
+        sections=[
+            Section(
+                drive.run_id, " ".join(f"{line}." for line in in_words(drive)), plots=list(_sums_along(number, drive))
+            )
+            for number, drive in enumerate(values.drives)
+        ],
     )
+
+
+def _verdict(values: Drives) -> Iterator[Verdict]:
+    held = [drive for drive in values.drives if drive.held_back and drive.compared_m]
+    if not held:
+        yield Verdict("doubtful", "Nothing is shown: no drive with metres to compare was held back from training.")
+        yield Verdict(
+            "do", "Train with a run held out (build-dataset --holdout run), or measure a drive that is in no dataset."
+        )
+    for called, name in (("time", "duration_s"), ("energy", "energy_joule")):
+        off = np.array([abs(getattr(drive, name).off_percent) for drive in held])
+        if (off >= _NO_USE_PERCENT).any():
+            yield Verdict("doubtful", f"Of no use for {called}: a drive is off by {off.max():.0f} %.")
+        told = [of.held for drive in held if (of := getattr(drive, name)).held is not None]
+        if told:
+            kind: Literal["good", "doubtful"] = "good" if sum(told) >= _HELD * len(told) else "doubtful"
+            yield Verdict(kind, f"90 % intervals hold the {called} of {sum(told)} of {len(told)} drives held back.")
+
+
+def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:
+    """Yield what a drive took so far over the distance driven, measured and predicted, with its interval."""
+    distance_m, first = np.array(drive.along.distance_m), None
+    for label, sums in (("time T [s]", drive.along.duration_s), ("energy E [J]", drive.along.energy_joule)):
+        if not len(distance_m):
+            return
+        plot = new_plot(
+            f"{label} {number}",
+            alt=f"{label} of {drive.run_id} so far over the distance driven, measured and predicted, with its 90 % interval.",
+            axes=("distance driven in segments [m]", label),
+            legend={"measured": DROPPED, "predicted, with its interval": SPLIT_COLOURS["train"]},
+            beside=first,
+            tooltips=[
+                ("at", "@metres{0.0} m"),
+                ("measured", "@measured{0.0}"),
+                ("predicted", "@predicted{0.0}"),
+                ("90 %", "@low{0.0} to @high{0.0}"),
+            ],
+        )
+        columns = dict(zip(("measured", "predicted", "low", "high"), _columns(sums), strict=True))
+        source = {"metres": distance_m, **columns}
+        plot.figure.varea("metres", "low", "high", source=source, color=SPLIT_COLOURS["train"], alpha=0.2)
+        plot.figure.hover.renderers = [
+            plot.figure.line("metres", name, source=source, color=colour, line_width=2)
+            for name, colour in (("measured", DROPPED), ("predicted", SPLIT_COLOURS["train"]))
+        ]
+        plot.figure.hover.mode = "vline"
+        first = plot
+        yield plot
 
 
 def _columns(sums: Sequence[Against]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -156,7 +156,7 @@ def _costed(model: CostModel, source: MapReader, pieces: Pieces, said: Verdicts)
         energy_low_joule=least,
         energy_high_joule=most,
         reasons=bits,
-        reason_names=[" ".join(names_of(int(value))) for value in bits],
+        reason_names=[" ".join(names_of(int(value), Reason)) for value in bits],
     )
     without_cost = int(table.column("duration_s").null_count)
     totals = PathTotals(

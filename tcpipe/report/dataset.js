@@ -57,13 +57,7 @@ page.ready.then(async () => {
       bar.style.background = `linear-gradient(to right, ${ramp.join()})`;
       scale.append(make("span", `${label(name)}: ${digits(legend[0][0], name)}`), bar, make("span", `${digits(legend[0][1], name)} (98 of 100 lie between)`));
     } else {
-      for (const [text, colour] of legend) {
-        const dot = make("i");
-        dot.style.background = colour;
-        const entry = make("span");
-        entry.append(dot, text);
-        scale.append(entry);
-      }
+      scale.append(...page.legend(legend));
     }
     return fill;
   }
@@ -140,13 +134,7 @@ page.ready.then(async () => {
     }
     left.append(pairs(inWords(i)));
     if (sheets && cell.has(i)) {
-      const room = make("div", "", { className: "patches" });
-      for (const layer of sheets.layers) {
-        const figure = make("figure");
-        figure.append(page.patch(sheets, layer, cell.get(i), 96), make("figcaption", layer.name));
-        room.append(figure);
-      }
-      right.append(room, make("p", "Travel is to the right; height is over the patch's own range.", { className: "note" }));
+      right.append(...page.patches(sheets, cell.get(i)));
     } else if (sheets) {
       right.append(make("p", `The page carries ${sheets.rows.length} of ${told.count} patches, and this one is not among them.`, { className: "note" }));
     }
@@ -162,31 +150,11 @@ page.ready.then(async () => {
   at("row").onchange = () => { const i = at("row").valueAsNumber - 1; if (i >= 0 && i < n) choose([i]); };
   show([]);
 
-  // The gallery.
-  const gallery = at("gallery");
-  if (gallery && sheets) {
-    let most = 60;
-    const named = (id) => classes.get(id)?.name ?? "unknown";
-    fillSelect(at("gallery-class"), [...new Set(sheets.rows.map((i) => named(c.class[i])))].sort());
-    fillSelect(at("gallery-split"), told.splits.map((s) => s.name).filter((name) => sheets.rows.some((i) => told.splits[c.split[i]].name === name)));
-    fillSelect(at("gallery-layer"), sheets.layers.map((layer) => layer.name));
-    at("gallery-layer").value = (sheets.layers.find((layer) => layer.name === "ortho") ?? sheets.layers[0]).name;
-    const draw = () => {
-      const [kind, split] = [at("gallery-class").value, at("gallery-split").value];
-      const layer = sheets.layers.find((one) => one.name === at("gallery-layer").value);
-      const rows = sheets.rows.filter((i) => (!kind || named(c.class[i]) === kind) && (!split || told.splits[c.split[i]].name === split));
-      gallery.replaceChildren(...rows.slice(0, most).map((i) => {
-        const button = make("button", "", { type: "button" });
-        button.append(page.patch(sheets, layer, cell.get(i), 92), `${named(c.class[i])} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${told.splits[c.split[i]].name}`);
-        button.onclick = () => { choose([i]); at("chosen").scrollIntoView({ block: "nearest" }); };
-        return button;
-      }));
-      at("gallery-count").textContent = `${Math.min(rows.length, most)} of ${rows.length} patches`;
-      at("gallery-more").hidden = rows.length <= most;
-    };
-    for (const id of ["gallery-class", "gallery-split", "gallery-layer"]) at(id).onchange = draw;
-    at("gallery-more").onclick = () => { most += 120; draw(); };
-    draw();
+  if (sheets) {
+    page.gallery(sheets, (i) => {
+      const [kind, split] = [classes.get(c.class[i])?.name ?? "unknown", told.splits[c.split[i]].name];
+      return { kind, split, words: `${kind} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${split}` };
+    }, (i) => choose([i]));
   }
   document.documentElement.dataset.ready = "yes";
 });

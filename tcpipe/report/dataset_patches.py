@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -37,11 +39,19 @@ def patches_shown(directory: Path, card: DatasetCard, samples: pa.Table, row_of:
     piece = np.searchsorted(files.starts, place, side="right") - 1
     near = np.flatnonzero(np.isin(piece, _some(np.unique(piece))))
     chosen = near[_stratified(samples.take(near))]
-    step = -(-card.patch_px // _PX)
-    pixels = _read(files, place[chosen], piece[chosen], step)
+    return sheets(row_of[chosen].tolist(), _read(files, place[chosen], piece[chosen], thinned_by(card.patch_px)), files)
+
+
+def thinned_by(patch_px: int) -> int:
+    """Return the step in which pixels of a patch are shown."""
+    return -(-patch_px // _PX)
+
+
+def sheets(rows: Sequence[int], pixels: Mapping[str, NDArray[Any]], files: PatchFiles) -> Json:
+    """Return thinned patches, (N, px, px) by layer, as a sheet for each layer, and the rows of the page that they belong to."""
     return {
-        "rows": row_of[chosen].tolist(),
-        "px": -(-card.patch_px // step),
+        "rows": rows,
+        "px": next(iter(pixels.values())).shape[1],
         "across": ACROSS,
         "layers": [{"name": name, "uri": _layer_uri(name, stack, files)} for name, stack in pixels.items()],
     }

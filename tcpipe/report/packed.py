@@ -6,6 +6,7 @@ kind       what a reader gets
 ``u8``     whole numbers to 255; ``u16`` to 65 535; ``u32`` to 4 294 967 295
 ``f32``    a float32
 ``half``   the upper 16 bits of a float32, rounded: to 0.4 %, for slopes and deviations
+``text``   texts, as JSON
 ``steps``  ``low + step * number`` over the column's range in 65 534 steps, for coordinates and labels
 =========  ======================================================================================
 
@@ -15,6 +16,7 @@ NaN stays NaN; among ``steps`` it is 65 535. ``page.js`` reads it.
 from __future__ import annotations
 
 import base64
+import json
 import zlib
 from collections.abc import Mapping
 from typing import Literal
@@ -22,9 +24,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tcpipe.errors import plain_line
 from tcpipe.formats.json_files import Json
 
-Kind = Literal["u8", "u16", "u32", "f32", "half", "steps"]
+Kind = Literal["u8", "u16", "u32", "f32", "half", "steps", "text"]
 Column = tuple[Kind, NDArray[np.generic]]
 
 _WHOLE = {"u8": "<u1", "u16": "<u2", "u32": "<u4"}
@@ -54,6 +57,8 @@ def _scale(values: NDArray[np.generic]) -> tuple[float, float]:
 
 
 def _bytes(kind: Kind, values: NDArray[np.generic], low: float, step: float) -> bytes:
+    if kind == "text":
+        return json.dumps([plain_line(str(value)) for value in values.tolist()]).encode()
     if kind in _WHOLE:
         return values.astype(_WHOLE[kind]).tobytes()
     if kind == "steps":

@@ -40,6 +40,47 @@ const page = (() => {
       + `background-position:${-(i % sheets.across) * sheets.px * scale}px ${-Math.floor(i / sheets.across) * sheets.px * scale}px`;
     return shown;
   }
+  function patches(sheets, i) {
+    const room = make("div", "", { className: "patches" });
+    for (const layer of sheets.layers) {
+      const figure = make("figure");
+      figure.append(patch(sheets, layer, i, 96), make("figcaption", layer.name));
+      room.append(figure);
+    }
+    return [room, make("p", "Travel is to the right; height is over the patch's own range.", { className: "note" })];
+  }
+  // Colours by name.
+  const legend = (entries) => entries.map(([text, colour]) => {
+    const dot = make("i"), entry = make("span");
+    dot.style.background = colour;
+    entry.append(dot, text);
+    return entry;
+  });
+  // Patches as buttons (gallery.html): `of(row)` gives a row's class, split and words, `choose(row)` is what a click does.
+  function gallery(sheets, of, choose) {
+    let most = 60;
+    const told = sheets.rows.map(of);
+    fillSelect(at("gallery-class"), [...new Set(told.map((one) => one.kind))].sort());
+    fillSelect(at("gallery-split"), [...new Set(told.map((one) => one.split))].sort());
+    fillSelect(at("gallery-layer"), sheets.layers.map((layer) => layer.name));
+    at("gallery-layer").value = (sheets.layers.find((layer) => layer.name === "ortho") ?? sheets.layers[0]).name;
+    const draw = () => {
+      const [kind, split] = [at("gallery-class").value, at("gallery-split").value];
+      const layer = sheets.layers.find((one) => one.name === at("gallery-layer").value);
+      const cells = [...told.keys()].filter((i) => (!kind || told[i].kind === kind) && (!split || told[i].split === split));
+      at("gallery").replaceChildren(...cells.slice(0, most).map((i) => {
+        const button = make("button", "", { type: "button" });
+        button.append(patch(sheets, layer, i, 92), told[i].words);
+        button.onclick = () => { choose(sheets.rows[i]); at("chosen").scrollIntoView({ block: "nearest" }); };
+        return button;
+      }));
+      at("gallery-count").textContent = `${Math.min(cells.length, most)} of ${cells.length} patches`;
+      at("gallery-more").hidden = cells.length <= most;
+    };
+    for (const id of ["gallery-class", "gallery-split", "gallery-layer"]) at(id).onchange = draw;
+    at("gallery-more").onclick = () => { most += 120; draw(); };
+    draw();
+  }
   // Columns as `tcpipe.report.packed` wrote them.
   async function unpack({ columns, data }) {
     const raw = Uint8Array.from(atob(data), (c) => c.charCodeAt(0));
@@ -47,6 +88,7 @@ const page = (() => {
     const whole = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array };
     return Object.fromEntries(columns.map(({ name, kind, at: first, bytes, low, step }) => {
       const part = buffer.slice(first, first + bytes);
+      if (kind === "text") return [name, JSON.parse(new TextDecoder().decode(part))];
       if (kind in whole) return [name, new whole[kind](part)];
       const halves = new Uint16Array(part);
       if (kind === "steps") return [name, Float64Array.from(halves, (n) => (n === 65535 ? NaN : low + step * n))];
@@ -57,7 +99,7 @@ const page = (() => {
     }));
   }
   return {
-    at, make, fillSelect, pairs, patch, unpack,
+    at, make, fillSelect, pairs, patches, legend, gallery, unpack,
     data: read("page-data"),
     ready,
     plots,

@@ -1,10 +1,15 @@
 """Pages in Chromium as a person has them: wide and on a phone, by day and by night (``make test-pages``; skipped without its parts)."""
 
 import shutil
+from contextlib import contextmanager
 
 import pytest
 from synthetic_store import add_run, add_world, lanes, segments
 
+from tcpipe.learning.evaluation_facts import EvaluateConfig
+from tcpipe.learning.evaluation_files import run_evaluation
+from tcpipe.learning.fitting import FitConfig
+from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.store import open_store
 
@@ -32,7 +37,7 @@ def dataset(tmp_path_factory):
     store = open_store(here / "store", create=True)
     add_world(store, here)
     for number, run in enumerate(("north", "south")):
-        start, end = lanes((4.0 * number,), -12.0, 12.0)
+        start, end = lanes((4.0 * number, 4.0 * number + 1.5, 4.0 * number - 9.0), -12.0, 12.0)
         add_run(store, run, segments(run, start, end, start_ns=int((number + 1) * 1e18)))
     build_dataset(here / "dataset", store=store.root)
     return here / "dataset"
@@ -46,16 +51,16 @@ def chromium():
         browser.close()
 
 
-@pytest.fixture(params=LOOKS, ids=lambda look: f"{look[0]} {look[1]}")
-def opened(request, chromium, dataset):
-    """The dataset's page, drawn; at the end it must have asked for nothing and complained of nothing."""
-    width, scheme = request.param
+@contextmanager
+def quiet_page(chromium, path, look):
+    """A page, drawn; at the end it must have asked for nothing and complained of nothing."""
+    width, scheme = look
     context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
     tab, complaints, asked = context.new_page(), [], []
     tab.on("console", lambda said: complaints.append(said.text) if said.type in {"error", "warning"} else None)
     tab.on("pageerror", lambda error: complaints.append(str(error)))
     tab.on("request", lambda sent: asked.append(sent.url) if not sent.url.startswith(("data:", "blob:")) else None)
-    url = (dataset / "report.html").as_uri()
+    url = path.as_uri()
     tab.goto(url)
     tab.wait_for_selector("html[data-ready]")
     yield tab
@@ -64,10 +69,38 @@ def opened(request, chromium, dataset):
     context.close()
 
 
-def test_it_fits_and_can_be_read_by_everyone(opened):
-    assert opened.evaluate("document.documentElement.scrollWidth") <= opened.viewport_size["width"]
-    found = axe.Axe().run(opened)["violations"]
+def by_look(look):
+    return f"{look[0]} {look[1]}"
+
+
+@pytest.fixture(params=LOOKS, ids=by_look)
+def opened(request, chromium, dataset):
+    with quiet_page(chromium, dataset / "report.html", request.param) as tab:
+        yield tab
+
+
+@pytest.fixture(scope="module")
+def evaluation(dataset, tmp_path_factory):
+    here = tmp_path_factory.mktemp("evaluated")
+    train(dataset, here / "physics", config=FitConfig(model="physics"))
+    run_evaluation(here / "physics", dataset, here / "evaluation", config=EvaluateConfig(draws=1))
+    return here / "evaluation/evaluation.html"
+
+
+@pytest.fixture(params=[LOOKS[0], LOOKS[3]], ids=by_look)
+def judged(request, chromium, evaluation):
+    with quiet_page(chromium, evaluation, request.param) as tab:
+        yield tab
+
+
+def fits_and_can_be_read_by_everyone(tab):
+    assert tab.evaluate("document.documentElement.scrollWidth") <= tab.viewport_size["width"]
+    found = axe.Axe().run(tab)["violations"]
     assert [(of["id"], [node["html"][:120] for node in of["nodes"]][:3]) for of in found] == []
+
+
+def test_it_fits_and_can_be_read_by_everyone(opened):
+    fits_and_can_be_read_by_everyone(opened)
 
 
 def test_a_metre_that_is_clicked_tells_its_label_and_shows_its_patch(opened):
@@ -118,3 +151,28 @@ def test_it_is_worked_by_keyboard_and_can_be_printed(opened):
     opened.keyboard.press("Shift+Tab")
     assert opened.evaluate("document.activeElement.id") == "row"
     assert len(opened.pdf()) > 20_000
+
+
+def test_an_evaluation_says_what_a_metre_was_and_was_predicted_to_be(judged):
+    fits_and_can_be_read_by_everyone(judged)
+    judged.locator("#after").focus()
+    judged.keyboard.press("Enter")
+    said = judged.locator("#chosen").inner_text()
+    assert "measured" in said
+    assert "tcpipe explain '" in said
+    assert judged.locator("#chosen .patch").count() == 3
+    off = f"Array.from({SOURCE}.data.error, Math.abs)"
+    assert judged.evaluate(f"{off}[0] === Math.max(...{off})")
+    x, y = judged.evaluate(f"[{SOURCE}.data.measured[3], {SOURCE}.data.predicted[3]]")
+    judged.locator("figure", has=judged.locator(".plot")).first.scroll_into_view_if_needed()
+    judged.mouse.click(*judged.evaluate(PLACE, ["against", x, y]))
+    judged.wait_for_function(f"{SOURCE}.selected.indices.some((i) => Math.abs({SOURCE}.data.measured[i] - {x}) < 1e-6)")
+
+
+def test_an_evaluation_answers_to_quantity_and_split_and_shows_the_worst(judged):
+    judged.select_option("#quantity", "T")
+    judged.select_option("#split", "test")
+    assert "time T" in judged.evaluate("page.model('against').below[0].axis_label")
+    judged.locator("#gallery button").first.click()
+    assert "energy E" in judged.locator("#chosen").inner_text()
+    assert judged.locator("#chosen .patch").count() == 3

@@ -67,7 +67,12 @@ def test_a_drive_that_was_trained_on_is_marked_and_in_no_sum(made, tmp_path):
     assert "of its samples trained the model: it is not held back" in str(said)
     assert said.values.energy_joule.measured == south.energy_joule.measured
     page = (tmp_path / "out" / "drives.html").read_text()
-    assert page.count("<svg") == 2
+    assert page.count('class="plot"') == 4  # time and energy of both
+    holds = south.energy_joule.held
+    verdict = (
+        f"{'Good' if holds else 'Doubtful'}</b> 90 % intervals hold the energy of {int(holds)} of 1 drives held back"
+    )
+    assert verdict in page
     assert "J measured" in page
     assert json.loads((tmp_path / "out" / "drives.json").read_text())["drives"][1]["run_id"] == "south"
 

@@ -1,0 +1,301 @@
+"""Figures of an evaluation's page: every sample measured against predicted, errors by class and slope, calibration, the worst metres."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from tcpipe.balance.cells import SLOPE_NAMES, slope_ranges
+from tcpipe.dataset import Dataset
+from tcpipe.formats.json_files import Json
+from tcpipe.learning.evaluation_facts import Plotted
+from tcpipe.learning.metrics import QUANTITIES, UNITS
+from tcpipe.learning.predicted_samples import LEVELS, calibration, column_of, errors_joule, worst_rows
+from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, SPLIT_COLOURS, class_colour
+from tcpipe.report.dataset_patches import sheets, thinned_by
+from tcpipe.report.packed import Column, packed, shown_to
+from tcpipe.report.page import Section, Shaded
+from tcpipe.report.plots import Plot, new_plot
+from tcpipe.tables.columns import floats
+
+MEASURED, PREDICTED = DROPPED, SPLIT_COLOURS["train"]
+MOST_PERCENT = 50.0
+"""Where the axis of errors ends, as the paper's."""
+
+_CALLED = {"w": "power w", "v": "velocity v", "T": "time T", "E": "energy E"}
+_DIGITS = {"w": 1, "v": 3, "T": 3, "E": 1}
+_COLOURS = dict(zip(QUANTITIES, CLASS_COLOURS, strict=False))
+_MOST_SHOWN = 20_000
+"""Samples of a split that can each be clicked: the first, which stand in random order."""
+_WORST = 30
+"""Of each split, with their patches."""
+_ENOUGH = 20
+"""Labels of a class and slope of which the share that intervals hold is judged, and the least that is not marked:"""
+_HELD = 0.8
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluatedSamples:
+    """What the page shows of samples: ``predictions.parquet`` and sheets of the worst metres' patches, None without any."""
+
+    table: pa.Table
+    patches: Json
+
+
+def evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
+    """Return what a page shows of the samples of ``table``, with patches of the dataset that they are of."""
+    rows = worst_rows(table, _WORST)
+    split = table.column("split").to_numpy(zero_copy_only=False)[rows]
+    parts: list[dict[str, NDArray[np.generic]]] = []
+    for name in dict.fromkeys(split.tolist()):
+        ids = table.column("sample_id").take(pa.array(rows[split == name]))
+        known = pa.array(data[name].column("sample_id").tolist(), pa.string())
+        parts.append(data[name].layers(pc.index_in(ids.combine_chunks(), value_set=known).to_numpy()))
+    if not parts:
+        return EvaluatedSamples(table, None)
+    step = thinned_by(data.card.patch_px)
+    pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in parts[0]}
+    at = np.searchsorted(_shown_rows(table), rows)
+    files = data[str(split[0])].view.stored.files
+    return EvaluatedSamples(table, sheets(at.tolist(), pixels, files))
+
+
+def _shown_rows(table: pa.Table) -> NDArray[np.int64]:
+    """Return the rows that the page holds, rising: the first of each split, and the worst."""
+    split = table.column("split").to_numpy(zero_copy_only=False)
+    first = [np.flatnonzero(split == name)[:_MOST_SHOWN] for name in dict.fromkeys(split.tolist())]
+    return np.unique(np.concatenate([*first, worst_rows(table, _WORST)]))
+
+
+def page_data(samples: EvaluatedSamples) -> Json:
+    """Return what the page's script is told."""
+    rows = _shown_rows(samples.table)
+    table = samples.table.take(pa.array(rows))
+    split, name = (table.column(of).to_numpy(zero_copy_only=False).astype(np.str_) for of in ("split", "terrain_name"))
+    splits, class_id = list(dict.fromkeys(split.tolist())), table.column("terrain_class").to_numpy()
+    columns: dict[str, Column] = {
+        "id": ("text", table.column("sample_id").to_numpy(zero_copy_only=False)),
+        "split": ("u8", np.array([splits.index(of) for of in split.tolist()], np.int64)),
+        "class": ("u8", class_id),
+        "slope": ("half", np.degrees(floats(table, "slope_rad"))),
+    }
+    for q in QUANTITIES:
+        said = floats(table, column_of(q, "predicted"))
+        columns[q] = shown_to(_DIGITS[q], floats(table, column_of(q)))
+        columns[f"{q} predicted"] = shown_to(_DIGITS[q], said)
+        columns[f"{q} std"] = ("half", floats(table, column_of(q, "std")))
+        for end in ("low", "high"):
+            columns[f"{q} {end}"] = ("half", floats(table, column_of(q, f"predicted_{end}")) - said)
+    return {
+        "samples": packed(columns),
+        "splits": [{"name": of, "colour": SPLIT_COLOURS[of]} for of in splits],
+        "classes": [
+            {"id": int(number), "name": str(name[class_id == number][0]), "colour": class_colour(int(number))}
+            for number in np.unique(class_id)
+        ],
+        "quantities": [
+            {"key": q, "called": _CALLED[q], "unit": UNITS[q], "digits": _DIGITS[q]} for q in reversed(QUANTITIES)
+        ],
+        "patches": samples.patches,
+    }
+
+
+def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> list[Section]:
+    """Return the sections on single samples; nothing where none was predicted. ``audits`` say of each split how near training it is."""
+    if not samples.table.num_rows:
+        return []
+    worst = (
+        f"The {_WORST} samples of each split whose E is furthest off, the furthest first. Travel is to the right; a click says more above. "
+        "Look for what they share: a class that the map has wrong, a step that the heights miss, a label with a large σ."
+    )
+    return [
+        _against(samples.table),
+        Section("Worst metres", worst, controls="gallery.html"),
+        *(_by_class_and_slope(samples.table, split, audit) for split, audit in audits.items()),
+        _calibration(samples.table),
+    ]
+
+
+def _against(table: pa.Table) -> Section:
+    text = (
+        "Each point is a metre; on the line it is predicted right. Hover for its figures, click it for σ, intervals and where it is from, "
+        "or draw a box; Next goes on to the one that is less off."
+    )
+    if table.num_rows > (shown := len(_shown_rows(table))):
+        text += f" {shown} of {table.num_rows} are shown, drawn at random, and the worst."
+    corners = {name: [0.0, 1.0] for name in ("measured", "predicted", "slope", "error")}
+    start = {**corners, "fill": ["#ffffff"] * 2, "class": [""] * 2}  # until the page's script has unpacked the samples
+    against, points = _scatter("against", "samples", "measured", "predicted", start)
+    off, _ = _scatter("off", "samples off", "slope", "error", points.data_source)
+    return Section("Measured against predicted", text, controls="evaluation.html", plots=[against, off])
+
+
+def _scatter(name: str, points_name: str, across: str, up: str, source: Any) -> tuple[Plot, Any]:
+    """Return a plot of every sample with the line of those that are right, and its points; the page's script fills both."""
+    plot = new_plot(
+        name,
+        alt=f"{up.capitalize()} over {across}, a point a sample; the tables below hold the figures by class.",
+        axes=("slope along travel [°]", "predicted less measured") if across == "slope" else (across, up),
+        height_px=380,
+        tools="tap,box_select,pan,wheel_zoom,box_zoom,reset,save",
+        drag="box_select",
+        tooltips=[
+            ("measured", "@measured{0.00}"),
+            ("predicted", "@predicted{0.00}"),
+            ("slope", "@slope{0.0}°"),
+            ("", "@class"),
+        ],
+    )
+    points = plot.figure.scatter(
+        across, up, size=6, fill_color="fill", line_color=None, fill_alpha=0.6, nonselection_fill_alpha=0.1,
+        selection_line_color="#000000", source=source, name=points_name,
+    )  # fmt: skip
+    line = plot.figure.line([0.0, 1.0], [0.0, 1.0], color=FAINT, line_width=2, line_dash="dashed", name=f"right {name}")
+    line.level = "underlay"
+    plot.figure.hover.renderers = [points]
+    return plot, points
+
+
+def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
+    """Return the RMSE of E by class and range of slope, as a heat map."""
+    part = table.filter(pc.and_(pc.equal(table.column("split"), split), pc.is_valid(table.column("slope_rad"))))
+    off, ranges = errors_joule(part), slope_ranges(floats(part, "slope_rad"))
+    energy, low, high = (floats(part, column_of("E", of)) for of in ("", "predicted_low", "predicted_high"))
+    classes = part.column("terrain_name").to_numpy(zero_copy_only=False)
+    names = [
+        name for _, name in sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
+    ]
+    met = np.unique(ranges)
+    cells = {
+        (name, at): off[here]
+        for name in names
+        for at in met
+        if (here := (classes == name) & (ranges == at) & np.isfinite(off)).any()
+    }
+    rmse = {key: float(np.sqrt(np.mean(of**2))) for key, of in cells.items()}
+    most = max(rmse.values(), default=1.0) or 1.0
+    rows: list[list[str | Shaded]] = []
+    for name in names:
+        row: list[str | Shaded] = [name]
+        for at in met:
+            here = (classes == name) & (ranges == at)
+            if (name, at) not in cells:
+                row.append("–")
+                continue
+            outside = float(np.mean((energy[here] < low[here]) | (energy[here] > high[here])))
+            doubted = len(cells[name, at]) >= _ENOUGH and outside > 1.0 - _HELD
+            mean = float(cells[name, at].mean())
+            text = f"{rmse[name, at]:.1f} J, {mean:+.1f} ({len(cells[name, at])}){'*' if doubted else ''}"
+            row.append(Shaded(text, rmse[name, at] / most, alarm=doubted))
+        rows.append(row)
+    text = (
+        "RMSE of E, mean error (predicted less measured), and in brackets of how many metres; darker is worse. * and a dashed border: "
+        f"90 % intervals hold fewer than {100 * _HELD:.0f} % of {_ENOUGH} labels or more there: believe no interval on such ground. {audit}"
+    )
+    return Section(
+        f"Error by class and slope, {split}", text, header=["class", *(SLOPE_NAMES[at] for at in met)], rows=rows
+    )
+
+
+def _calibration(table: pa.Table) -> Section:
+    """Return how many labels lie below what the model states, for every share that it may state."""
+    plots = []
+    for split in pc.unique(table.column("split")).to_pylist():
+        part = table.filter(pc.equal(table.column("split"), split))
+        found = {q: shares for q in QUANTITIES if (shares := calibration(part, q)) is not None}
+        if not found:
+            continue
+        plot = new_plot(
+            f"calibration {split}",
+            alt=f"Share of labels of {split} below each quantile that the model states; on the diagonal it knows its own errors.",
+            axes=("share stated", f"share of {split} labels below"),
+            legend={_CALLED[q]: _COLOURS[q] for q in found},
+            height_px=320,
+            tools="save,hover",
+        )
+        plot.figure.hover.tooltips = [("", "$name"), ("stated", "@stated{0 %}"), ("found", "@found{0.0 %}")]
+        plot.figure.line([0, 1], [0, 1], color=FAINT, line_dash="dashed", line_width=2, name="known")
+        lines = [
+            plot.figure.line(
+                "stated", "found", source={"stated": LEVELS, "found": shares}, color=_COLOURS[q], line_width=2, name=_CALLED[q]
+            )
+            for q, shares in found.items()
+        ]  # fmt: skip
+        plot.figure.hover.renderers = lines
+        plots.append(plot)
+    text = (
+        "What share of labels lies below each quantile of the stated errors, taken as normal. On the diagonal the model knows how wrong it "
+        "is; steeper in the middle it is less sure than it could be, flatter too sure; all above it predicts too much."
+        if plots
+        else "The model states no errors: too few samples were held out."
+    )
+    return Section("Does it know how wrong it is", text, plots=plots)
+
+
+def paper_pictures(plots: Mapping[str, Plotted]) -> Iterator[Section]:
+    """Yield the paper's pictures: E of test samples and T of the unseen area, some of every class, each with its error."""
+    for split, quantity in (("test", "E"), ("unseen", "T")):
+        if split in plots:
+            label = f"{_CALLED[quantity]} [{UNITS[quantity]}]"
+            text = (
+                f"As the paper's figures. Below: the absolute percentage error; its axis ends at {MOST_PERCENT:.0f} %."
+            )
+            drawn = _by_patch(plots[split], quantity, label)
+            yield Section(f"{label}, {split}: measured and predicted", text, plots=drawn, stacked=True)
+
+
+def _by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
+    measured, predicted = (
+        np.asarray(told["E_measured" if quantity == "E" else "T_measured"], np.float64),
+        np.asarray(told["E_predicted" if quantity == "E" else "T_predicted"], np.float64),
+    )
+    number, classes = np.arange(1, len(measured) + 1), np.asarray(told["class"], np.str_)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        percent = 100.0 * np.abs(predicted - measured) / np.abs(measured)
+    source = {"patch": number, "class": classes, "measured": measured, "predicted": predicted, "percent": percent}
+    tips = [
+        ("", "@class, patch @patch"),
+        ("measured", "@measured{0.00}"),
+        ("predicted", "@predicted{0.00}"),
+        ("error", "@percent{0.0} %"),
+    ]
+    legend = {"measured": MEASURED, "predicted": PREDICTED}
+    values = new_plot(
+        f"patches {quantity}", alt=f"Measured and predicted {label} of some patches of every class.", axes=("", label),
+        legend=legend, tools="xpan,xwheel_zoom,reset,save", tooltips=tips,
+    )  # fmt: skip
+    errors = new_plot(
+        f"patch errors {quantity}", alt="Their absolute error in percent.", axes=("", "absolute error [%]"),
+        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, beside=values,
+    )  # fmt: skip
+    for name, colour in legend.items():
+        values.figure.line("patch", name, source=source, color=colour, line_width=1.5)
+        values.figure.scatter("patch", name, source=source, color=colour, size=4)
+    errors.figure.vbar(x="patch", top="percent", width=0.8, color=SPLIT_COLOURS["unseen"], source=source)
+    errors.figure.y_range.start = 0
+    if (percent[np.isfinite(percent)] > MOST_PERCENT).any():
+        errors.figure.y_range.end = MOST_PERCENT
+    _mark_classes(classes, [values, errors])
+    return [values, errors]
+
+
+def _mark_classes(classes: NDArray[np.str_], plots: Sequence[Plot]) -> None:
+    """Shade every other class, and write its name below."""
+    spans = {name: np.flatnonzero(classes == name) + 1 for name in dict.fromkeys(classes.tolist())}
+    for plot in plots:
+        odd = list(spans.values())[::2]
+        strip = plot.figure.vstrip(
+            x0=[rows[0] - 0.5 for rows in odd], x1=[rows[-1] + 0.5 for rows in odd], color=FAINT, alpha=0.15
+        )
+        strip.level = "underlay"
+        plot.figure.hover.renderers = [of for of in plot.figure.renderers if of is not strip]
+        plot.figure.xaxis.ticker = [int(rows.mean()) for rows in spans.values()]
+        plot.figure.xaxis.major_label_overrides = {int(rows.mean()): name for name, rows in spans.items()}
+        plot.figure.xaxis.major_label_orientation = 0.6
+        plot.figure.xgrid.visible = False

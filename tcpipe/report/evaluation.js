@@ -1,0 +1,99 @@
+"use strict";
+// An evaluation's page: samples measured against predicted and over slope, one of them in words, and the worst with their patches.
+page.ready.then(async () => {
+  const told = page.data;
+  const { at, make, fillSelect, pairs } = page;
+  at("chosen").closest("section").append(at("chosen"), at("stepping"));
+  const c = await page.unpack(told.samples);
+  const kinds = Object.fromEntries(told.quantities.map((one) => [one.key, one]));
+  const classes = new Map(told.classes.map((one) => [one.id, one]));
+  const source = page.model("samples").data_source;
+  const plot = { against: page.model("against"), off: page.model("off") };
+  const off = (i, key) => c[`${key} predicted`][i] - c[key][i];
+  const splitOf = (i) => told.splits[c.split[i]], classOf = (i) => classes.get(c.class[i]);
+  fillSelect(at("split"), told.splits.map((one) => one.name));
+  fillSelect(at("quantity"), Object.keys(kinds), (key) => kinds[key].called);
+
+  let shown = [];  // rows of the page, the worst first
+  function draw() {
+    const key = at("quantity").value, split = at("split").value, { called, unit } = kinds[key];
+    shown = [...c.split.keys()].filter((i) => (!split || splitOf(i).name === split) && Number.isFinite(off(i, key)));
+    shown.sort((a, b) => Math.abs(off(b, key)) - Math.abs(off(a, key)));
+    const of = at("colour").value === "split" ? splitOf : classOf;
+    const column = (values) => Float64Array.from(shown, values);
+    source.selected.indices = [];
+    source.data = {
+      measured: column((i) => c[key][i]), predicted: column((i) => c[`${key} predicted`][i]), error: column((i) => off(i, key)),
+      slope: column((i) => c.slope[i]), fill: shown.map((i) => of(i).colour), class: shown.map((i) => classOf(i).name),
+    };
+    const ends = (values) => values.filter(Number.isFinite).reduce(([low, high], v) => [Math.min(low, v), Math.max(high, v)], [Infinity, -Infinity]);
+    const both = ends([...source.data.measured, ...source.data.predicted]);
+    page.model("right against").data_source.data = { x: both, y: both };
+    page.model("right off").data_source.data = { x: ends([...source.data.slope]), y: [0, 0] };
+    plot.against.below[0].axis_label = `${called}, measured [${unit}]`;
+    plot.against.left[0].axis_label = `predicted [${unit}]`;
+    plot.off.left[0].axis_label = `${called}, predicted less measured [${unit}]`;
+    const there = [...new Set(shown.map(of))];
+    at("scale").replaceChildren(...page.legend(there.map((one) => [one.name, one.colour])));
+    at("row").max = shown.length;
+  }
+
+  // One sample in words.
+  const cell = new Map((told.patches?.rows ?? []).map((row, i) => [row, i]));
+  function inWords(i) {
+    const rows = told.quantities.map(({ key, called, unit, digits }) => {
+      const [label, said, std] = [c[key][i], c[`${key} predicted`][i], c[`${key} std`][i]];
+      const sure = Number.isFinite(std) ? ` ± ${std.toPrecision(2)}` : "";
+      const ends = ["low", "high"].map((end) => (said + c[`${key} ${end}`][i]).toFixed(digits));
+      const interval = Number.isFinite(c[`${key} low`][i]) ? ` (90 %: ${ends[0]} to ${ends[1]})` : "";
+      return [called, `measured ${label.toFixed(digits)}${sure}, predicted ${said.toFixed(digits)}${interval} ${unit}`];
+    });
+    return [
+      ...rows, ["slope", Number.isFinite(c.slope[i]) ? `${c.slope[i].toFixed(1)}°` : "none"], ["ground", classOf(i).name], ["split", splitOf(i).name],
+      ["where from", make("code", `tcpipe explain '${c.id[i].replaceAll("'", "'\\''")}' --dataset DIR`)],
+    ];
+  }
+  function show(places) {
+    const box = at("chosen"), { key, unit, digits } = kinds[at("quantity").value];
+    box.replaceChildren();
+    if (!places.length) {
+      box.append(make("p", "Click a point, draw a box, or go through them by Next, the worst first: what is chosen stands here."));
+      return;
+    }
+    const i = shown[places[0]];
+    at("row").value = places[0] + 1;
+    const left = make("div"), right = make("div");
+    if (places.length > 1) {
+      const errors = places.map((place) => off(shown[place], key)), mean = (values) => values.reduce((a, b) => a + b, 0) / values.length;
+      const kind = told.classes.map((one) => [one.name, places.filter((place) => c.class[shown[place]] === one.id).length]).filter(([, count]) => count);
+      left.append(make("b", `${places.length} chosen`), pairs([
+        ["mean error", `${mean(errors).toFixed(digits)} ${unit}`], ["RMSE", `${Math.sqrt(mean(errors.map((e) => e * e))).toFixed(digits)} ${unit}`],
+        ["ground", kind.map((pair) => pair.join(" ")).join(", ")]]), make("p", "The worst of them:"));
+    }
+    left.append(pairs(inWords(i)));
+    right.append(...(cell.has(i) ? page.patches(told.patches, cell.get(i)) : [make("p", "The page carries patches of the worst metres of E alone.", { className: "note" })]));
+    box.append(left, right);
+  }
+  const choose = (places) => { source.selected.indices = places; };
+  source.selected.change.connect(() => show([...source.selected.indices].sort((a, b) => a - b)));
+  const step = (by) => { const n = shown.length; if (n) choose([((source.selected.indices[0] ?? (by > 0 ? -1 : 0)) + by + n) % n]); };
+  at("before").onclick = () => step(-1);
+  at("after").onclick = () => step(1);
+  at("clear").onclick = () => choose([]);
+  at("row").onchange = () => { const place = at("row").valueAsNumber - 1; if (place >= 0 && place < shown.length) choose([place]); };
+  for (const id of ["split", "quantity", "colour"]) at(id).onchange = () => { draw(); show([]); };
+  draw();
+  show([]);
+
+  if (told.patches) {
+    page.gallery(told.patches, (i) => ({
+      kind: classOf(i).name, split: splitOf(i).name,
+      words: `${classOf(i).name} ${c.slope[i].toFixed(1)}°, ${c.E[i].toFixed(0)} J, predicted ${c["E predicted"][i].toFixed(0)} J, ${splitOf(i).name}`,
+    }), (i) => {
+      at("split").value = "";
+      draw();
+      choose([shown.indexOf(i)]);
+    });
+  }
+  document.documentElement.dataset.ready = "yes";
+});
