@@ -27,7 +27,12 @@ class Ended(BaseException):
 
 
 def prepare_process() -> None:
-    """Open standard files that are closed, print what is no text as escapes, and end in order on SIGTERM and SIGHUP."""
+    """Open standard files that are closed, print what is no text as escapes, and end in order on SIGTERM and SIGHUP.
+
+    Linear algebra gets one thread, unless the environment says otherwise: matrices here are small, more threads only wait for each other,
+    and bytes would depend on their number.
+    """
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     while (opened := os.open(os.devnull, os.O_RDWR)) <= 2:  # else a data file could become standard error
         pass
     os.close(opened)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import re
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, StoreError, UsageError, plain_lines
-from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, is_abandoned
+from tcpipe.formats.atomic import TEMPORARY_PREFIX, clear, clear_scratch, is_abandoned
 from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.numbered import numbers, read_sealed_at, stem_and_number
@@ -105,16 +107,22 @@ def prune(
         (removed if why is None else kept).append(Leftover(what, place.where(), _size(place), why))
         if why is None and not dry_run:
             _remove(place)
-    for path in _temporaries(opened, min_age_s):
-        removed.append(Leftover("left by a killed call", str(path), _size(DirectoryPlace(path))))
-        if not dry_run:
-            clear(path.parent)
+    left = [
+        Leftover("left by a killed call", str(path), _size(DirectoryPlace(path)))
+        for path in _temporaries(opened, min_age_s)
+    ]
+    removed += left
+    if left and not dry_run:
+        clear(Path(opened.root))
     for what, place, entries, why in (*_spooled(opened, min_age_s), *_replaced(opened, min_age_s)):
         (removed if why is None else kept).extend(
             Leftover(what, place.where(of.name), of.size_bytes, why) for of in entries
         )
         for entry in entries if why is None and not dry_run else ():
             place.delete(entry.name)
+    if not dry_run:
+        clear_scratch()
+        _remove_empty(opened, min_age_s)
     if removed and not dry_run:
         opened.keep_index(opened.ingestions())
     return Pruned(str(opened.root), dry_run, tuple(removed), tuple(kept), sum(each.size_bytes for each in removed))
@@ -238,6 +246,17 @@ def _remove(place: Place) -> None:
     """Remove a run or an ingestion: its documents first, so that no reader looks for the rest."""
     for entry in sorted(place.entries(), key=lambda entry: stem_and_number(entry.name) is None):
         place.delete(entry.name)
+
+
+def _remove_empty(store: Store, min_age_s: float) -> None:
+    """Remove the directories, on disk, that a prune left empty which was killed between the last file and its directory."""
+    runs = store.runs_place
+    if not isinstance(runs, DirectoryPlace):
+        return
+    for above, _, files in os.walk(runs.root, topdown=False):
+        with suppress(OSError):  # it is not empty, or gone
+            if not files and Path(above) != runs.root and time.time() - Path(above).stat().st_mtime >= min_age_s:
+                Path(above).rmdir()
 
 
 def _written_ns(row: RunFacts) -> int:

@@ -2,6 +2,8 @@
 
 import os
 import signal
+import subprocess
+import sys
 import threading
 
 import pytest
@@ -40,3 +42,13 @@ def test_who_ends_in_time_and_other_signals_are_left_alone(ended):
     signal.signal(signal.SIGALRM, before)
     assert not event.wait(0.2)
     assert codes == []
+
+
+def test_linear_algebra_has_one_thread_unless_the_environment_says_otherwise():
+    told = "import os, sys, tcpipe.cli.process as p; p.prepare_process(); print(os.environ['OPENBLAS_NUM_THREADS'], 'numpy' in sys.modules)"
+    for given, wanted in (({}, "1 False\n"), ({"OPENBLAS_NUM_THREADS": "3"}, "3 False\n")):
+        environment = {key: value for key, value in os.environ.items() if key != "OPENBLAS_NUM_THREADS"} | given
+        found = subprocess.run(
+            [sys.executable, "-c", told], env=environment, capture_output=True, text=True, check=True
+        )
+        assert found.stdout == wanted

@@ -1,5 +1,6 @@
 """What is held out is predicted by the rest; turning is worth what a drive without it lacks."""
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -37,3 +38,12 @@ def test_no_metres_no_fit():
     metres = made(9, 19)
     assert physics_of(metres, standing_watt=STANDING_WATT) is None
     assert physics_of(metres.take(np.arange(0)), standing_watt=STANDING_WATT) is None
+
+
+def test_many_metres_are_not_drawn_all_at_once():
+    metres = made(10, 2000)
+    tracemalloc.start()
+    physics_of(metres, standing_watt=STANDING_WATT)
+    peak_bytes = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak_bytes < 2000 * 2000, "3.2 kB a metre are 6 GB of two million"

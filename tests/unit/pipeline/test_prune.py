@@ -1,6 +1,7 @@
 """What goes from a store and what stays: nothing of a dataset, nothing of somebody else, each thing whole or not at all."""
 
 import os
+import tempfile
 from dataclasses import replace
 
 import numpy as np
@@ -89,7 +90,7 @@ def test_what_is_kept_and_what_is_somebody_else_s_stays(store):
 
 
 def test_what_a_killed_call_left_goes_when_it_is_old(store):
-    holder = store.root / ".tmp-d-12345678"
+    holder, other = (store.root / f".tmp-{name}-12345678" for name in "de")
     (holder / "d").mkdir(parents=True)
 
     def planned():
@@ -99,8 +100,31 @@ def test_what_a_killed_call_left_goes_when_it_is_old(store):
     assert planned() == []
     os.utime(holder, (0, 0))
     assert planned() == [str(holder)]
-    prune(store=store.root, recipe=Recipe())
+    other.mkdir()
+    os.utime(other, (0, 0))
+    assert len(prune(store=store.root, recipe=Recipe(), keep=["a", "b"]).removed) == 2
     assert not holder.exists()
+    assert not other.exists()
+
+
+def test_the_scratch_of_a_killed_call_goes(store, tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    left = tmp_path / f"tcpipe-{os.getuid()}-0123abcd"
+    left.mkdir()
+    prune(store=store.root, recipe=Recipe(), dry_run=True)
+    assert left.is_dir()
+    prune(store=store.root, recipe=Recipe())
+    assert not left.exists()
+
+
+def test_a_directory_that_a_killed_prune_left_empty_goes_when_it_is_old(store):
+    empty = store.root / "runs" / "gone" / "0123abcd"
+    empty.mkdir(parents=True)
+    prune(store=store.root, recipe=Recipe(), min_age_s=60.0)
+    assert empty.is_dir()
+    prune(store=store.root, recipe=Recipe(), min_age_s=0.0)
+    assert not empty.parent.exists()
+    assert len(there(store)) == 2
 
 
 def test_a_kill_in_the_midst_of_it_leaves_what_no_reader_sees_and_a_later_call_removes(store, monkeypatch):
