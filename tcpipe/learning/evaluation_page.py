@@ -11,7 +11,7 @@ from tcpipe.learning.baselines import verdicts
 from tcpipe.learning.evaluation import EXPECTED
 from tcpipe.learning.evaluation_facts import SPLITS, ErrorsByClass, Evaluation, Leakage
 from tcpipe.learning.evaluation_figures import EvaluatedSamples, page_data, paper_pictures, sample_sections
-from tcpipe.learning.evaluation_verdict import verdict
+from tcpipe.learning.evaluation_verdict import verdict, worst_first
 from tcpipe.learning.metrics import ALL, LEAST, QUANTITIES, UNITS, Errors
 from tcpipe.learning.wei_isler import GRASS_ONLY, OURS, PER_CLASS
 from tcpipe.report.page import Number, Section, Verdict, render_page
@@ -58,7 +58,7 @@ def evaluation_page(
     return render_page(
         title=title,
         lead=lead,
-        verdict=[*claimed, *verdict(found)],
+        verdict=worst_first([*claimed, *verdict(found)]),
         numbers=[
             Number(
                 f"{found.splits[name].errors[quantity][ALL].mape_percent or float('nan'):.2f} %",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 from tcpipe.learning.baselines import CURVES, PHYSICS, TREES, standing
 from tcpipe.learning.evaluation_facts import Evaluation
@@ -26,8 +26,13 @@ _AS_GOOD_AS_LABELS = 0.7
 def verdict(found: Evaluation) -> list[Verdict]:
     """Return the sentences: of no use, good, thin, doubtful, then what to do."""
     told = [line for split in found.ordered_splits for line in _of_split(found, split)]
+    return worst_first([*told, *_to_do(found)])
+
+
+def worst_first(lines: Sequence[Verdict]) -> list[Verdict]:
+    """Return sentences of a verdict in the order in which they are read: doubtful, good, thin, what to do."""
     order = ("doubtful", "good", "thin", "do")
-    return sorted([*told, *_to_do(found)], key=lambda line: order.index(line.kind))
+    return sorted(lines, key=lambda line: order.index(line.kind))
 
 
 def is_of_no_use(found: Evaluation) -> bool:
@@ -37,13 +42,13 @@ def is_of_no_use(found: Evaluation) -> bool:
 
 def _of_split(found: Evaluation, split: str) -> Iterator[Verdict]:
     part, where = found.splits[split], "test" if split == "test" else "the unseen area"
-    for quantity, called in (("E", "energy"), ("T", "time")):
-        error = part.errors[quantity][ALL]
-        if (error.mape_percent or 0.0) >= _NO_USE_PERCENT:
-            yield Verdict(
-                "doubtful",
-                f"Of no use for {called}: on {where} it is off by {error.mape_percent:.0f} % on average (MAPE).",
-            )
+    off = [
+        f"{called} is off by {of.mape_percent:.0f} %"
+        for quantity, called in (("E", "energy"), ("T", "time"))
+        if ((of := part.errors[quantity][ALL]).mape_percent or 0.0) >= _NO_USE_PERCENT
+    ]
+    if off:
+        yield Verdict("doubtful", f"Of no use: on {where} {' and '.join(off)} on average (MAPE).")
     yield from _beside_the_simplest(found, split, where)
     yield from _sureness(part.errors["E"][ALL], where)
     yield from _weak_classes(part.errors["E"], where)

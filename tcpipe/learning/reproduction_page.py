@@ -61,7 +61,13 @@ def reproduction_page(
             _sources(quick=quick),
         ],
         warnings=[SIMULATED, *([_QUICK] if quick else [])],
-        claimed=[Verdict(_KINDS[claim.verdict], f"{claim.says}, {claim.split}: {claim.verdict}.") for claim in claims],
+        claimed=[
+            Verdict(
+                kind, f"Claims {name}: {'; '.join(f'{of.says} ({of.split})' for of in claims if of.verdict == name)}."
+            )
+            for name, kind in _KINDS.items()
+            if name in verdicts
+        ],
     )
 
 

@@ -166,6 +166,7 @@ def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:
             for name, colour in (("measured", DROPPED), ("predicted", SPLIT_COLOURS["train"]))
         ]
         plot.figure.hover.mode = "vline"
+        plot.figure.yaxis.formatter.use_scientific = False
         first = plot
         yield plot
 

@@ -65,7 +65,7 @@ def test_a_model_that_is_better_and_knows_its_errors_is_good():
 def test_half_off_and_more_is_of_no_use():
     found, said = told(replace(GOOD, mape_percent=95.2))
     assert is_of_no_use(found)
-    assert "Of no use for energy: on the unseen area it is off by 95 % on average" in said["doubtful"]
+    assert "Of no use: on the unseen area energy is off by 95 % on average" in said["doubtful"]
     assert "worst metres" in said["do"]
     assert verdict(found)[0].kind == "doubtful"
 
