@@ -81,7 +81,8 @@ def _as_promised(done: subprocess.CompletedProcess[str]) -> subprocess.Completed
         for text in done.stdout.splitlines() if command == "ingest" else [done.stdout]:
             said = json.loads(text)
             cls = known.get(f"{command}-{said.get('kind')}.answer") or known.get(f"{command}.answer")
-            assert cls is None or plain(typed(said, cls, Path(command))) == said
+            assert cls is not None, f"{command} --json has no contract"
+            assert plain(typed(said, cls, Path(command))) == said
     return done
 
 

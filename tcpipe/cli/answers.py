@@ -29,8 +29,11 @@ def answers() -> dict[str, type]:
     from tcpipe.pipeline.layers import ExportedLayers
     from tcpipe.pipeline.log_inspection import InspectedLog
     from tcpipe.pipeline.maps import AddedMap
+    from tcpipe.pipeline.migrate import Migrated
     from tcpipe.pipeline.overlay import Overlay
     from tcpipe.pipeline.preflight import Preflight
+    from tcpipe.pipeline.prune import Pruned
+    from tcpipe.pipeline.status import Status
     from tcpipe.pipeline.table_proposal import InspectedTables
     from tcpipe.pipeline.verify import Verified
     from tcpipe.planning.cost_map import CostMapCard, CostMapResult
@@ -65,12 +68,15 @@ def answers() -> dict[str, type]:
         "inspect-run.answer": InspectedRun,
         "inspect-store.answer": InspectedStore,
         "inspect-tables.answer": InspectedTables,
+        "migrate.answer": Migrated,
         "overlay.answer": Overlay,
         "plan-path.answer": PlanResult,
         "predict-path.answer": PathResult,
         "preflight.answer": Preflight,
+        "prune.answer": Pruned,
         "reproduce.answer": Reproduction,
         "simulate.answer": SimulatedSite,
+        "status.answer": Status,
         "train.answer": TrainResult,
         "verify.answer": Verified,
     }

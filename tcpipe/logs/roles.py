@@ -306,7 +306,7 @@ def _is_usable(decided: _Decisions, topic: Topic, ignored: Sequence[str]) -> boo
 # Words of topic names, matched from the start of a word: zed matches zed, zed2i and zedx.
 _FUSED = re.compile(
     r"filtered|fused|fusion|ekf|ukf|kalman|icp|truth|groundtruth|gazebo|amcl|locali[sz]|loam|lio|lidar|laser|scan|"
-    r"cartographer|hector|slam$|slam_toolbox|map$|mapping|global|world|gt$"
+    r"cartographer|hector|slam$|slam_toolbox|map$|mapping|global|world|gt$|kf$"
 )
 _SLAM = re.compile(r"icp$|slam|loam|lego_?loam|(fast)?_?lio|liosam|cartographer|hector$|kiss$")
 """Poses from a laser, matched scan by scan: what is told by nothing else in the log."""
@@ -549,8 +549,8 @@ def _without_motion(decided: _Decisions, topics: Sequence[Topic]) -> list[str]:
     if any(role in decided.roles or role in decided.undecided for role in MOTION_ROLES):
         return []
     lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
-    types = {topic.name: topic.type_name for topic in topics}
-    could = {name: why for name, why in decided.left_out.items() if _is_motion(types[name])}
+    types = {topic.name: topic.type_name for topic in topics if topic.message_count != 0}
+    could = {name: why for name, why in decided.left_out.items() if _is_motion(types.get(name, ""))}
     if could:
         name = next(iter(could))
         role = "gnss" if types[name] in ROLE_TYPES["gnss"] else "wheel_odometry"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from tcpipe.errors import LogError
-from tcpipe.logs.mapped import MAPPED
+from tcpipe.logs.names_of_fields import CALLED, fields_called
 from tcpipe.recipe.checking import as_toml
 
 
@@ -26,39 +26,6 @@ class InspectedTables:
     recipe: str
     """TOML; "" where no column says what it is."""
 
-
-_ANY_UNIT = re.compile(r"\s*[\[(].*|_?(deg|rad|m|mps2?|radps|volt|amp)$")
-
-
-def _axes(before: str, name: str) -> dict[str, str]:
-    return {f"{name}_{axis}": rf"(.*[_.])?({before})[_.]?{axis}" for axis in "xyz"}
-
-
-_VELOCITY = {"linear_x": r"(.*[_.])?(t?l(in(ear)?)?|v(el(ocity)?)?)[_.]?x|speed|velocity|forward_velocity|v"}
-_TURN = {"angular_z": r"(.*[_.])?(t?a(ng(ular)?)?|w|omega)[_.]?z|yaw_?rate|omega"}
-_CALLED: dict[str, dict[str, str]] = {
-    "gnss": {
-        "latitude": r"(.*[_.])?lat(itude)?",
-        "longitude": r"(.*[_.])?(lon(gitude)?|lng|long)",
-        "altitude": r"(.*[_.])?(alt(itude)?|height|h)",
-        "east_std": r"sde",
-        "north_std": r"sdn",
-        "up_std": r"sdu",
-    },
-    "imu": {
-        **_axes("w|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),
-        **_axes("a|acc(el)?|lin(ear)?_?acc(el(eration)?)?", "linear_acceleration"),
-    },
-    "command": {**_VELOCITY, **_TURN},
-    "wheel_odometry": {**_VELOCITY, **_TURN},
-    "power": {"voltage": r"(.*[_.])?volt(age)?", "current": r"(.*[_.])?(curr(ent)?|amps?)"},
-    "pose": {
-        "x": r"[tp]?x|pos(ition)?[_.]?x|east(ing)?",
-        "y": r"[tp]?y|pos(ition)?[_.]?y|north(ing)?",
-        "z": r"[tp]?z|pos(ition)?[_.]?z|up|height",
-    },
-}
-"""What columns are called that play a field of a role; the first role whose fields are all there is proposed."""
 
 _COMMAND = re.compile(r"cmd|command|joy")
 _BARE = {"voltage": re.compile(r"volt"), "current": re.compile(r"curr|amp")}
@@ -104,16 +71,11 @@ def _tables(columns: Mapping[str, Sequence[str]]) -> Iterator[str]:
 
 def _role(file: str, names: Sequence[str]) -> tuple[str | None, dict[str, str]]:
     """Return the role that a table plays by its columns, and which column is which field."""
-    for role, called in _CALLED.items():
+    for role in CALLED:
         if (role in ("command", "wheel_odometry")) and (role == "command") != bool(_COMMAND.search(file.lower())):
             continue
-        found: dict[str, str] = {}
-        for field, pattern in called.items():
-            match = next((n for n in names if re.fullmatch(pattern, _ANY_UNIT.sub("", n.lower()))), None)
-            if match is not None and match not in found.values():
-                found[field] = match
-        needed = [field for field, of in MAPPED[role].items() if of.needed]
-        if found and all(field in found for field in needed) and (role != "power" or len(found) == 2):
+        found = fields_called(role, names)
+        if found and (role != "power" or len(found) == 2):
             return role, found
     for quantity, word in _BARE.items():
         if word.search(Path(file).stem.lower()) and len(names) == 2:

@@ -9,6 +9,7 @@ import resource
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -453,7 +454,8 @@ def _topic(channel: Channel, types: TypeLibrary) -> Topic:
     elif not channel.type_name:
         problem = "the log does not say of which type its messages are"
     elif not channel.definition.strip() and not types.knows(channel.type_name):
-        problem = f"type {channel.type_name} is unknown: the log holds no definition of it, and none is bundled; give its .msg files"
+        where = "the log holds no definition of it, and none is bundled"
+        problem = f"type {channel.type_name} is unknown: {where}; give its .msg files with --msgdef DIR"
     return Topic(
         channel.topic,
         channel.type_name,
@@ -474,7 +476,14 @@ def _open_file(path: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]
 
 def _open_directory(directory: Path, stack: ExitStack, fetched: Mapping[Path, FetchedFile]) -> _OpenFiles:
     """Open the files of a ROS 2 bag; one that cannot be opened costs only itself."""
-    found = rosbag2_files(directory)
+    try:
+        found = rosbag2_files(directory)
+    except LogError as error:
+        below = [str(path) for path in islice(_logs_below(directory), _LISTED + 1) if path.parent != directory]
+        if not below:
+            raise
+        names = ", ".join(below[:_LISTED]) + (" and more" if len(below) > _LISTED else "")
+        raise LogError(*error.problems, f"{directory}: logs lie below it, give one of them: {names}") from None
     _allow_files(len(found.paths))
     parts, damage, errors = [], list(found.damage), []
     for file in found.paths:

@@ -174,7 +174,9 @@ class TypeLibrary:
             where = (
                 "the log holds no definition of it" if not definition.strip() else "its definition names other types"
             )
-            raise DefinitionError(f"type {type_name} is unknown: {where}, and none is bundled; give its .msg files")
+            raise DefinitionError(
+                f"type {type_name} is unknown: {where}, and none is bundled; give its .msg files with --msgdef DIR"
+            )
         definitions: _Definitions = {}
         wire = _Unfold(known, fallback, definitions).record(type_name, ())
         if wire.leaves > MAX_COLUMNS:

@@ -81,29 +81,23 @@ def _by_metadata(directory: Path, present: tuple[Path, ...], information: Mappin
     if isinstance(named, list) and len(named) > MAX_FILES:
         raise LogError(f"{directory}: {METADATA} names {len(named)} files; bags of up to {MAX_FILES} are read")
     listed = [Path(name).name for name in named if isinstance(name, str)] if isinstance(named, list) else []
-    paths, damage = [], []
-    for name in dict.fromkeys(listed):
-        path = next((p for p in (directory / name, directory / f"{name}.zstd") if _is_file(p)), None)
-        if path is None:
-            damage.append(Damage(f"{directory.name}/{name}", f"{METADATA} names this file, but it is not there"))
-        else:
-            paths.append(path)
+    here = {name: next(filter(_is_file, (directory / name, directory / f"{name}.zstd")), None) for name in listed}
+    paths = [path for path in here.values() if path is not None]
+    missing = [name for name, path in here.items() if path is None]
     taken = set(paths)
-    for path in present:
-        if path not in taken and path.with_name(path.name.removesuffix(".zstd")) not in taken:
-            damage.append(
-                Damage(
-                    f"{directory.name}/{path.name}",
-                    f"{METADATA} does not name this file; it is read all the same",
-                    messages_lost=0,
-                )
-            )
-            paths.append(path)
+    extra = [p for p in present if p not in taken and p.with_name(p.name.removesuffix(".zstd")) not in taken]
+    paths += extra
+    count = information.get("message_count")
+    if missing and len(missing) == len(extra) and _is_count(count):  # renamed: the count tells whether anything is lost
+        lost = [(path.name, f"{METADATA} calls this file {name}", 0) for path, name in zip(extra, missing, strict=True)]
+    else:
+        lost = [(name, f"{METADATA} names this file, but it is not there", None) for name in missing]
+        lost += [(path.name, f"{METADATA} does not name this file; it is read all the same", 0) for path in extra]
+    damage = tuple(Damage(f"{directory.name}/{name}", what, messages_lost=cost) for name, what, cost in lost)
     if not paths:
         names = ", ".join(listed[:_LISTED]) + (", …" if len(listed) > _LISTED else "")
         raise LogError(f"{directory}: not a ROS 2 bag: no file that {METADATA} names is there ({names or 'none'})")
-    count = information.get("message_count")
-    return Rosbag2Files(tuple(paths), tuple(damage), count if _is_count(count) else None, _topic_counts(information))
+    return Rosbag2Files(tuple(paths), damage, count if _is_count(count) else None, _topic_counts(information))
 
 
 def _is_file(path: Path) -> bool:

@@ -265,6 +265,7 @@ def test_a_log_without_motion_says_so_in_three_lines_and_how_to_use_what_was_lef
     assert '[read.topics] wheel_odometry = ["/odometry/filtered"]' in found.problems[1]
     assert "/chatter (std_msgs/msg/String" in found.problems[2]
     assert len(assign(("/chatter", "std_msgs/msg/String")).problems) == 2
+    assert len(assign_roles([topic("/odom", ODOMETRY, count=0)], {}).problems) == 2, "an empty topic is no way out"
 
 
 def test_empty_and_unreadable_topics_play_nothing() -> None:
@@ -294,6 +295,7 @@ def test_empty_and_unreadable_topics_play_nothing() -> None:
         ("/velocity", STAMPED, "wheel_odometry"),
         ("/wheels/twist", "geometry_msgs/msg/TwistWithCovarianceStamped", "wheel_odometry"),
         ("/ukf/odom", ODOMETRY, None),
+        ("/odom_kf", ODOMETRY, None),
         ("/zed/odometry/filtered", ODOMETRY, None),
         ("/ground_truth/state", ODOMETRY, None),
         ("/lio_sam/mapping/odometry", ODOMETRY, None),

@@ -303,6 +303,17 @@ def test_directories_that_are_no_bag_are_refused(tmp_path):
         open_log(tmp_path / "nowhere.mcap")
 
 
+def test_of_a_folder_of_logs_one_is_to_be_given(tmp_path):
+    for day in range(9):
+        (tmp_path / f"{day}").mkdir()
+        (tmp_path / f"{day}" / "a.bag").touch()
+    with pytest.raises(LogError) as refused:
+        open_log(tmp_path)
+    assert refused.value.problems[1].endswith(
+        "/0/a.bag, " + ", ".join(f"{tmp_path}/{n}/a.bag" for n in "1234") + " and more"
+    )
+
+
 def test_a_topic_that_is_not_there_is_named_with_those_that_are(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", random_messages(19, count=3, types=TYPES[:1]))
     with open_log(path) as log, pytest.raises(LogError, match="there is no topic /nope; it has /Imu"):
@@ -321,6 +332,20 @@ def test_a_file_of_a_bag_that_is_missing_or_broken_costs_only_itself(tmp_path):
         said = [str(damage) for damage in log.damage]
     assert any("run_1.db3" in line and "not there" in line for line in said)
     assert any("run_2.db3" in line and "is empty" in line for line in said)
+
+
+def test_a_renamed_file_of_a_bag_is_no_damage_unless_messages_are_missing(tmp_path):
+    messages = random_messages(22, count=20, types=TYPES[:2])
+    bag = write_rosbag2(tmp_path / "run", messages)
+    next(bag.glob("*.db3")).rename(bag / "mine.db3")
+    with open_log(bag) as log:
+        assert_same(log.table("/Imu"), expected_columns(messages, "/Imu"))
+        assert [damage.is_loss for damage in log.damage] == [False] * len(log.damage)
+        assert "mine.db3: metadata.yaml calls this file run.db3" in str(log.damage[0])
+    counted = (bag / "metadata.yaml").read_text()
+    (bag / "metadata.yaml").write_text(counted.replace("message_count: 20", "message_count: 21"))
+    with open_log(bag) as log:
+        assert any(damage.is_loss for damage in log.damage)
 
 
 def test_an_open_db3_with_a_journal_is_read_whole(tmp_path):

@@ -1,0 +1,99 @@
+"""Which field of a role a column is, or a field of somebody's own message type, by what it is called."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+
+from tcpipe.logs.mapped import MAPPED
+from tcpipe.logs.msg_text import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
+from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
+from tcpipe.logs.topics import Topic
+
+_ANY_UNIT = re.compile(r"\s*[\[(].*|_?(deg|rad|m|mps2?|radps|volt|amp)$")
+
+
+def _axes(before: str, name: str) -> dict[str, str]:
+    return {f"{name}_{axis}": rf"(.*[_.])?({before})[_.]?{axis}" for axis in "xyz"}
+
+
+_VELOCITY = {"linear_x": r"(.*[_.])?(t?l(in(ear)?)?|v(el(ocity)?)?)[_.]?x|speed|velocity|forward_velocity|v"}
+_TURN = {"angular_z": r"(.*[_.])?(t?a(ng(ular)?)?|w|omega)[_.]?z|yaw_?rate|omega"}
+CALLED: Mapping[str, Mapping[str, str]] = {
+    "gnss": {
+        "latitude": r"(.*[_.])?lat(itude)?",
+        "longitude": r"(.*[_.])?(lon(gitude)?|lng|long)",
+        "altitude": r"(.*[_.])?(alt(itude)?|height|h)",
+        "east_std": r"sde",
+        "north_std": r"sdn",
+        "up_std": r"sdu",
+    },
+    "imu": {
+        **_axes("w|gyro?|ang(ular)?_?vel(ocity)?|angular_velocity|omega", "angular_velocity"),
+        **_axes("a|acc(el)?|lin(ear)?_?acc(el(eration)?)?", "linear_acceleration"),
+    },
+    "command": {**_VELOCITY, **_TURN},
+    "wheel_odometry": {**_VELOCITY, **_TURN},
+    "power": {"voltage": r"(.*[_.])?volt(age)?", "current": r"(.*[_.])?(curr(ent)?|amps?)"},
+    "pose": {
+        "x": r"[tp]?x|pos(ition)?[_.]?x|east(ing)?",
+        "y": r"[tp]?y|pos(ition)?[_.]?y|north(ing)?",
+        "z": r"[tp]?z|pos(ition)?[_.]?z|up|height",
+    },
+}
+"""What is called how, as patterns of names in lower case without a unit; the likelier role first."""
+
+_PROPOSED = ("gnss", "imu")
+"""Roles whose fields are called so that nothing else is taken for them."""
+_DEEPEST = 4
+
+
+def fields_called(role: str, names: Sequence[str]) -> dict[str, str]:
+    """Return the name of each field of a role; {} where one is missing that the role needs."""
+    found: dict[str, str] = {}
+    for field, pattern in CALLED[role].items():
+        match = next((name for name in names if re.fullmatch(pattern, _ANY_UNIT.sub("", name.lower()))), None)
+        if match is not None and match not in found.values():
+            found[field] = match
+    return found if all(field in found for field, of in MAPPED[role].items() if of.needed) else {}
+
+
+def proposed_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterator[str]:
+    """Yield one line for each message type that no role knows and whose fields are called as those of a role that nothing can play.
+
+    Parameters
+    ----------
+    topics
+        The log's topics; what a definition in the log does not tell cannot be proposed.
+    settled
+        Roles that are played, or that the recipe speaks of.
+    """
+    held = [of for of in topics if of.message_count != 0 and of.problem is None and not of.name.startswith(OVERLAY)]
+    types = {topic.type_name for topic in held}
+    for role in _PROPOSED:
+        if role in settled or types & set(ROLE_TYPES[role]):
+            continue
+        for topic in held:
+            if found := fields_called(role, _numbers(topic)):
+                lines = ", ".join(f'{role}.{field} = "{name}"' for field, name in found.items())
+                yield (
+                    f"{topic.name} ({topic.type_name}) could play {role}, by what its fields are called; where their units and axes "
+                    f'are right, the recipe says: [read.topics] {role} = ["{topic.name}"] and [read.fields] {lines}'
+                )
+
+
+def _numbers(topic: Topic) -> list[str]:
+    """Return the dotted names of a message's numbers; none where its definition cannot be read."""
+    try:
+        return list(_below(parse_msg(topic.definition, topic.type_name), topic.type_name))
+    except MsgTextError:
+        return []
+
+
+def _below(messages: Mapping[str, FieldTypes], type_name: str, prefix: str = "") -> Iterator[str]:
+    for name, of in messages.get(type_name, ()):
+        dotted = f"{prefix}{name}"
+        if of.length is None and of.name in BASE_TYPES - {"string", "wstring"}:
+            yield dotted
+        elif of.length is None and dotted.count(".") < _DEEPEST:
+            yield from _below(messages, of.name, f"{dotted}.")

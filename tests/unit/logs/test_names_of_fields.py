@@ -1,0 +1,83 @@
+"""What a message type of somebody's own could play is told by its definition, and by nothing that is of another role."""
+
+from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.logs.names_of_fields import fields_called, proposed_roles
+from tcpipe.logs.topics import Topic
+from tcpipe.recipe import ReadConfig
+from tcpipe.stages.read_roles import roles_by
+
+RTK = """std_msgs/Header header
+float64 latitude
+float64 longitude   # deg
+float64 altitude
+float64 utm_easting
+uint8 zone
+string letter
+"""
+IMU_INSIDE = f"""Header header
+sensor_msgs/Imu imu
+string raw
+{"=" * 80}
+MSG: sensor_msgs/Imu
+geometry_msgs/Vector3 angular_velocity
+float64[9] angular_velocity_covariance
+geometry_msgs/Vector3 linear_acceleration
+{"=" * 80}
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+
+
+def topic(
+    name: str, definition: str, kind: str = "driver/msg/Own", problem: str | None = None, count: int = 9
+) -> Topic:
+    return Topic(name, kind, count, 0, 10**9, "ros1", definition, problem)
+
+
+def test_a_receiver_s_own_message_is_proposed_with_the_lines_of_the_recipe() -> None:
+    (said,) = proposed_roles([topic("/rtk", RTK)], settled=())
+    assert '[read.topics] gnss = ["/rtk"]' in said
+    assert '[read.fields] gnss.latitude = "latitude", gnss.longitude = "longitude", gnss.altitude = "altitude"' in said
+
+
+def test_fields_are_looked_for_in_the_messages_inside_a_message() -> None:
+    (said,) = proposed_roles([topic("/vectornav", IMU_INSIDE)], settled=())
+    assert 'imu.angular_velocity_z = "imu.angular_velocity.z"' in said
+    assert 'imu.linear_acceleration_x = "imu.linear_acceleration.x"' in said
+
+
+def test_nothing_is_proposed_for_what_is_played_or_cannot_be_read_or_lacks_a_field() -> None:
+    assert not list(proposed_roles([topic("/rtk", RTK)], settled={"gnss"}))
+    fix = topic("/fix", "", "sensor_msgs/msg/NavSatFix")
+    assert not list(proposed_roles([topic("/rtk", RTK), fix], settled=()))
+    others = [
+        topic("/empty", RTK, count=0),
+        topic("/lost", RTK, problem="encoded as json"),
+        topic("/text", RTK.replace("float64 latitude", "string latitude")),
+        topic("/half", "float64 latitude"),
+        topic("/broken", "float64 latitude\nfloat64 longitude\n???\n"),
+        topic("/endless", f"Own inner\n{'=' * 80}\nMSG: driver/Own\nOwn inner\n"),
+        topic("/tcpipe/track", RTK),
+    ]
+    assert not list(proposed_roles(others, settled=()))
+
+
+def test_a_log_without_motion_asks_with_the_proposal_and_one_with_motion_warns_with_it() -> None:
+    odom = topic("/odom", "", "nav_msgs/msg/Odometry")
+    alone = roles_by(ReadConfig(), [topic("/rtk", RTK)], None, known=shipped_profiles())
+    assert alone.problems[-1].startswith("/rtk (driver/msg/Own) could play gnss")
+    beside = roles_by(ReadConfig(), [topic("/rtk", RTK), odom], None, known=shipped_profiles())
+    assert not beside.problems
+    assert beside.warnings[-1] == alone.problems[-1]
+    ignored = roles_by(ReadConfig(ignore_topics=("/rtk",)), [topic("/rtk", RTK), odom], None, known=shipped_profiles())
+    assert not any("/rtk" in line for line in ignored.warnings)
+
+
+def test_columns_are_told_with_their_units_left_off() -> None:
+    assert fields_called("gnss", ["time", "lat_deg", "lon (deg)", "h_m"]) == {
+        "latitude": "lat_deg",
+        "longitude": "lon (deg)",
+        "altitude": "h_m",
+    }
