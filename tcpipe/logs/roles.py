@@ -552,10 +552,11 @@ def _without_motion(decided: _Decisions, topics: Sequence[Topic]) -> list[str]:
     types = {topic.name: topic.type_name for topic in topics if topic.message_count != 0}
     could = {name: why for name, why in decided.left_out.items() if _is_motion(types.get(name, ""))}
     if could:
-        name = next(iter(could))
-        role = "gnss" if types[name] in ROLE_TYPES["gnss"] else "wheel_odometry"
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
-        lines.append(f'left out: {reasons}; to use one all the same: [read.topics] {role} = ["{name}"]')
+        name = next((name for name in could if not name.startswith(OVERLAY)), "")
+        role = "gnss" if types.get(name) in ROLE_TYPES["gnss"] else "wheel_odometry"
+        advice = f'; to use one all the same: [read.topics] {role} = ["{name}"]' if name else ""
+        lines.append(f"left out: {reasons}{advice}")
     return [*lines, *_undecodable(topics), f"the log holds {listing(topics)}"]
 
 

@@ -284,7 +284,9 @@ def _mend(topics: Sequence[RoleTopic], promise: Promise | None, span_s: float) -
     if promise is not None and span_s < _SHORT_S:
         yield f"the log is {span_s:.0f} s long: record a minute as it will be driven, for a prediction that holds"
     if promise is not None and not promise.segments:
-        yield "there is no segment in it: drive straight at one speed for some metres"
+        lost = max(promise.ledger_m, key=lambda name: promise.ledger_m[name], default="")
+        cure = REMEDIES["gap"] if lost == "gap" else "drive straight at one speed for some metres"
+        yield f"there is no segment in it: {cure}"
 
 
 def _costs(labelled: LabelledSegments) -> Iterator[str]:

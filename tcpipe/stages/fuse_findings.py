@@ -73,14 +73,16 @@ def fuse_warnings(inputs: FusionInputs, facts: FuseFacts) -> tuple[str, ...]:
     found += _reopened(facts)
     common = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
     if common > _COMMON:
+        what = "these fixes are too few or too coarse to" if GNSS in facts.sensors else "a GNSS would"
         found.append(
             f"nothing tells how long a metre of odometry is: its scale stays 1, and {common:.0%} are in the deviations of velocity, "
-            "duration, power and energy as one error of the whole run; a GNSS would tell it"
+            f"duration, power and energy as one error of the whole run; {what} tell it"
         )
     if IMU not in facts.sensors:
         found.append("no IMU is used: attitude is inferred from the path; roll and pitch are weak")
     found += [
-        f"{role}: {facts.rejected[role]} of {count} measurements were refused by the gate (rejections.parquet)"
+        f"{role}: {facts.rejected[role]} of {count} measurements were refused by the gate (rejections.parquet); "
+        f"if it is what errs, leave it out: [read.topics] {role} = []"
         for role, count in facts.measurements.items()
         if facts.rejected[role] > _MANY_REFUSED * count
     ]

@@ -88,6 +88,7 @@ def _by_metadata(directory: Path, present: tuple[Path, ...], information: Mappin
     extra = [p for p in present if p not in taken and p.with_name(p.name.removesuffix(".zstd")) not in taken]
     paths += extra
     count = information.get("message_count")
+    lost: list[tuple[str, str, int | None]]
     if missing and len(missing) == len(extra) and _is_count(count):  # renamed: the count tells whether anything is lost
         lost = [(path.name, f"{METADATA} calls this file {name}", 0) for path, name in zip(extra, missing, strict=True)]
     else:

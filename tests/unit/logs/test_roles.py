@@ -266,6 +266,7 @@ def test_a_log_without_motion_says_so_in_three_lines_and_how_to_use_what_was_lef
     assert "/chatter (std_msgs/msg/String" in found.problems[2]
     assert len(assign(("/chatter", "std_msgs/msg/String")).problems) == 2
     assert len(assign_roles([topic("/odom", ODOMETRY, count=0)], {}).problems) == 2, "an empty topic is no way out"
+    assert "all the same" not in assign(("/tcpipe/fix", FIX)).problems[1], "nor is what was made of another log"
 
 
 def test_empty_and_unreadable_topics_play_nothing() -> None:

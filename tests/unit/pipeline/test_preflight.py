@@ -1,5 +1,7 @@
 """What preflight says of topics, rates and losses: by hand. That it promises what ingesting gives, tests/end_to_end shows."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -36,6 +38,8 @@ def test_what_is_slow_or_absent_for_most_of_the_time_is_said():
     (line,) = _mend((), promise(budget=budget), 60.0)
     assert line == "power: its rate rules the error of E: 5.0% would be 1.2% at 20 Hz"
     assert [line[:7] for line in _mend((), promise(segments=0), 20.0)] == ["the log", "there i"]
+    (line,) = _mend((), replace(promise(segments=0), ledger_m={"gap": 90.0, "standing": 1.0}), 60.0)
+    assert "positions too uncertain" in line, "driving straighter would win nothing"
 
 
 def test_the_deviation_of_a_count_is_that_of_its_windows():

@@ -69,12 +69,19 @@ def test_nothing_is_said_where_nothing_is_odd():
 def test_refusals_are_told_beyond_a_fifth(rejected, said):
     lines = warned(FusionInputs(PLACE), stretch(measurements={"gnss": 10}, rejected={"gnss": rejected}))
     assert any(f"gnss: {rejected} of 10 measurements were refused" in line for line in lines) == said
+    assert any("leave it out: [read.topics] gnss = []" in line for line in lines) == said
 
 
 @pytest.mark.parametrize(("common", "said"), [(None, None), (0.02, None), (0.03, "3%")])
 def test_a_scale_that_nothing_tells_is_told_beyond_two_hundredths(common, said):
     lines = warned(FusionInputs(PLACE), stretch(common_scale_std=common), stretch(common_scale_std=0.01))
     assert [re.search(r"(\d+%)", line)[1] for line in lines] == ([] if said is None else [said])
+    assert all("these fixes are too few or too coarse to tell it" in line for line in lines)
+
+
+def test_without_fixes_they_would_tell_the_scale():
+    lines = warned(FusionInputs(PLACE), stretch(common_scale_std=0.03, sensors=("imu", "wheel_odometry")))
+    assert "a GNSS would tell it" in lines[0]
 
 
 def test_a_track_without_a_place_or_without_an_imu_is_warned_of():
