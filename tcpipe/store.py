@@ -3,7 +3,7 @@
 ::
 
     <root>/
-      store.json                                    that this is a store, and of which layout
+      store.json, report.html                       that this is a store, and of which layout; the page of all runs
       records/<kind>/<fact>.json                    what is remembered: logs seen, failed, damaged, accepted, superseded, names of runs
       maps/<name>-<n>.json                          a map: its files and their checksums
       maps/<name>/<digest>/                         <name>.zarr, and a picture of it

@@ -1,4 +1,4 @@
-"""``tcpipe report``: one HTML page for a run, a dataset or a store."""
+"""``tcpipe report``: the HTML page of a run, a dataset or a store."""
 
 from __future__ import annotations
 
@@ -9,15 +9,23 @@ from tcpipe.cli.options import SEALED
 
 @click.command(short_help="HTML page of a run, dataset or store")
 @click.argument("path", type=SEALED, metavar="PATH")
-def report(path: str) -> None:
-    """Write report.html for PATH: a run directory, a dataset, or a store (one page a run), and print the physics of each robot.
+@click.option(
+    "--no-runs", is_flag=True, help="Of a store: its own page alone, which leads to those of the runs that are there."
+)
+@click.option(
+    "--patches",
+    is_flag=True,
+    help="Of a dataset: pictures of all its patches in a folder beside the page, which shows them.",
+)
+def report(path: str, *, no_runs: bool, patches: bool) -> None:
+    """Write report.html for PATH: a run directory, a dataset, or a store and each of its runs; and print the physics of each robot.
 
     The page needs no network.
     """
     from tcpipe.cli.output import say
     from tcpipe.pipeline.report import report as run
 
-    written = run(path)
+    written = run(path, runs=not no_runs, patches=patches)
     for page in written:
         say(page.path)
         for line in page.physics:

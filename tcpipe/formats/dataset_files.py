@@ -5,6 +5,7 @@
     dataset.json  croissant.json  README.md  samples.parquet  report.html
     overview.png  relief.png  classes.png                    the map, small, as the report shows it
     drive-next.geojson                                       where to drive for what is thin
+    report-patches/                                          pictures of all patches, after `tcpipe report --patches`
     patches.zarr/{ortho,terrain,height,sample_id}            --format zarr
     data/<split>-00000-of-00001.parquet                      --format parquet: the same layers, a row a sample
 """

@@ -24,7 +24,7 @@ from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
 from tcpipe.tables.arrays import column_of
-from tcpipe.tables.findings import EnergyBudget
+from tcpipe.tables.findings import EnergyBudget, PhysicsFit
 
 T = TypeVar("T")
 
@@ -33,7 +33,7 @@ logger = logging.getLogger("tcpipe")
 RUNS, LOGS = "runs.parquet", "logs.parquet"
 
 _ABOUT = b"tcpipe_index"
-_VERSION = b"3"
+_VERSION = b"4"
 """Of these tables: those of another are made again."""
 
 
@@ -96,6 +96,10 @@ class RunFacts:
     """How large the files of the manifest are [byte], by their name beside it."""
     ledger_m: Mapping[str, float] = field(default_factory=dict)
     """Where every metre went [m], by entry."""
+    standing_watt: float | None = None
+    """What the robot draws while it stands."""
+    physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Terms of the fit of power and their standard deviations, in SI, by ``term`` or, of one class of terrain, ``term on terrain``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +157,13 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
         track_file=f"{place}/{named['track.parquet']}",
         sizes={name: of.size_bytes for name, of in manifest.checksums.items()},
         ledger_m=manifest.ledger_m,
+        standing_watt=None if label is None else label.physics.standing_watt,
+        physics={} if label is None or label.physics.fit is None else _terms(label.physics.fit),
     )
+
+
+def _terms(fit: PhysicsFit) -> dict[str, tuple[float, float]]:
+    return {of.term if of.terrain == "all" else f"{of.term} on {of.terrain}": (of.value, of.std) for of in fit.terms}
 
 
 def known_log(known: RunJson, state: str) -> KnownLog:

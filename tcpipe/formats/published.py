@@ -33,6 +33,8 @@ CARDS = ("dataset.json", "model.json", "cost-map.json")
 """Documents that prove all files beside them."""
 _UNLISTED = ("report.html",)
 """What lies beside a card that does not list it, since it is made of it."""
+REPORT_PATCHES = "report-patches"
+"""Folder beside a dataset's page, of pictures that it shows: unlisted too."""
 CLAIM = "writing.json"
 """The card of who puts a directory there, as long as that goes on."""
 _CRC_BYTES = 4
@@ -144,7 +146,7 @@ def others_beside(url: str) -> list[str]:
     place = open_place(url)
     name, data = _card_at(place) or ("", b"{}")
     listed = typed(parse_json(data, Path(place.where(name))), Checksums, Path(place.where(name))).checksums
-    names = {entry.name for entry in place.entries()}
+    names = {entry.name for entry in place.entries() if not entry.name.startswith(f"{REPORT_PATCHES}/")}
     return [place.where(other) for other in sorted(names - {*listed, *_UNLISTED, name})]
 
 

@@ -1,8 +1,10 @@
-"""What wins lost metres back, by the entry of the ledger that has them."""
+"""The largest losses of drives, and what wins the metres back, by the entry of the ledger that has them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 
 from tcpipe.tables.bits import DropReason, Loss, name_of
 
@@ -29,3 +31,38 @@ REMEDIES: Mapping[str, str] = {
     }.items()
 }  # fmt: skip
 """By entry, in words."""
+
+_MOST_LOSSES = 10
+_WORTH_M = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class StoreLoss:
+    """Metres that are in no segment for one reason, and what would win them back."""
+
+    reason: str
+    metres: float
+    share: float
+    """Of all metres driven [1]."""
+    runs: int
+    """Runs that lost metres so."""
+    remedy: str
+
+    def __str__(self) -> str:
+        """Return the loss as one line."""
+        many = "1 run" if self.runs == 1 else f"{self.runs} runs"
+        return f"{self.metres:>9.1f} m ({self.share:.1%}) {self.reason.replace('_', ' ')} in {many}: {self.remedy}"
+
+
+def losses_of(ledgers_m: Iterable[Mapping[str, float]]) -> tuple[StoreLoss, ...]:
+    """Return the ten largest losses of runs, by their ledgers [m], the largest first."""
+    metres, of_runs = Counter[str](), Counter[str]()
+    for ledger_m in ledgers_m:
+        metres.update(ledger_m)
+        of_runs.update(reason for reason, lost_m in ledger_m.items() if lost_m >= _WORTH_M)
+    total = sum(metres.values())
+    lost = [(reason, lost_m) for reason, lost_m in metres.most_common() if reason != "kept" and of_runs[reason]]
+    return tuple(
+        StoreLoss(reason, lost_m, lost_m / total, of_runs[reason], REMEDIES.get(reason, ""))
+        for reason, lost_m in lost[:_MOST_LOSSES]
+    )

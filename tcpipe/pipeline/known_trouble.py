@@ -8,6 +8,7 @@ from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError
+from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.record_files import record_name
 from tcpipe.pipeline.log_sources import lineage_of
@@ -91,7 +92,7 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
 
     """
     opened = open_store(store)
-    known = _known(opened)
+    known = known_trouble(opened, [run.facts for run in opened.runs()])
     chosen: list[Trouble] = []
     problems: list[str] = []
     for name in dict.fromkeys(names):
@@ -106,13 +107,14 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
     return Accepted(tuple(now), tuple(trouble for trouble in chosen if trouble not in now))
 
 
-def _known(store: Store) -> list[Trouble]:
-    """Return all trouble that was told, and the damage of runs that were made before that was remembered."""
+def known_trouble(store: Store, runs: Sequence[RunFacts]) -> list[Trouble]:
+    """Return all trouble that was told, and the damage of ``runs`` that were made before that was remembered."""
     known = [replace(told, kind=kind) for kind in ("failed", "damaged") for told in store.records(kind, Trouble)]
-    for run in store.runs():
-        if run.facts.damage and run.facts.log:
-            about = run.facts.log.source
-            known.append(Trouble(about.sha256, run.facts.damage, about.paths, run.run_id, "damaged"))
+    known += [
+        Trouble(run.log.source.sha256, run.damage, run.log.source.paths, run.run_id, "damaged")
+        for run in runs
+        if run.damage and run.log
+    ]
     return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
 
 

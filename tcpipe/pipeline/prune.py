@@ -168,12 +168,12 @@ def _referred(store: Store) -> dict[tuple[str, str], str]:
     """Return the ingestions that datasets are made of, and of which; one that lies where it was no more may lie elsewhere."""
     found: dict[tuple[str, str], str] = {}
     for made in store.records("datasets", DatasetMade):
-        if not _is_replaced(made):
+        if not is_replaced(made):
             found.update(dict.fromkeys(made.runs, made.out))
     return found
 
 
-def _is_replaced(made: DatasetMade) -> bool:
+def is_replaced(made: DatasetMade) -> bool:
     """Tell whether another dataset lies where this one was."""
     out = Path(made.out)
     try:

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import UsageError
+from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
-from tcpipe.formats.dataset_files import read_current_card
+from tcpipe.formats.dataset_files import CARD, read_current_card
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.place import Place
 from tcpipe.formats.published import here
 from tcpipe.formats.seals import sealed_page
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.pipeline.store_facts import store_facts
+from tcpipe.report.dataset_patches import all_patches, folder_of
 from tcpipe.report.dataset_report import dataset_report
+from tcpipe.report.dataset_samples import MOST_SAMPLES
 from tcpipe.report.physics import physics_in_words
 from tcpipe.report.run_report import run_report
+from tcpipe.report.store_report import store_report
 from tcpipe.store import Store, inside_store, is_store, run_at
 
 _PAGE = "report.html"
@@ -31,38 +35,78 @@ class Page:
     """What the page says of the robots' physics, a line a robot."""
 
 
-def report(path: Path | str) -> list[Page]:
-    """Write ``report.html`` into a run's recipe directory or a dataset (also at a URL), or into every run of a store; return the pages.
+def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> list[Page]:
+    """Write ``report.html`` into a run's recipe directory, a dataset or a store, here or at a URL; return the pages.
 
     One that would be the same is left alone.
+
+    Parameters
+    ----------
+    path
+        What the page is of.
+    runs
+        Of a store: write the page of every run too.
+    patches
+        Of a dataset: write pictures of all patches into a folder beside the page, which shows them.
 
     Raises
     ------
     UsageError
         When the path is none of these.
+    StoreError
+        Something cannot be read; of a store all other pages are written.
 
     """
-    stored = is_store(path) or inside_store(path) is not None
-    if is_url(path) and not stored:
-        (page,) = _of_dataset(here(path), None)
-        if page.changed:
-            open_place(path).put(_PAGE, Path(page.path).read_bytes())
-        return [replace(page, path=f"{str(path).rstrip('/')}/{_PAGE}")]
-    if not is_url(path) and (Path(path) / "dataset.json").is_file():
-        return _of_dataset(Path(path), Path(path).absolute().parent)
-    store = Store(path)
-    found = (store, store.runs()) if is_store(path) else run_at(path)
-    if found is None or not found[1]:
+    inside = is_store(path) or inside_store(path) is not None
+    if not inside and (is_url(path) or (Path(path) / CARD).is_file()):
+        return [_of_dataset(path, patches=patches)]
+    if patches:
+        raise UsageError(f"{path}: is no dataset; --patches is for one")
+    if is_store(path):
+        return _of_store(Store(path), runs=runs)
+    found = run_at(path)
+    if found is None:
         there = is_url(path) or Path(path).exists()
-        what = "is no dataset, run or store with runs" if there else "there is no such directory"
+        what = "is no dataset, run or store" if there else "there is no such directory"
         raise UsageError(f"{path}: {what}; give a dataset, a run of a store, or a store")
-    return [_write(run.place, run_report(found[0], run), _physics_of(run)) for run in found[1]]
+    return [_of_run(found[0], run) for run in found[1]]
 
 
-def _of_dataset(path: Path, beside: Path | None) -> list[Page]:
-    fits = read_current_card(path).physics
-    said = tuple(physics_in_words(robot, fit) for robot, fit in fits.items())
-    return [_write(DirectoryPlace(path), dataset_report(path, beside), said)]
+def _of_store(store: Store, *, runs: bool) -> list[Page]:
+    """Write the store's page, first, as those of the runs lead to it, and again without the runs that cannot be read."""
+    found = store.ingestions()
+    store.keep_index(found)
+    facts = store_facts(store, found, will_be=found.finished if runs else ())
+    page, pages, problems = _write(store.place, store_report(facts), ()), list[Page](), list[str]()
+    for run in found.finished if runs else ():
+        try:
+            pages.append(_of_run(store, run))
+        except StoreError as error:
+            problems += error.problems
+    if problems:
+        _write(store.place, store_report(store_facts(store, found)), ())
+        raise StoreError(*problems)
+    return [page, *pages]
+
+
+def _of_run(store: Store, run: RunDirectory) -> Page:
+    return _write(run.place, run_report(store, run), _physics_of(run))
+
+
+def _of_dataset(path: Path | str, *, patches: bool) -> Page:
+    """Write a dataset's page, and, before it, pictures of all patches, which it shows from then on."""
+    directory, place = here(path), open_place(path)
+    card = read_current_card(directory)
+    folder, count = folder_of(card)
+    if patches and card.samples > MOST_SAMPLES:
+        raise UsageError(
+            f"{path}: of more than {MOST_SAMPLES} samples the page shows means, which have no patch; leave --patches out"
+        )
+    for name, data in all_patches(directory, card) if patches else ():
+        place.put(f"{folder}/{name}", data, lasting=False)
+    shown = folder if card.samples and len(place.files(folder)) == count else ""
+    html = dataset_report(directory, None if is_url(path) else directory.absolute().parent, folder=shown)
+    return _write(place, html, tuple(physics_in_words(robot, fit) for robot, fit in card.physics.items()))
 
 
 def _physics_of(run: RunDirectory) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
 from tcpipe.formats.record_files import Call
-from tcpipe.motion.remedies import REMEDIES
+from tcpipe.motion.remedies import StoreLoss, losses_of
 from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time, latest_calls
 from tcpipe.pipeline.ingest_task import IngestTask, too_young
 from tcpipe.pipeline.known_runs import KnownRuns, known_runs
@@ -39,8 +39,6 @@ TROUBLE: tuple[State, ...] = ("failed_permanent", "failed_transient", "partial")
 
 _MOST_NAMES = 3
 _MOST_CALLS = 7
-_MOST_LOSSES = 10
-_WORTH_M = 0.05
 _IN_WORDS: Mapping[State, str] = {"failed_permanent": "failed for what it holds", "failed_transient": "failed for now"}
 
 
@@ -59,24 +57,6 @@ class Group:
         names = f": {', '.join(self.logs[:_MOST_NAMES])}{more}" if self.state != "done" else ""
         cause = f", {self.cause}" if self.cause else ""
         return f"{len(self.logs):>7} {_words(self.state)}{cause}{names}"
-
-
-@dataclass(frozen=True, slots=True)
-class StoreLoss:
-    """Metres that are in no segment for one reason, and what would win them back."""
-
-    reason: str
-    metres: float
-    share: float
-    """Of all metres driven [1]."""
-    runs: int
-    """Runs that lost metres so."""
-    remedy: str
-
-    def __str__(self) -> str:
-        """Return the loss as one line."""
-        many = "1 run" if self.runs == 1 else f"{self.runs} runs"
-        return f"{self.metres:>9.1f} m ({self.share:.1%}) {self.reason.replace('_', ' ')} in {many}: {self.remedy}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +139,7 @@ def status(
     with scratch_directory() as staging:
         found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
     mine = found.sources if shard is None else in_shard(found.sources, shard)
-    passing = _failed_for_now(calls)
+    passing = failed_for_now(calls)
     groups: dict[tuple[State, str], list[IngestTask]] = {}
     for source in mine:
         task_source = remembered(source, known.seen.get(source.lineage, ()))
@@ -171,10 +151,8 @@ def status(
         Group(state, cause, tuple(task.source.name for task in tasks), sum(_bytes(task) for task in tasks))
         for (state, cause), tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
     )
-    current = [run.facts for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling)]
-    return replace(
-        _summed(opened, told, found, known, calls, sources=given, jobs=jobs), losses=tuple(losses_of(current))
-    )
+    ledgers_m = (run.facts.ledger_m for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling))
+    return replace(_summed(opened, told, found, known, calls, sources=given, jobs=jobs), losses=losses_of(ledgers_m))
 
 
 def _standing(task: IngestTask, store: Store, known: KnownRuns, passing: Mapping[str, str]) -> tuple[State, str]:
@@ -222,7 +200,7 @@ def _why_outdated(made: RunFacts, task: IngestTask) -> str:
     return "made for another robot, or with other message definitions"
 
 
-def _failed_for_now(calls: Sequence[Call]) -> dict[str, str]:
+def failed_for_now(calls: Sequence[Call]) -> dict[str, str]:
     """Return the logs whose latest failure may pass, and what that was."""
     found: dict[str, str] = {}
     for call in reversed(calls):
@@ -266,20 +244,6 @@ def _summed(
         losses=(),
         exit_code=3 if trouble or problems else 0,
     )
-
-
-def losses_of(runs: Sequence[RunFacts]) -> list[StoreLoss]:
-    """Return the largest losses of runs, the largest first."""
-    metres, of_runs = Counter[str](), Counter[str]()
-    for run in runs:
-        metres.update(run.ledger_m)
-        of_runs.update(reason for reason, lost_m in run.ledger_m.items() if lost_m >= _WORTH_M)
-    total = sum(metres.values())
-    lost = [(reason, lost_m) for reason, lost_m in metres.most_common() if reason != "kept" and of_runs[reason]]
-    return [
-        StoreLoss(reason, lost_m, lost_m / total, of_runs[reason], REMEDIES.get(reason, ""))
-        for reason, lost_m in lost[:_MOST_LOSSES]
-    ]
 
 
 def _bytes(task: IngestTask) -> int:

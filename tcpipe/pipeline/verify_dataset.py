@@ -29,6 +29,7 @@ from tcpipe.formats.dataset_files import (
 )
 from tcpipe.formats.json_files import plain
 from tcpipe.formats.parquet import read_table
+from tcpipe.formats.published import REPORT_PATCHES
 from tcpipe.formats.recipe_toml import recipe_id
 from tcpipe.formats.seals import broken_checksums, broken_seal
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, measured
@@ -65,7 +66,8 @@ def _files(directory: Path, card: DatasetCard) -> Iterator[Finding]:
     yield "files", len(card.checksums)
     there = {path.relative_to(directory).as_posix() for path in directory.rglob("*") if not path.is_dir()}
     for name in sorted(there - {*card.checksums, CARD, REPORT}):
-        yield f"{directory / name}: is no file of this dataset"
+        if not name.startswith(f"{REPORT_PATCHES}/"):
+            yield f"{directory / name}: is no file of this dataset"
 
 
 def _samples(directory: Path, card: DatasetCard) -> Iterator[Finding]:

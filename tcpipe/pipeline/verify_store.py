@@ -46,7 +46,9 @@ def verify_store(store: Store) -> Iterator[Finding]:
     place = store.place
     yield broken_seal_in(place.read(MARK), place.where(MARK)) or ("files", 1)
     for name in place.files():
-        if name != MARK:
+        if name == _REPORT:
+            yield from _seals(place, [name])
+        elif name != MARK:
             yield _stranger(place, name)
     for name in place.folders():
         if name == SPOOL:

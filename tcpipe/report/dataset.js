@@ -135,8 +135,13 @@ page.ready.then(async () => {
     left.append(pairs(inWords(i)));
     if (sheets && cell.has(i)) {
       right.append(...page.patches(sheets, cell.get(i)));
+    } else if (sheets && told.folder) {
+      const layers = sheets.layers.map(({ name }, k) => ({ name, uri: `${told.folder}/${k}-${Math.floor(i / told.per_sheet)}.webp` }));
+      right.append(...page.patches({ ...sheets, layers }, i % told.per_sheet));
+      const lost = () => right.replaceChildren(make("p", `${told.folder} is not beside this page.`, { className: "note" }));
+      Object.assign(new Image(), { src: layers[0].uri, onerror: lost });
     } else if (sheets) {
-      right.append(make("p", `The page carries ${sheets.rows.length} of ${told.count} patches, and this one is not among them.`, { className: "note" }));
+      right.append(make("p", `The page carries ${sheets.rows.length} of ${told.count} patches, and this one is not among them; 'tcpipe report --patches' puts all beside it.`, { className: "note" }));
     }
     box.append(left, right);
   }

@@ -1,8 +1,9 @@
-"""Some hundred patches inside a dataset's page: as many of every split, class and range of slope as there are."""
+"""Some hundred patches inside a dataset's page, of every split, class and range of slope; and all of them in a folder beside it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.formats.dataset_card import DatasetCard
-from tcpipe.formats.dataset_files import PatchFiles, open_patches, rows_in_files
+from tcpipe.formats.dataset_files import PatchFiles, open_patches, read_samples, rows_in_files
 from tcpipe.formats.json_files import Json
-from tcpipe.report.pictures import ACROSS, class_picture, picture_uri, relief_picture, sheet
+from tcpipe.formats.published import REPORT_PATCHES
+from tcpipe.report.pictures import ACROSS, class_picture, picture_bytes, picture_uri, relief_picture, sheet
 from tcpipe.tables.columns import floats
 
 MOST_PATCHES = 500
@@ -24,6 +26,37 @@ _PIECES = 24
 """Pieces of the files that are read: patches lie in random order, so a few hold all kinds."""
 
 
+PER_SHEET = 10 * ACROSS
+"""Patches in a picture of that folder."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Patches:
+    """A dataset's patches: by row of its samples where each lies in the files, and in which piece, (T,); ``step`` thins the pixels."""
+
+    files: PatchFiles
+    place: NDArray[np.int64]
+    piece: NDArray[np.int64]
+    step: int
+
+    def read(self, rows: NDArray[np.int64]) -> dict[str, NDArray[np.generic]]:
+        return _read(self.files, self.place[rows], self.piece[rows], self.step)
+
+    def some(self, samples: pa.Table) -> NDArray[np.int64]:
+        """Return up to `MOST_PATCHES` rows of all kinds, rising."""
+        near = np.flatnonzero(np.isin(self.piece, _some(np.unique(self.piece))))
+        return near[_stratified(samples.take(near))]
+
+
+def _patches(directory: Path, card: DatasetCard, samples: pa.Table) -> _Patches:
+    files = open_patches(directory, card)
+    splits = samples.column("split").to_numpy(zero_copy_only=False)
+    place = np.empty(samples.num_rows, dtype=np.int64)
+    for name, rows in rows_in_files(card, splits).items():
+        place[splits == name] = rows
+    return _Patches(files, place, np.searchsorted(files.starts, place, side="right") - 1, thinned_by(card.patch_px))
+
+
 def patches_shown(directory: Path, card: DatasetCard, samples: pa.Table, row_of: NDArray[np.int64]) -> Json:
     """Return sheets of patches by layer and the rows of the page that they belong to (``row_of`` each sample, (T,)).
 
@@ -31,15 +64,9 @@ def patches_shown(directory: Path, card: DatasetCard, samples: pa.Table, row_of:
     """
     if not samples.num_rows:
         return None
-    files = open_patches(directory, card)
-    splits = samples.column("split").to_numpy(zero_copy_only=False)
-    place = np.empty(samples.num_rows, dtype=np.int64)  # where each row of samples lies in the files
-    for name, rows in rows_in_files(card, splits).items():
-        place[splits == name] = rows
-    piece = np.searchsorted(files.starts, place, side="right") - 1
-    near = np.flatnonzero(np.isin(piece, _some(np.unique(piece))))
-    chosen = near[_stratified(samples.take(near))]
-    return sheets(row_of[chosen].tolist(), _read(files, place[chosen], piece[chosen], thinned_by(card.patch_px)), files)
+    every = _patches(directory, card, samples)
+    chosen = every.some(samples)
+    return sheets(row_of[chosen].tolist(), every.read(chosen), every.files)
 
 
 def thinned_by(patch_px: int) -> int:
@@ -53,8 +80,39 @@ def sheets(rows: Sequence[int], pixels: Mapping[str, NDArray[Any]], files: Patch
         "rows": rows,
         "px": next(iter(pixels.values())).shape[1],
         "across": ACROSS,
-        "layers": [{"name": name, "uri": _layer_uri(name, stack, files)} for name, stack in pixels.items()],
+        "layers": [{"name": name, "uri": _uri(name, stack, files)} for name, stack in pixels.items()],
     }
+
+
+def _uri(name: str, stack: NDArray[np.generic], files: PatchFiles) -> str:
+    pixels, exact = _picture(name, stack, files, _range(stack))
+    return picture_uri(pixels, exact=exact)
+
+
+def folder_of(card: DatasetCard) -> tuple[str, int]:
+    """Return where the pictures of all of this dataset's patches lie from its page, and how many there are."""
+    return f"{REPORT_PATCHES}/{card.inputs[:16]}", len(card.layers) * -(-card.samples // PER_SHEET)
+
+
+def all_patches(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
+    """Yield the pictures of all patches, in the order of the samples, and what each is called in its folder.
+
+    Raises
+    ------
+    DatasetError
+        They cannot be read.
+
+    """
+    samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
+    every = _patches(directory, card, samples)
+    ranges = (
+        {name: _range(stack) for name, stack in every.read(every.some(samples)).items()} if samples.num_rows else {}
+    )
+    for number, first in enumerate(range(0, samples.num_rows, PER_SHEET)):
+        stacks = every.read(np.arange(first, min(first + PER_SHEET, samples.num_rows)))
+        for layer, (name, stack) in enumerate(stacks.items()):
+            pixels, exact = _picture(name, stack, every.files, ranges[name])
+            yield f"{layer}-{number}.webp", picture_bytes(pixels, exact=exact)
 
 
 def _some(pieces: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -90,14 +148,22 @@ def _read(
     return {layer: np.concatenate(parts)[back] for layer, parts in stacks.items()}
 
 
-def _layer_uri(name: str, stack: NDArray[np.generic], files: PatchFiles) -> str:
+def _range(stack: NDArray[np.generic]) -> tuple[float, float]:
+    """Return between which values most pixels lie."""
+    low, high = np.percentile(stack.astype(np.float64), (1, 99))
+    return float(low), float(high)
+
+
+def _picture(
+    name: str, stack: NDArray[np.generic], files: PatchFiles, shown: tuple[float, float]
+) -> tuple[NDArray[np.uint8], bool]:
+    """Return patches of a layer as one sheet, and whether every pixel counts; a photograph is shown over a range of its values."""
     layer = files.layers[name]
     if layer.kind == "categorical":
-        return picture_uri(sheet(class_picture(stack.astype(np.int64))), exact=True)
+        return sheet(class_picture(stack.astype(np.int64))), True
     values = stack.astype(np.float64)
     if name.startswith("ortho"):
-        low, high = np.percentile(values, (1, 99))
-        grey = np.clip((values - low) / max(high - low, 1.0) * 255, 0, 255).astype(np.uint8)
-        return picture_uri(sheet(grey))
+        low, high = shown
+        return sheet(np.clip((values - low) / max(high - low, 1.0) * 255, 0, 255).astype(np.uint8)), False
     values[stack == layer.nodata] = np.nan
-    return picture_uri(sheet(relief_picture(values)))
+    return sheet(relief_picture(values)), False

@@ -16,7 +16,7 @@ from tcpipe.formats.store_mark import MARK
 from tcpipe.report.balance import balance_sections
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, class_colour
 from tcpipe.report.dataset_map import map_plots
-from tcpipe.report.dataset_patches import patches_shown
+from tcpipe.report.dataset_patches import PER_SHEET, patches_shown
 from tcpipe.report.dataset_samples import (
     COLUMNS,
     MOST_SAMPLES,
@@ -36,10 +36,11 @@ from tcpipe.tables.columns import floats
 _PAGE = "report.html"
 
 
-def dataset_report(directory: Path, beside: Path | None = None) -> str:
+def dataset_report(directory: Path, beside: Path | None = None, *, folder: str = "") -> str:
     """Return the HTML page of the dataset in ``directory``; `DatasetError` if it is none, or of another data model.
 
-    ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too.
+    ``beside`` is the directory in which the dataset lies: the page leads to runs of stores that lie there too. ``folder`` beside the page
+    holds pictures of all patches (`tcpipe.report.dataset_patches.all_patches`), if it is given.
     Patches, pictures and places to drive that are lost or damaged are said on the page, which is written without them.
     """
     card, samples = read_current_card(directory), read_samples(directory, COLUMNS)
@@ -55,6 +56,7 @@ def dataset_report(directory: Path, beside: Path | None = None) -> str:
         lead=card.description or f"{card.format} format, data model {card.data_model_version}",
         verdict=verdict(card, lost),
         numbers=_numbers(card),
+        links=[] if beside is None else _store_pages(beside, hrefs),
         warnings=[*card.problems, *card.warnings],
         sections=[
             _map_section(shown, plots),
@@ -76,7 +78,8 @@ def dataset_report(directory: Path, beside: Path | None = None) -> str:
             _provenance(card),
         ],
         script="dataset.js" if samples.num_rows else "",
-        data=_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs),
+        data={**_data(card, samples, shown, patches=patches, drawn=plots[0], hrefs=hrefs), "folder": folder},
+        reads_pictures=bool(folder),
     )
 
 
@@ -111,10 +114,11 @@ def _map_section(shown: SamplesShown, plots: list[Plot]) -> Section:
 
 def _data(
     card: DatasetCard, samples: pa.Table, shown: SamplesShown, *, patches: Json, drawn: Plot, hrefs: Mapping[str, str]
-) -> Json:
+) -> dict[str, Json]:
     names = [renderer.name or "" for renderer in drawn.figure.renderers]
     return {
         "count": card.samples,
+        "per_sheet": PER_SHEET,
         "samples": shown.json,
         "patches": patches,
         "ground": [name.removeprefix("layer ") for name in names if name.startswith("layer ")],
@@ -141,6 +145,12 @@ def _run_pages(beside: Path, card: DatasetCard) -> dict[str, str]:
         for store in stores
         if (place := store / "runs" / run.run_id / run.recipe_id).is_dir()
     }
+
+
+def _store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
+    """Return the pages, where there are, of the stores that the runs' pages (`_run_pages`) lie in."""
+    stores = sorted({href.split("/")[1] for href in hrefs.values()})
+    return [Link(f"All runs of {name}", f"../{name}/{_PAGE}") for name in stores if (beside / name / _PAGE).is_file()]
 
 
 def _label_sections(samples: pa.Table) -> list[Section]:

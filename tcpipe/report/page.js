@@ -103,6 +103,6 @@ const page = (() => {
     data: read("page-data"),
     ready,
     plots,
-    model: (name) => Bokeh.documents[0].get_model_by_name(name),
+    model: (name) => drawn && Bokeh.documents[0].get_model_by_name(name),
   };
 })();

@@ -102,6 +102,7 @@ def render_page(
     links: Sequence[Link] = (),
     script: str = "",
     data: Json = None,
+    reads_pictures: bool = False,
 ) -> str:
     """Return the page's HTML; every text is escaped, everything is inline.
 
@@ -117,6 +118,8 @@ def render_page(
         File beside this one that runs when all figures are drawn.
     data
         What it is told.
+    reads_pictures
+        Whether it may show pictures that lie beside it; it asks for nothing else, ever.
 
     """
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
@@ -131,6 +134,7 @@ def render_page(
         warnings=warnings,
         verdict=verdict,
         links=links,
+        pictures="'self' file: " if reads_pictures else "",
         sections=[
             (
                 section,

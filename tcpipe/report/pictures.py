@@ -22,10 +22,15 @@ _CIVIDIS = np.array([[0, 34, 78], [65, 77, 107], [124, 123, 120], [188, 175, 111
 
 
 def picture_uri(pixels: Bytes, *, exact: bool = False) -> str:
-    """Return a picture, grey (R, C) or colour (R, C, 3), as a data URI; ``exact`` keeps every pixel as it is."""
+    """Return a picture as a data URI; arguments as of `picture_bytes`."""
+    return f"data:image/webp;base64,{base64.b64encode(picture_bytes(pixels, exact=exact)).decode('ascii')}"
+
+
+def picture_bytes(pixels: Bytes, *, exact: bool = False) -> bytes:
+    """Return a picture, grey (R, C) or colour (R, C, 3), as WebP; ``exact`` keeps every pixel as it is."""
     stream = io.BytesIO()
     Image.fromarray(pixels).save(stream, format="WEBP", quality=78, lossless=exact, method=4)
-    return f"data:image/webp;base64,{base64.b64encode(stream.getvalue()).decode('ascii')}"
+    return stream.getvalue()
 
 
 def read_picture(path: Path) -> Bytes | None:

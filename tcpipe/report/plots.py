@@ -53,6 +53,7 @@ def new_plot(
     tooltips: Sequence[tuple[str, str]] = (),
     names: Sequence[str] = (),
     true_to_scale: bool = False,
+    over_time: bool = False,
     beside: Plot | None = None,
 ) -> Plot:
     """Return an empty plot as wide as the page.
@@ -77,6 +78,8 @@ def new_plot(
         What stands along the vertical axis instead of numbers, from below.
     true_to_scale
         A metre is as long across as along.
+    over_time
+        The horizontal axis holds UTC, in milliseconds since 1970.
     beside
         A plot whose horizontal axis moves together with this one's.
 
@@ -95,6 +98,7 @@ def new_plot(
         border_fill_alpha=0.0,
         outline_line_color=None,
         match_aspect=true_to_scale,
+        x_axis_type="datetime" if over_time else "auto",
         x_range=DataRange1d() if beside is None else beside.figure.x_range,
         y_range=FactorRange(factors=list(names)) if names else DataRange1d(),
     )
@@ -140,6 +144,7 @@ def waterfall(ledger_m: Mapping[str, float]) -> Plot:
         },
     )
     plot.figure.x_range.start = 0
+    plot.figure.xaxis.formatter.use_scientific = False
     plot.figure.ygrid.visible = False
     return plot
 

@@ -11,6 +11,7 @@ from tcpipe.learning.evaluation_files import run_evaluation
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.training import train
 from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.report import report
 from tcpipe.store import open_store
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: make test-pages")
@@ -176,3 +177,53 @@ def test_an_evaluation_answers_to_quantity_and_split_and_shows_the_worst(judged)
     judged.locator("#gallery button").first.click()
     assert "energy E" in judged.locator("#chosen").inner_text()
     assert judged.locator("#chosen .patch").count() == 3
+
+
+@pytest.fixture(params=[LOOKS[0], LOOKS[3]], ids=by_look)
+def store_page(request, chromium, dataset):
+    """The page of the store, which leads to two runs and the dataset."""
+    report(dataset.parent / "store")
+    with quiet_page(chromium, dataset.parent / "store/report.html", request.param) as tab:
+        yield tab
+
+
+def test_the_store_s_page_fits_sorts_filters_and_leads_to_runs(store_page):
+    fits_and_can_be_read_by_everyone(store_page)
+    first = store_page.locator("#s1 td a").first
+    assert first.inner_text() == "south"
+    store_page.locator("#s1 th button").first.focus()
+    store_page.keyboard.press("Enter")
+    assert first.inner_text() == "north"
+    store_page.fill("#find", "sou")
+    assert store_page.locator("#s1 td a").all_inner_texts() == ["south"]
+    chosen = "Bokeh.documents[0].get_model_by_name('used').data_source.selected"
+    assert store_page.evaluate(f"{chosen}.indices") == [0]
+    store_page.click("#clear")
+    store_page.evaluate(f"{chosen}.indices = [1]")
+    assert store_page.locator("#s1 td a").all_inner_texts() == ["north"]
+    assert first.get_attribute("href").endswith("/report.html")
+
+
+def test_a_patch_that_is_not_inside_the_page_comes_from_the_folder_beside_it(chromium, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr("tcpipe.report.dataset_patches.MOST_PATCHES", 5)
+    there = tmp_path / "dataset"
+    shutil.copytree(dataset, there)
+    report(there, patches=True)
+    tab = chromium.new_page()
+    answered = []
+    tab.on("response", lambda found: answered.append(found.url))
+    tab.goto((there / "report.html").as_uri())
+    tab.wait_for_selector("html[data-ready]")
+    rows = tab.evaluate("page.data.patches.rows")
+    tab.evaluate(f"{SOURCE}.selected.indices = [[...{SOURCE}.data.x.keys()].find((i) => !{rows}.includes(i))]")
+    assert tab.locator("#chosen .patch").count() == 3
+    tab.wait_for_timeout(500)
+    assert tab.locator("#chosen .patch").count() == 3  # and is not replaced by a note that the folder is gone
+    assert {url.rpartition("/")[2] for url in answered} == {"report.html", "0-0.webp", "1-0.webp", "2-0.webp"}
+    for picture in there.rglob("*.webp"):
+        picture.unlink()
+    tab.reload()
+    tab.wait_for_selector("html[data-ready]")
+    tab.evaluate(f"{SOURCE}.selected.indices = [[...{SOURCE}.data.x.keys()].find((i) => !{rows}.includes(i))]")
+    tab.get_by_text("is not beside this page").first.wait_for()
+    tab.close()

@@ -1,0 +1,112 @@
+"use strict";
+// The store's page: a table of all runs that sorts and filters, and plots over time; what is chosen in one is chosen in the other.
+page.ready.then(() => {
+  const { data: told, at, make, fillSelect } = page;
+  const runs = told.rows.map((row, number) => Object.assign({ number }, ...told.fields.map((name, i) => ({ [name]: row[i] }))));
+  const kind = (run) => run.state.startsWith("superseded") ? "superseded" : run.state;
+  const date = (ms) => ms === null ? "" : new Date(ms).toISOString().slice(0, 16).replace("T", " ");
+  const digits = (name, places) => (run) => run[name] === null ? "" : run[name].toFixed(places);
+  const columns = [
+    ["run", (run) => run.run], ["start_ms", (run) => date(run.start_ms), 1], ["robot", (run) => run.robot], ["state", (run) => run.state],
+    ["datasets", (run) => run.datasets.map((n) => told.datasets[n]).join(", ")], ["tags", (run) => run.tags],
+    ["segments", digits("segments", 0), 1], ["driven", digits("driven", 0), 1], ["used", digits("used", 1), 1], ["floor", digits("floor", 2), 1],
+    ["warnings", digits("warnings", 0), 1],
+  ];
+
+  // What is shown: the rows of the filters, or those that were chosen in a plot.
+  let [by, falls, most, chosen] = ["", false, 25, null];
+  const key = (run) => by === "datasets" ? run.datasets.map((n) => told.datasets[n]).join(", ") : run[by];
+  const order = (one, other) => {
+    const [a, b] = [key(one), key(other)], lacks = (value) => value === null || value === "";
+    if (lacks(a) || lacks(b)) return lacks(a) - lacks(b);
+    return (a < b ? -1 : a > b ? 1 : 0) * (falls ? -1 : 1);
+  };
+  const wanted = () => {
+    const [robot, state, dataset, cause] = ["robot", "state", "dataset", "cause"].map((id) => at(id).value);
+    const words = at("find").value.toLowerCase().split(/\s+/).filter(Boolean);
+    return runs.filter((run) => (!robot || run.robot === robot) && (!state || kind(run) === state)
+      && (!cause || run.causes.includes(Number(cause))) && words.every((word) => `${run.run} ${run.tags}`.toLowerCase().includes(word))
+      && (!dataset || (dataset === "none" ? !run.datasets.length : run.datasets.includes(Number(dataset)))));
+  };
+  const table = document.querySelector("#s1 table");
+  const heads = [...table.rows[0].cells];
+  const more = make("button", "More", { type: "button" });
+  table.parentElement.after(more);
+  function draw() {
+    const found = chosen ?? wanted();
+    const sorted = by ? [...found].sort(order) : found;
+    [...table.rows].slice(1).forEach((row) => row.remove());
+    table.tBodies[0].append(...sorted.slice(0, most).map((run) => {
+      const row = make("tr");
+      row.append(...columns.map(([name, text, number]) => {
+        const cell = make("td", name === "run" && run.href ? "" : text(run), { className: number ? "number" : "" });
+        if (name === "run" && run.href) cell.append(make("a", run.run, { href: run.href }));
+        if (!number && cell.textContent.length > 16) cell.className = "long";
+        return cell;
+      }));
+      return row;
+    }));
+    more.hidden = sorted.length <= most;
+    at("count").textContent = `${Math.min(sorted.length, most)} of ${sorted.length} runs${chosen ? " chosen in a plot" : ""}, ${runs.length} in all`;
+    heads.forEach((head, i) => { head.ariaSort = columns[i][0] === by ? (falls ? "descending" : "ascending") : null; });
+  }
+  heads.forEach((head, i) => {
+    const [name, , number] = columns[i];
+    const button = make("button", head.textContent, { type: "button", className: "sort" });
+    button.onclick = () => { [by, falls] = [name, by === name ? !falls : Boolean(number)]; draw(); };
+    if (number) head.classList.add("number");
+    head.replaceChildren(button);
+  });
+  more.onclick = () => { most += 100; draw(); };
+
+  // The plots.
+  const source = page.model("used")?.data_source;
+  const points = runs.filter((run) => run.start_ms !== null);
+  const colours = new Map(told.robots);
+  const numbers = (name) => Float64Array.from(points, (run) => run[name] ?? NaN);
+  const term = () => {
+    const n = at("term")?.selectedIndex ?? -1;
+    return Float64Array.from(points, (run) => run.terms[n] ?? NaN);
+  };
+  let quiet = false;
+  if (source) {
+    if (at("term")) {
+      fillSelect(at("term"), told.terms);
+      const axis = page.model("drift term").left[0];
+      at("term").onchange = () => { source.data = { ...source.data, term: term() }; axis.axis_label = at("term").value; };
+      axis.axis_label = at("term").value;
+    }
+    source.data = {
+      run: points.map((run) => run.run), start_ms: numbers("start_ms"), fill: points.map((run) => colours.get(run.robot)),
+      used: numbers("used"), floor: numbers("floor"), standing: numbers("standing"), term: term(),
+    };
+    source.selected.change.connect(() => {
+      if (quiet) return;
+      const picked = source.selected.indices.map((i) => points[i]);
+      chosen = picked.length ? picked : null;
+      draw();
+    });
+  }
+  const filtered = () => {
+    const found = new Set(wanted());
+    chosen = null;
+    if (source) {
+      quiet = true;
+      source.selected.indices = found.size === runs.length ? [] : points.flatMap((run, i) => found.has(run) ? [i] : []);
+      quiet = false;
+    }
+    draw();
+  };
+  fillSelect(at("robot"), told.robots.map(([robot]) => robot));
+  fillSelect(at("state"), [...new Set(runs.map(kind))], (state) => `${state} (${runs.filter((run) => kind(run) === state).length})`);
+  fillSelect(at("dataset"), ["none", ...told.datasets.keys()], (n) => told.datasets[n] ?? n);
+  fillSelect(at("cause"), [...told.causes.keys()], (n) => told.causes[n].slice(0, 80));
+  for (const id of ["robot", "state", "dataset", "cause"]) at(id).onchange = filtered;
+  at("find").oninput = filtered;
+  at("clear").onclick = () => {
+    for (const id of ["find", "robot", "state", "dataset", "cause"]) at(id).value = "";
+    filtered();
+  };
+  draw();
+  document.documentElement.dataset.ready = "yes";
+});

@@ -1,0 +1,171 @@
+"""The page of a store says of each run what its documents say, names what failed, and tells a change over the nights from scatter."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from page_reading import data_of
+from synthetic_store import add_run, add_world, lanes, segments
+
+from tcpipe.errors import StoreError, UsageError
+from tcpipe.formats.bucket import open_place
+from tcpipe.formats.record_files import Call
+from tcpipe.motion.remedies import REMEDIES, losses_of
+from tcpipe.pipeline import calls
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.known_trouble import Trouble, accept
+from tcpipe.pipeline.report import report
+from tcpipe.pipeline.verify import verify
+from tcpipe.recipe import ReadConfig, Recipe
+from tcpipe.report.store_verdict import shift_of
+from tcpipe.store import open_store
+
+EVIL = "<b>\"'&\x1b[31m\u202e</script>"
+OLD = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
+
+
+def add(store, run_id, number, **how):
+    table = segments(run_id, *lanes(np.array([float(number)]), -10.0, 10.0), start_ns=10**18 + number * 10**14)
+    add_run(store, run_id, table, **how)
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    """Runs a and b in a dataset, b with an older ingestion too, c of a damaged log and in none, d superseded by a; two logs failed."""
+    here = tmp_path_factory.mktemp("store page")
+    store = open_store(here / "store", create=True)
+    add_world(store, here)
+    add(store, "b", 1, recipe=OLD)
+    for number, run_id in enumerate(("a", "b", "d")):
+        lines = [f"gnss: {number + 2} fixes are late"] if number < 2 else []
+        add(store, run_id, number, warnings=lines, tags={"site": EVIL})
+    store.supersede("d", "a")
+    build_dataset(here / "dataset", store=store.root)
+    add(store, "c", 3, ledger_m={"kept": 20.0, "gap": 60.0, "standing": 5.0})
+    store.remember("failed/1", Trouble("1" * 64, (f"/logs/junk: {EVIL} is no log",), ("/logs/junk",)))
+    store.remember("failed/2", Trouble("a", ("/logs/a.mcap: was cut",), ("/logs/a.mcap",)))
+    failed = {"/logs/passing.mcap": "No space left on device", "/logs/b.mcap": "No space left on device"}
+    calls.remember_call(store, calls.started(), Call("ingest", "0", 3, {"failed": 1}, failed=failed))
+    return store
+
+
+def shown(store):
+    page = report(store.root, runs=False)[0]
+    html = open_place(store.root).read("report.html").decode()
+    told = data_of(html)
+    rows = [dict(zip(told["fields"], row, strict=True)) for row in told["rows"]]
+    return page, html, told, rows
+
+
+def test_each_run_is_there_as_its_documents_say(store):
+    page, _, told, rows = shown(store)
+    assert page.path == str(store.root / "report.html")
+    assert [(row["run"], row["state"]) for row in rows] == [
+        ("c", "good"), ("d", "superseded by a"), ("b", "good"), ("b", "of another recipe"), ("a", "good")
+    ]  # fmt: skip
+    for row, run_id in ((rows[0], "c"), (rows[-1], "a")):
+        (run,) = store.recipes_of(run_id)
+        made = run.manifest
+        assert (row["robot"], row["segments"]) == (made.robot, made.counts.segments)
+        assert row["driven"] == pytest.approx(sum(made.ledger_m.values()), abs=0.05)
+        assert row["used"] == pytest.approx(100.0 * made.ledger_m["kept"] / sum(made.ledger_m.values()), abs=0.01)
+        assert row["start_ms"] == run.table("segments").column("start_ns").to_numpy().min() // 10**6
+    assert [told["datasets"][n] for row in rows for n in row["datasets"]] == ["dataset"] * 2
+    assert [row["causes"] for row in rows] == [[], [], [0], [], [0]]
+    assert not report(store.root, runs=False)[0].changed
+
+
+def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
+    _, html, *_ = shown(store)
+    manifests = [store.recipes_of(name)[-1].manifest for name in ("a", "c")]
+    current = [
+        *manifests,
+        next(run for run in store.recipes_of("b") if run.manifest.recipe == Recipe().ingest).manifest,
+    ]
+    driven_m = sum(sum(made.ledger_m.values()) for made in current)
+    assert f"<div><b>{driven_m:.0f} m</b><span>driven</span></div>" in html
+    assert "<div><b>3</b><span>runs</span></div>" in html
+    assert "Most is to be won of gap, 60 m" in html
+
+
+def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_accepts_it(store):
+    _, html, *_ = shown(store)
+    part = html.split("<h2>Failed and damaged</h2>")[1].split("</section>")[0]
+    assert "is no log" in part
+    assert "failed for what it holds" in part
+    assert "passing.mcap" in part
+    assert "was cut" not in part  # the run of that content is there
+    assert "b.mcap" not in part
+    assert "2 logs gave no run" in html
+    accept(["/logs/junk"], store=store.root)
+    assert "1 log gave no run" in shown(store)[1]
+
+
+def test_names_are_text_and_pages_are_led_to_where_they_are(store):
+    _, html, _, rows = shown(store)
+    assert "<b>\"'" not in html
+    assert "\x1b" not in html
+    assert "\u202e" not in html
+    assert not any(row["href"] for row in rows)
+    assert 'href="../dataset/report.html"' in html
+    pages = report(store.root)
+    assert [page.path for page in pages[1:]] == [f"{run.where}/report.html" for run in store.runs()]
+    for row in shown(store)[3]:
+        assert (row["href"] != "") == (row["run"] != "d")
+        assert not row["href"] or (store.root / row["href"]).is_file()
+    assert not [line for line in verify(store.root).problems if "report.html" in line]
+
+
+def test_an_empty_store_and_one_of_failed_logs_alone_have_a_page(tmp_path):
+    store = open_store(tmp_path / "store", create=True)
+    assert "No run can be used." in shown(store)[1]
+    store.remember("failed/1", Trouble("1" * 64, ("/logs/junk: is no log",), ("/logs/junk",)))
+    _, html, *_ = shown(store)
+    assert "No run can be used; 1 log gave none" in html
+    assert '<td class="long">' in html
+    with pytest.raises(UsageError, match="is no dataset, run or store"):
+        report(tmp_path)
+
+
+def test_a_run_that_cannot_be_read_is_named_and_costs_no_other_page(tmp_path):
+    store = open_store(tmp_path / "store", create=True)
+    for number, run_id in enumerate("abc"):
+        add(store, run_id, number)
+    runs = {run.run_id: run for run in store.runs()}
+    track = runs["b"].file("track.parquet")
+    track.write_bytes(track.read_bytes()[::-1])
+    (store.root / "runs/c" / runs["c"].recipe_id / "manifest-1.json").write_text("{")
+    with pytest.raises(StoreError, match=r"track\.parquet"):
+        report(store.root)
+    rows = {row["run"]: row for row in shown(store)[3]}
+    assert (rows["a"]["href"] != "", rows["b"]["href"], rows["c"]["href"]) == (True, "", "")
+    assert rows["c"]["state"] == "not as it was written"
+
+
+def test_many_runs_are_all_told_and_some_can_be_read_without_scripts(store, monkeypatch):
+    monkeypatch.setattr("tcpipe.report.store_report.MOST_ROWS", 2)
+    _, html, _, rows = shown(store)
+    assert len(rows) == 5
+    assert "Without scripts the first 2 of 5 stand here." in html
+    assert html.split("<h2>All runs</h2>")[1].split("</section>")[0].count("<tr>") == 3
+
+
+def test_a_change_is_told_from_scatter():
+    scatter = np.random.default_rng(3).normal(84.0, 1.0, 20)
+    assert shift_of(scatter) is None
+    assert shift_of(scatter[:11]) is None
+    found = shift_of([*scatter[:15], *(scatter[15:] + 12.0)])
+    assert (found.earlier, found.latest) == (15, 5)
+    assert shift_of([*np.tile(scatter, 50), *(scatter + 12.0)]).latest == 20
+    assert found.after - found.before == pytest.approx(12.0, abs=1.0)
+    assert shift_of([5.0] * 20) is None
+    assert shift_of([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
+    assert shift_of([5.0] * 15 + [6.0] * 5) is not None
+
+
+def test_losses_add_up_over_runs():
+    found = losses_of([{"kept": 50.0, "gap": 30.0, "standing": 0.01}, {"kept": 10.0, "gap": 10.0}])
+    assert [(loss.reason, loss.metres, loss.runs) for loss in found] == [("gap", 40.0, 2)]
+    assert found[0].share == pytest.approx(0.4, abs=1e-3)
+    assert found[0].remedy == REMEDIES["gap"]
+    assert losses_of([]) == ()
