@@ -27,7 +27,7 @@ T = TypeVar("T")
 INPUTS = "in"
 """Directory of a workplace that no call changes."""
 
-LONGEST_S, LATEST_S = 180.0, 5.0
+LONGEST_S, LATEST_S = 600.0, 5.0
 """A call that takes longer hangs; one that is asked to end ends as fast."""
 
 STORE = "tcpipe-store"
