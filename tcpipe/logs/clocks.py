@@ -85,6 +85,10 @@ class Settled:
     simulated: SimulatedClock | None = None
 
 
+ON_SIMULATED_CLOCK = "brought to the simulation's clock"
+"""How the reason ends where a topic's log times were turned into what the simulation's clock told then."""
+
+
 def settle_clocks(topics: Mapping[str, TopicTimes], *, clock_published: bool = False) -> Settled:
     """Return each topic's timeline, and what the clocks did.
 
@@ -128,7 +132,7 @@ def _simulated(name: str, times: TopicTimes, clock: SimulatedClock) -> Timeline:
         stamps = np.where(known, times.header_ns, told)
         draft = _Draft("header", _COUNTED, stamps, every, epoch, {}, median, int(np.count_nonzero(~known)))
         return _timeline(times, draft, [0])
-    draft = _Draft("log", f"{why}; brought to the simulation's clock", told, every, epoch, {}, median, 0)
+    draft = _Draft("log", f"{why}; {ON_SIMULATED_CLOCK}", told, every, epoch, {}, median, 0)
     return replace(_timeline(times, draft, [0]), moved_s=(float(np.median(told - times.log_time_ns)) / SECOND_NS,))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from tcpipe.logs.clocks import Settled, Timeline
+from tcpipe.logs.clocks import ON_SIMULATED_CLOCK, Settled, Timeline
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import TopicReadings
@@ -69,13 +69,14 @@ def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]
         yield lost + (": the track lies in a local frame and cannot be placed on a map" if nowhere else "")
     if timeline is None:
         return
-    if timeline.source == "log" and source.readings.header_ns is not None:
+    simulated = timeline.why.endswith(ON_SIMULATED_CLOCK) and any(timeline.moved_s)
+    if timeline.source == "log" and (simulated or source.readings.header_ns is not None):
         yield f"{name}: log time rules, since {timeline.why}"
     if timeline.notes.get("stamps_replaced"):
         count = timeline.notes["stamps_replaced"]
         yield f"{name}: {count} header stamps are unset or wrong and were taken from the log time"
     for epoch, moved_s in enumerate(timeline.moved_s):
-        if moved_s:
+        if moved_s and not simulated:
             yield (
                 f"{name}: its clock is not the other topics': its stamps were moved by {moved_s:+.3f} s in epoch {epoch}; "
                 f"what is left of its delay can be set with read.time_offset_s"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.logs.clocks import Settled, Timeline
+from tcpipe.logs.clocks import ON_SIMULATED_CLOCK, Settled, Timeline
 from tcpipe.logs.messages import Readings
 from tcpipe.logs.roles import PlayedRole, RoleAssignment
 from tcpipe.power.readings import PowerReadings
@@ -85,6 +85,13 @@ def test_stamps_that_were_replaced_or_moved_are_told():
         "gnss: /fix: its clock is not the other topics': its stamps were moved by -0.500 s in epoch 1;"
     )
     assert read(source(), timeline(notes={"stamps_replaced": 0})).warnings == ()
+
+
+def test_the_years_between_a_simulation_and_the_wall_clock_are_no_delay_to_be_set():
+    why = f"it has no stamps; {ON_SIMULATED_CLOCK}"
+    (line,) = read(source(header=False), timeline(source="log", why=why, moved_s=(-1.7e9,))).warnings
+    assert line == f"gnss: /fix: log time rules, since {why}"
+    assert read(source(header=False), timeline(source="log", why=why, moved_s=(0.0,))).warnings == ()
 
 
 def test_a_topic_without_a_timeline_plays_no_part_but_says_what_it_lacks():
