@@ -80,7 +80,8 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     say(f"$ tcpipe build-dataset {dataset_path} --split {site.region}")
     built = build_dataset(dataset_path, store=store_path, split=site.region, recipe=Recipe())
     say(f"$ tcpipe report {dataset_path}")
-    pages = (*report(dataset_path), *report(store_path))
+    of_store = report(store_path)  # first: the dataset's page leads to it
+    pages = (*report(dataset_path), *of_store)
     statuses = {added.status, built.status, *(result.status for result in ingested.results)}
     unchanged = statuses == {"unchanged"} and not any(page.changed for page in pages)
     return DemoResult(directory, ingested, built, tuple(Path(page.path) for page in pages), unchanged)
