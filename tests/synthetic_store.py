@@ -13,6 +13,7 @@ from tcpipe.formats.recipe_toml import ingest_key, recipe_id
 from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.bits import DropReason
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, PowerSign, RunFacts
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
@@ -89,6 +90,30 @@ def segments(run_id, start_xy_m, end_xy_m, *, start_ns=0, powered=True, robot="h
             rest[column.name] = np.zeros(n, np.int64 if pa.types.is_integer(column.dtype) else np.float64)
     rest["geometry"] = line_column(start, end)
     return LABELLED_SEGMENTS.table(**given, **rest)
+
+
+def driven(table, *, powered=True):
+    """A gated track of 20 Hz through all segments of a table, one after the other, after five seconds of standing."""
+    starts, ends = (table.column(f"{end}_ns").to_numpy() for end in ("start", "end"))
+    stamps = np.arange(starts[0] - 5_000_000_000, ends[-1], 50_000_000)
+    corner_s = (np.append(starts, ends[-1]) - stamps[0]) * 1e-9
+    at_s = (stamps - stamps[0]) * 1e-9
+    given = {"stamp_ns": stamps, "dropped_by": np.where(stamps < starts[0], int(DropReason.STANDING), 0)}
+    for axis in ("lon", "lat"):
+        corners = np.append(table.column(f"start_{axis}_deg").to_numpy(), table.column(f"end_{axis}_deg")[-1].as_py())
+        given[f"{axis}_deg"] = np.interp(at_s, corner_s, corners)
+    given["forward_velocity_mps"] = np.where(stamps < starts[0], 0.0, 0.8)
+    given["power_watt"] = (
+        np.where(stamps < starts[0], STANDING_WATT, 200.0) if powered else np.full(len(stamps), np.nan)
+    )
+    for name in ("wheel_velocity_mps", "voltage_volt", "current_amp"):
+        given[name] = np.full(len(stamps), np.nan)
+    rest = {
+        column.name: np.full(len(stamps), 0 if pa.types.is_integer(column.dtype) else 0.02)
+        for column in GATED_TRACK.columns
+        if column.name not in given
+    }
+    return GATED_TRACK.table(**given, **rest)
 
 
 def add_run(

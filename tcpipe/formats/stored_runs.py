@@ -15,6 +15,7 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.numbered import digest_of, read_as_at
 from tcpipe.formats.parquet import highest, lowest, read_table, write_table
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
+from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest, ManifestHead
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
@@ -52,6 +53,13 @@ class RunDirectory:
     def manifest(self) -> Manifest:
         """The whole manifest, with the run's tags as they are now; `StoreError` if it is not as it was written."""
         return replace(_manifest(self.place, self.facts.state), tags=self.facts.tags)
+
+    @property
+    def streams_key(self) -> str:
+        """Names the read settings of the streams that it was made from, as ``run.json`` has it while these are there."""
+        told = self.manifest
+        key = read_key(told.recipe, told.robot_requested, definitions=told.message_definitions)
+        return f"{key}-{told.tcpipe_version}"
 
     @property
     def where(self) -> str:

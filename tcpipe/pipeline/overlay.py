@@ -20,7 +20,6 @@ from tcpipe.errors import LogError, StoreError, UsageError, plain_lines
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.roles import NAV_SAT_FIX, OVERLAY, POSE_STAMPED
@@ -164,9 +163,8 @@ class _Clock:
 
 def _recorder_clock(store: Store, run: RunDirectory) -> _Clock:
     """Return the clock of a run's log; `StoreError` where its streams are not those that the run was made from."""
-    manifest, known = run.manifest, store.run_json(run.run_id)
-    key = read_key(manifest.recipe, manifest.robot_requested, definitions=manifest.message_definitions)
-    if known is None or known.streams_key != f"{key}-{manifest.tcpipe_version}" or not known.streams:
+    known = store.run_json(run.run_id)
+    if known is None or known.streams_key != run.streams_key or not known.streams:
         raise StoreError(f"{run.where}: the streams it was made from are gone or were read anew; ingest the log again")
     columns = ["stamp_ns", "log_time_ns", "epoch"]
     tables = (read_table(path, columns) for path in store.stream_files(run.run_id, known).values())

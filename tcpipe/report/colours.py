@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from tcpipe.tables.bits import DropReason
+
 INK = "#22303c"
 FAINT = "#8a97a3"
 KEPT = "#009e73"
@@ -9,6 +11,22 @@ DROPPED = "#d55e00"
 SPLIT_COLOURS = {"train": "#0072b2", "test": "#e69f00", "unseen": "#c2185b", "buffer": FAINT}
 CLASS_COLOURS = ("#aa3377", "#228833", "#66ccee", "#ccbb44", "#ee6677", "#4477aa", "#bbbbbb")
 """Paul Tol's bright scheme; class 1 has the first one, beyond the last they begin again."""
+CURSOR = "#ff2d95"
+DOUBTED = "#e69f00"
+UNUSED = "#8fd3bd"
+"""Of what is kept, and in no segment."""
+REASON_COLOURS = {
+    DropReason.GAP: "#cc79a7",
+    DropReason.STANDING: FAINT,
+    DropReason.STUCK: "#6b4a1b",
+    DropReason.TURNING_IN_PLACE: "#b8a200",
+    DropReason.REVERSING: "#56b4e9",
+    DropReason.ACCELERATING: DROPPED,
+    DropReason.BELOW_LIMIT: "#0072b2",
+}
+"""Why a row of the track is not used, on the map and over time; names stand beside them wherever it matters."""
+LINE_COLOURS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", FAINT)
+"""Of lines in one plot, the first for what the pipeline goes on with."""
 
 
 def class_colour(number: int) -> str:

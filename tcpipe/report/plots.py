@@ -19,13 +19,14 @@ from typing import Any, cast
 import bokeh
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import DataRange1d, FactorRange, HoverTool
+from bokeh.models import DataRange1d, DataRenderer, FactorRange, HoverTool, Range1d
+from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 from numpy.typing import NDArray
 
 from tcpipe.errors import plain_line
 from tcpipe.formats.json_files import Json
-from tcpipe.report.colours import DROPPED, KEPT, SPLIT_COLOURS
+from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
 
 _TEX = re.compile(r"\$\$|\\\(|\\\[")
 _UNREAD = "\u2060"
@@ -55,6 +56,7 @@ def new_plot(
     true_to_scale: bool = False,
     over_time: bool = False,
     beside: Plot | None = None,
+    ends: tuple[float, float] | None = None,
 ) -> Plot:
     """Return an empty plot as wide as the page.
 
@@ -82,8 +84,11 @@ def new_plot(
         The horizontal axis holds UTC, in milliseconds since 1970.
     beside
         A plot whose horizontal axis moves together with this one's.
+    ends
+        Of the horizontal axis; it follows what is drawn without.
 
     """
+    own = DataRange1d() if ends is None else Range1d(start=ends[0], end=ends[1])
     drawn = figure(
         name=name,
         x_axis_label=axes[0],
@@ -99,7 +104,7 @@ def new_plot(
         outline_line_color=None,
         match_aspect=true_to_scale,
         x_axis_type="datetime" if over_time else "auto",
-        x_range=DataRange1d() if beside is None else beside.figure.x_range,
+        x_range=own if beside is None else beside.figure.x_range,
         y_range=FactorRange(factors=list(names)) if names else DataRange1d(),
     )
     drawn.toolbar.logo = None
@@ -110,6 +115,17 @@ def new_plot(
     if tooltips:
         drawn.add_tools(HoverTool(tooltips=list(tooltips)))
     return Plot(drawn, alt, legend or {})
+
+
+def add_cursor(plot: Plot) -> None:
+    """Add a line across, ``cursor <name>``, which is nowhere until the page's script says where."""
+    name = f"cursor {plot.figure.name}"
+    plot.figure.add_layout(Span(dimension="height", location=np.nan, line_color=CURSOR, line_width=1.5, name=name))
+
+
+def say_of(plot: Plot, drawn: DataRenderer) -> None:
+    """Show the column ``text`` of what was drawn where the mouse is on it."""
+    plot.figure.add_tools(HoverTool(renderers=[drawn], tooltips=[("", "@text")]))
 
 
 def waterfall(ledger_m: Mapping[str, float]) -> Plot:

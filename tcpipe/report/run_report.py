@@ -1,53 +1,78 @@
-"""The page of one ingested run: where it drove, what was used, and what each metre cost."""
+"""The page of one ingested run: where it drove, what its sensors told over time, what was used, and what each metre cost."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyproj import Transformer
 
-from tcpipe.errors import TcpipeError, plain_line
-from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.run_documents import RunJson
+from tcpipe.errors import StoreError, TableError
+from tcpipe.formats.json_files import Json
+from tcpipe.formats.parquet import read_table
+from tcpipe.formats.run_documents import Manifest, RunJson
 from tcpipe.formats.stored_runs import RunDirectory
-from tcpipe.report.colours import DROPPED, KEPT
+from tcpipe.report.colours import DOUBTED, FAINT, KEPT, UNUSED
 from tcpipe.report.error_budget import budget_sections
-from tcpipe.report.figures import histograms, ledger_bars, over_distance, path_on_map
-from tcpipe.report.overview import map_overview
-from tcpipe.report.page import Number, Section, render_page
+from tcpipe.report.packed import Column, packed, shown_to
+from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
-from tcpipe.report.quality import quality_sections
+from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
+from tcpipe.report.quality import QUALITY_WORDS, quality_sections
+from tcpipe.report.run_map import RunMap, run_map
+from tcpipe.report.run_plots import SPEED_ROLES, Line, lines_of, reasons_told, time_plots
 from tcpipe.report.run_sensors import sensor_sections
+from tcpipe.report.run_series import (
+    Series,
+    Timeline,
+    gate_spans,
+    rail_series,
+    speed_series,
+    timeline_of,
+    track_series,
+)
+from tcpipe.report.run_verdict import verdict
 from tcpipe.store import Store
-from tcpipe.tables.bits import DropReason, Quality, name_of
+from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.findings import PhysicsFacts
 
-_MOSTLY = 0.5
+_PAGE = "report.html"
+_STEP_M = 0.05
+"""Places of the track that are nearer are one on the map."""
 
-_COLOURS = {
-    "kept": KEPT,
-    "gap": "#7a5195",
-    "standing": "#9aa3ab",
-    "stuck": "#000000",
-    "turning in place": "#e0a100",
-    "reversing": "#2a6fb0",
-    "accelerating": DROPPED,
-    "below limit": "#d48fb0",
+_LABELS = {
+    "power": ("power_watt", "power_std_watt", 1),
+    "velocity": ("velocity_mps", "velocity_std_mps", 3),
+    "duration": ("duration_s", "duration_std_s", 3),
+    "energy": ("energy_joule", "energy_std_joule", 1),
 }
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """The interactive part of the page."""
+
+    sections: tuple[Section, ...] = ()
+    data: Json = None
+    missing: tuple[str, ...] = ()
 
 
 def run_report(store: Store, run: RunDirectory) -> str:
     """Return the HTML page of a run of the store; a map of the store that lies under the run is its background."""
-    track, segments, manifest = run.track().table, run.segments(), run.manifest
+    track, segments, manifest, refused = run.track().table, run.segments(), run.manifest, run.rejections()
     label = manifest.info.findings.facts.label
     known = store.run_json(run.run_id)
     ledger, total = manifest.ledger_m, sum(manifest.ledger_m.values())
+    bits = integers(segments, "quality")
+    quality = {name_of(bit): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
+    drawn = _drawn(store, run, track, segments, refused)
     return render_page(
         title=f"Run {run.run_id}",
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {_source_line(known)}",
+        verdict=verdict(manifest, quality, drawn.missing),
         numbers=[
             Number(f"{total:.0f} m", "driven"),
             Number(f"{segments.num_rows}", "segments"),
@@ -56,12 +81,18 @@ def run_report(store: Store, run: RunDirectory) -> str:
             Number(_mean(segments, "velocity_mps", "m/s", digits=2), "mean velocity v"),
         ],
         warnings=[*manifest.damage, *manifest.warnings],
+        links=[Link("All runs of the store", f"../../../{_PAGE}")] if store.place.size(_PAGE) is not None else [],
         sections=[
-            *_track_sections(store, run, track),
-            *_segment_sections(segments, ledger, label.physics if label else None, manifest.robot),
+            *drawn.sections,
+            Section("Where every metre went", "Kept and dropped add up to the odometer.", plots=[waterfall(ledger)]),
+            *_label_sections(segments, label.physics if label else None, manifest.robot),
+            *(quality_sections(quality, "segments") if segments.num_rows else []),
             *budget_sections(run.facts.energy_budget),
-            *sensor_sections(known, manifest, run.rejections()),
+            *sensor_sections(known, manifest, refused),
+            _provenance(run, manifest, known),
         ],
+        script="run.js" if drawn.data is not None else "",
+        data=drawn.data,
     )
 
 
@@ -71,116 +102,157 @@ def _source_line(known: RunJson | None) -> str:
     return f"from {', '.join(known.source.paths)} ({known.source.size_bytes / 1e6:.1f} MB)"
 
 
-def _column(table: pa.Table, name: str) -> NDArray[np.float64]:
-    values: NDArray[np.float64] = table.column(name).to_numpy(zero_copy_only=False)
-    return values
-
-
-def _bits(table: pa.Table, name: str) -> NDArray[np.uint32]:
-    values: NDArray[np.uint32] = table.column(name).to_numpy()
-    return values
-
-
 def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
     values = segments.column(name).drop_null().to_numpy()
     return f"{values.mean():.{digits}f} {unit}" if len(values) else "none"
 
 
-def _first_reason(dropped_by: NDArray[np.uint32]) -> NDArray[np.object_]:
-    """Return each row's reason by precedence, ``kept`` where there is none."""
-    reasons = np.full(len(dropped_by), "kept", dtype=object)
-    for bit in reversed(list(DropReason)):
-        reasons[(dropped_by & int(bit)) != 0] = name_of(bit).replace("_", " ")
-    return reasons
-
-
-def _track_sections(store: Store, run: RunDirectory, track: pa.Table) -> list[Section]:
+def _drawn(store: Store, run: RunDirectory, track: pa.Table, segments: pa.Table, refused: pa.Table) -> _Drawn:
+    """Return map and plots over time with what their script needs; what cannot be drawn is said."""
     if not track.num_rows:
-        return []
-    x, y = _column(track, "x_m"), _column(track, "y_m")
-    dropped = _bits(track, "dropped_by")
-    distance = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    series = {"speed [m/s]": (_column(track, "forward_velocity_mps"), "#2a6fb0")}
-    if track.column("power_watt").null_count < track.num_rows:
-        series["power [W]"] = (_column(track, "power_watt"), DROPPED)
-    series["height [m]"] = (_column(track, "z_m"), "#8a5a2b")
-    return [
-        _path_section(store, run, track),
-        Section("Speed, power and height over distance", "", over_distance(distance, series, dropped == 0)),
-    ]
-
-
-def _path_section(store: Store, run: RunDirectory, track: pa.Table) -> Section:
-    reasons = _first_reason(_bits(track, "dropped_by"))
-    text = "The fused track; colour says why a row is not used."
-    found, lost = _map_under(store, run, track)
-    text += "".join(f" Map {name} cannot be shown: {why}." for name, why in lost)
-    if found is None:
-        x, y = _column(track, "x_m"), _column(track, "y_m")
-        return Section("Path", text, path_on_map(x, y, reasons, _COLOURS))
-    source, picture, x, y = found
-    x_min_m, y_min_m, x_max_m, y_max_m = source.grid.bounds_m
-    svg = path_on_map(
-        x,
-        y,
-        reasons,
-        _COLOURS,
-        backdrop=picture,
-        extent_m=(x_min_m, x_max_m, y_min_m, y_max_m),
-        labels=("easting [m]", "northing [m]"),
+        return _Drawn(missing=("No track: nothing was recorded that could be fused.",))
+    info = run.manifest.info
+    timeline = timeline_of(track)
+    ground = run_map(store, run, track, segments, located=info.datum is not None)
+    told, lost = _told_series(store, run, timeline)
+    series = [track_series(track, timeline, ground.track_xy_m), *told]
+    lines, spans = lines_of(series), gate_spans(track, timeline, info.rate_hz)
+    over_time = time_plots(
+        timeline, lines=lines, spans=spans, facts=info.findings.facts, refused=refused, labels=bool(segments.num_rows)
     )
-    return Section("Path on the map", text, svg)
+    data: dict[str, Json] = {
+        "run": run.run_id,
+        "first_s": 0.0,
+        "last_s": max(timeline.end_s, 1.0),
+        "epochs": [[each.start_s, str(each.first_ns)] for each in timeline.epochs],
+        "series": {each.name: each.json for each in series},
+        "lines": over_time.lines,
+        "spans": spans.json,
+        "segments": _segments(segments, timeline, ground),
+        "starts": [str(stamp) for stamp in integers(segments, "start_ns").tolist()],
+        "reasons": reasons_told(),
+        "quality": [[int(bit), words] for bit, words in QUALITY_WORDS.items()],
+        "ground": list(ground.ground),
+        "step_m": _STEP_M,
+        "kept": KEPT,
+        "doubted": DOUBTED,
+        "unused": UNUSED,
+        "tall_by_wide": float(np.divide(*np.maximum(np.ptp(ground.track_xy_m, axis=0), 1.0)[::-1])),
+    }
+    text = "Colour says what a metre is used for, or why it is not; a click on the track or in a plot below tells all of it."
+    sections = (
+        Section("The drive", text, controls="run.html", plots=[ground.plot]),
+        Section("Over time", _time_text(series, lines), controls="run_time.html", plots=over_time.plots, stacked=True),
+    )
+    return _Drawn(sections, data, (*ground.missing, *lost))
 
 
-_Under = tuple[MapFile, NDArray[np.uint8], NDArray[np.float64], NDArray[np.float64]]
+def _told_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[list[Series], list[str]]:
+    """Return what sensors told, from the streams, and in words what of it is lost."""
+    try:
+        known = store.run_json(run.run_id)
+        there = known is not None and known.streams_key == run.streams_key
+        files = store.stream_files(run.run_id, known, ("power", *SPEED_ROLES)) if known is not None and there else {}
+        tables = {role: read_table(path) for role, path in files.items()}
+    except (StoreError, TableError) as error:
+        return [], [f"What sensors told cannot be drawn: {error.problems[0]}."]
+    if not tables and run.manifest.counts.gnss_messages:
+        return [], ["What sensors told is gone or was read anew: of it the track's columns are drawn."]
+    series = list(rail_series(tables.pop("power"), timeline)) if "power" in tables else []
+    if "gnss_velocity" in tables:
+        tables.pop("gnss", None)
+    speeds = [speed_series(role, table, timeline) for role, table in tables.items()]
+    return [*series, *(each for each in speeds if each is not None)], []
 
 
-def _map_under(store: Store, run: RunDirectory, track: pa.Table) -> tuple[_Under | None, list[tuple[str, str]]]:
-    """Return the first map that holds most of the track, its picture and the track in its CRS, and the maps that cannot be read."""
-    gnss_crs = run.manifest.recipe.read.gnss_crs
-    lon, lat = _column(track, "lon_deg"), _column(track, "lat_deg")
-    lost: list[tuple[str, str]] = []
-    for name in store.maps() if run.track().info.datum is not None else ():
-        try:
-            source = open_map(*store.map_files(name))
-            x, y = Transformer.from_crs(gnss_crs, source.grid.crs, always_xy=True).transform(lon, lat)
-            if source.grid.contains(np.column_stack([x, y])).mean() > _MOSTLY:
-                return (source, map_overview(source), np.asarray(x), np.asarray(y)), lost
-        except (TcpipeError, OSError) as error:
-            lost.append((name, plain_line(str(error))))
-    return None, lost
+def _time_text(series: Sequence[Series], lines: Sequence[Line]) -> str:
+    """Return what the plots show, and which series are thinned."""
+    text = (
+        "Shaded: not used, in the colour of the reason. Draw a box to zoom, double-click for the whole run; every plot follows. "
+        "Where many values share a pixel, the line goes through the lowest and the highest of them."
+    )
+    if not any(line.plot == "power" for line in lines):
+        text += " There is no power."
+    for each in series:
+        if len(each.t_s) < each.of:
+            text += (
+                f" {each.name.replace('_', ' ')}: {each.of} values; the page carries the lowest and the highest of every "
+                f"{-(-2 * each.of // len(each.t_s))}."
+            )
+    return text
 
 
-def _physics_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> list[Section]:
-    """Return what a metre costs by physics, and what that leaves unexplained; nothing where it could not be fitted."""
+def _segments(segments: pa.Table, timeline: Timeline, ground: RunMap) -> Json:
+    """Return what the page holds of each segment."""
+    epoch = integers(segments, "epoch")
+    columns: dict[str, Column] = {
+        name: ("f32", timeline.seconds(integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
+    }
+    for number, end in enumerate(ground.ends_xy_m):
+        columns |= {f"{axis}{number}": ("f32", end[:, place]) for place, axis in enumerate("xy")}
+    for name, (value, std, digits) in _LABELS.items():
+        columns[name], columns[f"{name}_std"] = (
+            shown_to(digits, floats(segments, value)),
+            ("half", floats(segments, std)),
+        )
+    rise_m = floats(segments, "end_z_m") - floats(segments, "start_z_m")
+    columns["slope"] = "f32", np.degrees(np.arctan2(rise_m, floats(segments, "chord_m")))
+    columns["turn"], columns["turn_std"] = (
+        ("f32", np.degrees(floats(segments, f"turn_{part}rad"))) for part in ("", "std_")
+    )
+    columns["residual"] = "f32", floats(segments, "power_watt") - floats(segments, "physics_power_watt")
+    return packed(columns | {"quality": ("u16", integers(segments, "quality"))})
+
+
+def _label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> Iterator[Section]:
+    if not segments.num_rows:
+        return
+    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
+    drawn = [
+        histogram(f"of {name}", floats(segments, name), label=label, of_what="segments")
+        for label, name in labels.items()
+    ]
+    yield Section("Labels", "One value a segment.", plots=drawn)
     if physics is None or not physics.fitted:
-        return []
-    left = _column(segments, "power_watt").astype(float) - _column(segments, "physics_power_watt").astype(float)
+        return
+    yield from physics_sections({} if physics.fit is None else {robot: physics.fit})
     text = (
         f"Power minus what standing, drivetrain, rolling, grade and turning, fitted on this run, predict ({physics.segments} segments): "
         f"terrain and errors. {physics.outliers} segments are further than four standard deviations of "
         f"{physics.residual_watt:.0f} W."
     )
-    fits = {} if physics.fit is None else {robot: physics.fit}
-    return [
-        *physics_sections(fits),
-        Section("What physics leaves unexplained", text, histograms({"w - physics [W]": left})),
-    ]
+    yield Section("What physics leaves unexplained", text, plots=list(_physics_plots(segments)))
 
 
-def _segment_sections(
-    segments: pa.Table, ledger: Mapping[str, float], physics: PhysicsFacts | None, robot: str
-) -> list[Section]:
-    sections = [
-        Section("Where every metre went", "Kept and dropped add up to the odometer.", ledger_bars(ledger)),
+def _physics_plots(segments: pa.Table) -> Iterator[Plot]:
+    measured, fitted = floats(segments, "power_watt"), floats(segments, "physics_power_watt")
+    yield histogram("residual", measured - fitted, label="w - physics [W]", of_what="segments")
+    known = np.isfinite(measured) & np.isfinite(fitted)
+    plot = new_plot(
+        "physics",
+        alt="Power of each segment as it was measured against what physics predicts; on the line they are equal.",
+        axes=("w by physics [W]", "w [W]"),
+        height_px=220,
+        tools="save",
+    )
+    ends: NDArray[np.float64] = np.array([fitted[known].min(), fitted[known].max()]) if known.any() else np.zeros(2)
+    plot.figure.scatter(
+        fitted[known].astype(np.float32), measured[known].astype(np.float32), size=4, color=KEPT, alpha=0.7
+    )
+    plot.figure.line(ends, ends, color=FAINT, line_dash="dashed", line_width=1.5)
+    yield plot
+
+
+def _provenance(run: RunDirectory, manifest: Manifest, known: RunJson | None) -> Section:
+    """Return what the run is made from: enough to make it again."""
+    tags: Mapping[str, str] = manifest.tags
+    rows = [
+        ("made by", f"tcpipe {manifest.tcpipe_version}, data model {manifest.data_model_version}"),
+        ("recipe", run.recipe_id),
+        ("estimator", manifest.info.estimator),
+        ("tags", ", ".join(f"{key}={value}" for key, value in tags.items()) or "none"),
+        *((("log", f"sha256 {known.source.sha256}"),) if known is not None else ()),
     ]
-    if segments.num_rows:
-        labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
-        data = {label: _column(segments, name).astype(float) for label, name in labels.items()}
-        sections.append(Section("Labels", "One value a segment.", histograms(data)))
-        sections += _physics_sections(segments, physics, robot)
-        quality = _bits(segments, "quality")
-        sections += quality_sections(
-            {name_of(bit): int(((quality & int(bit)) != 0).sum()) for bit in Quality}, "segments"
-        )
-    return sections
+    return Section(
+        "Provenance", "The same log and recipe make the same run.", header=("what", "is"), rows=rows, folded=True
+    )

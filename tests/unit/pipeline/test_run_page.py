@@ -4,7 +4,10 @@ import json
 import shutil
 from dataclasses import replace
 
+import numpy as np
+import pyarrow.parquet as pq
 import pytest
+from page_reading import data_of, unpacked
 from stored_files import run_document
 
 from tcpipe.formats.logs.log_file import open_log
@@ -38,7 +41,7 @@ def page(store):
 def test_a_map_that_cannot_be_read_is_named_and_the_next_one_drawn(store):
     _, html = page(store)
     assert "Map damaged cannot be shown:" in html
-    assert "<h2>Path on the map</h2>" in html
+    assert data_of(html)["ground"] == ["hillshade"]
 
 
 def test_without_any_readable_map_the_path_stands_alone(store, tmp_path):
@@ -46,8 +49,49 @@ def test_without_any_readable_map_the_path_stands_alone(store, tmp_path):
     shutil.copytree(store.root, alone)
     (Store(alone).map_path("site") / "zarr.json").write_text("{")
     _, html = page(Store(alone))
-    assert "<h2>Path</h2>" in html
+    assert data_of(html)["ground"] == []
+    assert "east [m]" in html
     assert html.count("cannot be shown") == 2
+
+
+def test_every_sensor_and_every_gate_stands_in_the_page_as_it_lies_in_the_store(store):
+    run, html = page(store)
+    told, track = data_of(html), run.track().table
+    assert len(html) < 5_000_000
+    at_s = (track.column("stamp_ns").to_numpy() - track.column("stamp_ns")[0].as_py()) * 1e-9
+    carried = told["series"]["track"]["packed"]
+    assert unpacked(carried, "t") == pytest.approx(at_s, abs=1e-4)
+    for name, column in (("power", "power_watt"), ("speed", "forward_velocity_mps"), ("height", "z_m")):
+        wanted = track.column(column).to_numpy()
+        assert np.allclose(unpacked(carried, name), wanted, atol=0.05, rtol=1e-3, equal_nan=True)
+    files = store.stream_files(run.run_id, store.run_json(run.run_id))
+    power = pq.read_table(files["power"])
+    (rail,) = [name for name in told["series"] if name.startswith("current ")]
+    amps = power.column("current_amp").drop_null().to_numpy()
+    assert unpacked(told["series"][rail]["packed"], "current") == pytest.approx(amps, abs=1e-3)
+    assert {line["series"] for line in told["lines"] if line["plot"] == "speed"} == {"track", "gnss", "visual_odometry"}
+    spans = told["spans"]
+    seconds = unpacked(spans, "end") - unpacked(spans, "start")
+    dropped = unpacked(spans, "bits") != 0
+    rows = (track.column("dropped_by").to_numpy() != 0).sum()
+    assert seconds[dropped].sum() == pytest.approx(rows / 20.0, abs=0.01)
+    segments = run.segments()
+    assert unpacked(told["segments"], "energy_std") == pytest.approx(segments["energy_std_joule"].to_numpy(), rel=5e-3)
+    ids = [f"{told['run']}-{start}" for start in told["starts"]]
+    assert ids == segments.column("segment_id").to_pylist()
+
+
+def test_where_streams_are_gone_the_track_is_drawn_and_the_page_says_so(store, tmp_path):
+    alone = tmp_path / "store"
+    shutil.copytree(store.root, alone)
+    (run,) = Store(alone).runs()
+    document = run_document(run)
+    named = json.loads(document.read_text())["streams"]
+    power = next(name for name in named if name.endswith("power.parquet"))
+    (document.parent / power).write_bytes(b"damaged")
+    html = run_report(Store(alone), run)
+    assert list(data_of(html)["series"]) == ["track"]
+    assert "What sensors told cannot be drawn" in html
 
 
 def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):

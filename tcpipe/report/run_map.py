@@ -1,0 +1,137 @@
+"""The map of a run's page: the ground under the track, if a map of the store has it, and room for what the page's script draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from pyproj import Transformer
+
+from tcpipe.errors import TcpipeError, plain_line
+from tcpipe.formats.maps.map_files import MapFile, open_map
+from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.report.colours import CURSOR
+from tcpipe.report.overview import class_overview, ortho_overview, relief_overview
+from tcpipe.report.pictures import picture_uri
+from tcpipe.report.plots import Plot, new_plot
+from tcpipe.store import Store
+from tcpipe.tables.columns import floats, lonlat_deg
+
+Floats = NDArray[np.float64]
+
+_MOSTLY = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class RunMap:
+    """The plot, the plane it is drawn in, names of the pictures on it, and in words why maps are not there."""
+
+    plot: Plot
+    track_xy_m: Floats
+    """Shape (N, 2)."""
+    ends_xy_m: tuple[Floats, Floats]
+    """Start and end of each segment, shape (M, 2) each."""
+    ground: tuple[str, ...]
+    missing: tuple[str, ...]
+
+
+def run_map(store: Store, run: RunDirectory, track: pa.Table, segments: pa.Table, *, located: bool) -> RunMap:
+    """Return the map; ``located`` is whether the track has a place on Earth."""
+    lonlat = np.column_stack([floats(track, "lon_deg"), floats(track, "lat_deg")])
+    found, missing = _map_under(store, run, lonlat) if located else (None, [])
+    if found is None:
+        ends = tuple(
+            np.column_stack([floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
+        )
+        xy_m = np.column_stack([floats(track, "x_m"), floats(track, "y_m")])
+        plot = _empty("map", ("east [m]", "north [m]"), xy_m)
+        return RunMap(
+            plot, xy_m, (ends[0], ends[1]), (), (*missing, *_absent(store, located=located, lost=bool(missing)))
+        )
+    source, to_map = found
+    xy_m = to_map(lonlat)
+    plot = _empty("map", ("easting [m]", "northing [m]"), xy_m)
+    ground = _draw_ground(plot, source)
+    return RunMap(
+        plot, xy_m, (to_map(lonlat_deg(segments, "start")), to_map(lonlat_deg(segments, "end"))), ground, tuple(missing)
+    )
+
+
+def _absent(store: Store, *, located: bool, lost: bool) -> Sequence[str]:
+    if not located:
+        return ["No fix of a GNSS: the track lies in a plane of its own, and no map can be laid under it."]
+    if lost:
+        return []
+    return ["No map of the store lies under the track." if store.maps() else "The store has no map ('tcpipe add-map')."]
+
+
+_Under = tuple[MapFile, Callable[[Floats], Floats]]
+
+
+def _map_under(store: Store, run: RunDirectory, lonlat: Floats) -> tuple[_Under | None, list[str]]:
+    """Return the first map that holds most of the track with the way into its plane, and which maps cannot be read."""
+    lost: list[str] = []
+    for name in store.maps():
+        try:
+            source = open_map(*store.map_files(name))
+            turned = Transformer.from_crs(run.manifest.recipe.read.gnss_crs, source.grid.crs, always_xy=True)
+
+            def to_map(places_deg: Floats, turned: Transformer = turned) -> Floats:
+                return np.column_stack(turned.transform(*places_deg.T)).reshape(-1, 2)
+
+            if source.grid.contains(to_map(lonlat)).mean() > _MOSTLY:
+                return (source, to_map), lost
+        except (TcpipeError, OSError) as error:
+            lost.append(f"Map {name} cannot be shown: {plain_line(str(error))}.")
+    return None, lost
+
+
+def _empty(name: str, axes: tuple[str, str], xy_m: Floats) -> Plot:
+    low, high = xy_m.min(axis=0), xy_m.max(axis=0)
+    wide, tall = np.maximum(high - low, 0.1 * np.max(high - low, initial=10.0))
+    plot = new_plot(
+        name,
+        alt="Map of the track: segments, and where and why the rest is not used; the waterfall below holds the metres.",
+        axes=axes,
+        height_px=int(np.clip(110 + 900 * tall / wide, 330, 600)),
+        tools="pan,wheel_zoom,box_zoom,reset,save",
+        drag="pan",
+        true_to_scale=True,
+    )
+    figure = plot.figure
+    corners = {"xs": [[low[0], high[0]]], "ys": [[low[1], high[1]]], "colour": ["#00000000"]}
+    track = figure.multi_line("xs", "ys", color="colour", line_width=3, source=corners, name="track")
+    ends = {end: list[float]() for end in ("x0", "y0", "x1", "y1", "colour")}
+    figure.segment("x0", "y0", "x1", "y1", color="colour", line_width=6, line_cap="butt", source=ends, name="segments")
+    figure.scatter(
+        "x", "y", size=15, fill_alpha=0.0, line_color=CURSOR, line_width=3, source={"x": [], "y": []}, name="here"
+    )
+    figure.x_range.renderers = figure.y_range.renderers = [track]
+    figure.xgrid.visible = figure.ygrid.visible = False
+    figure.axis.formatter.use_scientific = False
+    figure.axis.ticker.desired_num_ticks = 4
+    return plot
+
+
+def _draw_ground(plot: Plot, source: MapFile) -> tuple[str, ...]:
+    """Draw the map's pictures, the first to be seen; return their names."""
+    layers = source.layers
+    looks = [("orthophoto", ortho_overview)] if any(name.startswith("ortho") for name in layers) else []
+    looks += [("hillshade", relief_overview), *([("classes", class_overview)] if "terrain" in layers else [])]
+    x_min_m, y_min_m, x_max_m, y_max_m = source.grid.bounds_m
+    for number, (name, look) in enumerate(looks):
+        drawn = plot.figure.image_url(
+            url=[picture_uri(look(source), exact=name == "classes")],
+            x=x_min_m,
+            y=y_max_m,
+            w=x_max_m - x_min_m,
+            h=y_max_m - y_min_m,
+            anchor="top_left",
+            name=f"layer {name}",
+        )
+        drawn.level = "image"
+        drawn.visible = number == 0
+    return tuple(name for name, _ in looks)

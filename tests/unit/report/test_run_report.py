@@ -1,0 +1,175 @@
+"""The page of a run of which only its store is known: what is thinned keeps its peaks, times survive clocks that step, lacks are said."""
+
+import re
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from page_reading import data_of, unpacked
+from synthetic_store import add_run, driven, lanes, segments
+
+from tcpipe.report.run_plots import time_plots
+from tcpipe.report.run_report import run_report
+from tcpipe.report.run_series import gate_spans, rail_series, speed_series, thinned, timeline_of
+from tcpipe.store import open_store
+from tcpipe.tables.findings import ClockStep, RunFacts
+from tcpipe.tables.levels import POWER, REJECTIONS, Sensor
+
+EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e\"'&"
+
+
+def drive(run_id="run", **how):
+    start, end = lanes((0.0,), -10.0, 10.0)
+    return segments(run_id, start, end, start_ns=10**18, **how)
+
+
+def page_of(tmp_path, table, **how):
+    store = open_store(tmp_path / "store", create=True)
+    add_run(store, "run", table, **how)
+    (run,) = store.runs()
+    return run_report(store, run)
+
+
+def test_thinning_keeps_every_peak_and_says_how_many_there_were():
+    rng = np.random.default_rng(1)
+    values = rng.normal(size=100_003)
+    values[[17, 60_001]] = 40.0, -40.0
+    values[500:900] = np.nan
+    shown = thinned("x", np.arange(len(values)) * 0.01, {"y": (6, values)}, most=2_000)
+    kept = shown.columns["y"][1]
+    assert len(kept) == len(shown.t_s) <= 2_000
+    assert shown.of == len(values)
+    assert (np.nanmax(kept), np.nanmin(kept)) == (40.0, -40.0)
+    per_bin = -(-2 * len(values) // 2_000)
+    for number in (0, 7, len(kept) // 2 - 1):
+        part = values[number * per_bin : (number + 1) * per_bin]
+        part = part[np.isfinite(part)]
+        pair = kept[2 * number : 2 * number + 2]
+        assert set(pair[np.isfinite(pair)]) == ({part.min(), part.max()} if len(part) else set())
+    assert (np.diff(shown.t_s) > 0).all()
+    assert abs(shown.t_s[np.nanargmax(kept)] - 0.17) < per_bin * 0.01
+
+
+def test_what_is_short_is_carried_whole():
+    shown = thinned("x", np.arange(5.0), {"y": (2, np.array([1.0, np.nan, 3.0, 2.0, 5.0]))})
+    assert shown.columns["y"][1] == pytest.approx([1.0, np.nan, 3.0, 2.0, 5.0], nan_ok=True)
+    assert shown.of == len(shown.t_s) == 5
+
+
+def stepped(track, by_ns):
+    """The track with its second half an epoch later, its stamps ``by_ns`` off."""
+    half, rows = track.num_rows // 2, np.arange(track.num_rows)
+    stamps = track.column("stamp_ns").to_numpy() + np.where(rows >= half, by_ns, 0)
+    track = track.set_column(0, track.schema.field("stamp_ns"), pa.array(stamps))
+    return track.set_column(1, track.schema.field("epoch"), pa.array((rows >= half).astype(np.int16))), half
+
+
+@pytest.mark.parametrize(
+    "by_ns", [-3_600_000_000_000, 1_500_000_000_000_000_000], ids=["back an hour", "on by decades"]
+)
+def test_after_a_step_of_the_clock_the_drive_goes_on(by_ns):
+    track, half = stepped(driven(drive()), by_ns)
+    axis = timeline_of(track)
+    at_s = axis.seconds(track.column("stamp_ns").to_numpy(), track.column("epoch").to_numpy())
+    assert np.diff(at_s)[half - 1] == pytest.approx(1.0)
+    assert np.delete(np.diff(at_s), half - 1) == pytest.approx(0.05)
+    assert axis.end_s == at_s[-1]
+    assert np.isnan(axis.seconds(np.array([0]), np.array([7]))).all()
+
+
+def test_a_span_ends_where_the_reason_or_the_track_does():
+    track = driven(drive())
+    without = pa.concat_tables(
+        [track.slice(0, 40), track.slice(60)]
+    )  # two seconds, a second is missing, three more standing
+    spans = gate_spans(without, timeline_of(without), 20.0)
+    assert spans.bits.tolist() == [2, 2, 0]
+    assert spans.start_s == pytest.approx([-0.025, 2.975, 4.975])
+    assert spans.end_s[:2] == pytest.approx([1.975, 4.975])
+
+
+def test_rails_that_tell_current_and_voltage_in_turn_are_series_of_their_own():
+    n = 10
+    stamps = 10**18 + np.arange(n) * 10**8
+    odd = np.arange(n) % 2 == 1
+    table = POWER.table(
+        stamp_ns=stamps, log_time_ns=stamps, epoch=np.zeros(n, np.int16), rail=np.where(np.arange(n) < 6, "left", EVIL),
+        voltage_volt=np.where(odd, 25.0, np.nan), current_amp=np.where(odd, np.nan, 4.0),
+    )  # fmt: skip
+    found = {each.name: each for each in rail_series(table, timeline_of(driven(drive())))}
+    assert sorted(found) == sorted([f"{kind} {rail}" for kind in ("voltage", "current") for rail in ("left", EVIL)])
+    assert found["current left"].t_s == pytest.approx([5.0, 5.2, 5.4])
+    assert found["voltage left"].columns["voltage"][1] == pytest.approx([25.0] * 3)
+
+
+def test_speed_of_a_sensor_that_tells_places_is_its_chord_over_a_second():
+    t_s = np.arange(0, 20, 0.1)
+    stamps = 10**18 + (t_s * 1e9).astype(np.int64)
+    table = pa.table(
+        {
+            "stamp_ns": stamps,
+            "epoch": np.zeros(len(t_s), np.int16),
+            "x_m": 3.0 * np.cos(t_s / 3),
+            "y_m": 3.0 * np.sin(t_s / 3),
+        }
+    )
+    shown = speed_series("pose", table, timeline_of(driven(drive())))
+    assert shown.columns["speed"][1] == pytest.approx(
+        6.0 * np.sin(1 / 6), abs=1e-3
+    )  # chord of a circle of 3 m at 1 m/s
+    assert np.diff(shown.t_s) == pytest.approx(1.0)
+
+
+def test_a_run_without_power_map_or_sensors_says_so(tmp_path):
+    table = drive(powered=False)
+    html = page_of(tmp_path, table, track=driven(table, powered=False))
+    for text in (
+        "No power: no segment has w or E.",
+        "No GNSS",
+        "no camera",
+        "The store has no map",
+        "There is no power.",
+    ):
+        assert text in html
+    told = data_of(html)
+    assert told["ground"] == []
+    assert "power" not in {line["plot"] for line in told["lines"]}
+    assert np.isnan(unpacked(told["segments"], "power")).all()
+
+
+def test_a_run_without_track_or_segments_is_a_page_too(tmp_path):
+    html = page_of(tmp_path, drive().slice(0, 0), ledger_m={"kept": 0.0, "gap": 12.0})
+    assert "No track: nothing was recorded that could be fused." in html
+    assert "No segment: every metre was lost" in html
+    assert "12 m gap: a sensor is silent" in html
+
+
+def test_names_are_text(tmp_path):
+    table = drive()
+    sensor = Sensor(EVIL, EVIL, EVIL, EVIL)
+    html = page_of(tmp_path, table, track=driven(table), tags={"tag": EVIL}, warnings=(EVIL,), sensors={"gnss": sensor})
+    assert "<script>alert" not in html
+    assert html.count("&lt;script&gt;alert(1)") >= 4
+    assert not re.search("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e]", html.split("page-figures")[0])
+
+
+def test_the_same_run_has_the_same_page(tmp_path):
+    table = drive()
+    store = open_store(tmp_path / "store", create=True)
+    add_run(store, "run", table, track=driven(table))
+    (run,) = store.runs()
+    first = run_report(store, run)
+    assert run_report(store, run) == first
+    assert str(tmp_path) not in first
+
+
+def test_a_step_of_the_clock_has_its_place_and_its_size():
+    track, half = stepped(driven(drive()), 10**12)
+    axis = timeline_of(track)
+    facts = RunFacts(clock_steps=(ClockStep(10**18, 1000.0, ("/gnss",)),))
+    shown = time_plots(
+        axis, lines=[], spans=gate_spans(track, axis, 20.0), facts=facts, refused=REJECTIONS.empty(), labels=False
+    )
+    (event,) = [drawn.data_source.data for drawn in shown.plots[0].figure.renderers if "text" in drawn.data_source.data]
+    assert event["text"] == ("the clock steps by +1000.000 s",)
+    assert event["right"][0] == pytest.approx((half - 1) * 0.05 + 1.0)
