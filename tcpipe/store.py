@@ -460,12 +460,10 @@ class Store:
         except (TableError, StoreError):
             return None
 
-    def stream_files(self, run_id: str, known: RunJson, roles: Sequence[str] = ()) -> dict[str, Path]:
-        """Return the files of L1, or of some roles, on this machine by role, proved; `StoreError` if one is not as it was written."""
-        place, named = self.runs_place.below(run_id), {PurePosixPath(name).stem: name for name in sorted(known.streams)}
-        return {
-            of: local_file(place, name, known.streams[name]) for of, name in named.items() if not roles or of in roles
-        }
+    def stream_files(self, run_id: str, known: RunJson) -> dict[str, Path]:
+        """Return the files of L1 on this machine by role, proved; `StoreError` if one is not as it was written."""
+        place = self.runs_place.below(run_id)
+        return {PurePosixPath(name).stem: local_file(place, name, of) for name, of in sorted(known.streams.items())}
 
     def write_run(
         self,

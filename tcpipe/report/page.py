@@ -77,7 +77,6 @@ class Section:
 
     title: str
     text: str = ""
-    svg: str = ""
     header: Sequence[str] = field(default_factory=tuple)
     rows: Sequence[Sequence[Any]] = field(default_factory=tuple)
     figures_from: int | None = None

@@ -19,7 +19,7 @@ from typing import Any, cast
 import bokeh
 import numpy as np
 from bokeh.document import Document
-from bokeh.models import DataRange1d, DataRenderer, FactorRange, HoverTool, Range1d
+from bokeh.models import DataRange1d, FactorRange, HoverTool, Range1d
 from bokeh.models.annotations.geometry import Span
 from bokeh.plotting import figure
 from numpy.typing import NDArray
@@ -123,7 +123,7 @@ def add_cursor(plot: Plot) -> None:
     plot.figure.add_layout(Span(dimension="height", location=np.nan, line_color=CURSOR, line_width=1.5, name=name))
 
 
-def say_of(plot: Plot, drawn: DataRenderer) -> None:
+def say_of(plot: Plot, drawn: Any) -> None:
     """Show the column ``text`` of what was drawn where the mouse is on it."""
     plot.figure.add_tools(HoverTool(renderers=[drawn], tooltips=[("", "@text")]))
 

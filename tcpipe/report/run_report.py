@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
 
 import numpy as np
 import pyarrow as pa
@@ -151,8 +152,9 @@ def _told_series(store: Store, run: RunDirectory, timeline: Timeline) -> tuple[l
     """Return what sensors told, from the streams, and in words what of it is lost."""
     try:
         known = store.run_json(run.run_id)
-        there = known is not None and known.streams_key == run.streams_key
-        files = store.stream_files(run.run_id, known, ("power", *SPEED_ROLES)) if known is not None and there else {}
+        there = known.streams if known is not None and known.streams_key == run.streams_key else {}
+        wanted = {name: of for name, of in there.items() if PurePosixPath(name).stem in ("power", *SPEED_ROLES)}
+        files = store.stream_files(run.run_id, replace(known, streams=wanted)) if known is not None else {}
         tables = {role: read_table(path) for role, path in files.items()}
     except (StoreError, TableError) as error:
         return [], [f"What sensors told cannot be drawn: {error.problems[0]}."]

@@ -2,9 +2,10 @@
 
 import shutil
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
-from synthetic_store import add_run, add_world, lanes, segments
+from synthetic_store import add_run, add_world, driven, lanes, segments
 
 from tcpipe.learning.evaluation_facts import EvaluateConfig
 from tcpipe.learning.evaluation_files import run_evaluation
@@ -57,6 +58,7 @@ def quiet_page(chromium, path, look):
     """A page, drawn; at the end it must have asked for nothing and complained of nothing."""
     width, scheme = look
     context = chromium.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    context.set_default_timeout(120_000)  # a busy machine is no fault of a page
     tab, complaints, asked = context.new_page(), [], []
     tab.on("console", lambda said: complaints.append(said.text) if said.type in {"error", "warning"} else None)
     tab.on("pageerror", lambda error: complaints.append(str(error)))
@@ -227,3 +229,58 @@ def test_a_patch_that_is_not_inside_the_page_comes_from_the_folder_beside_it(chr
     tab.evaluate(f"{SOURCE}.selected.indices = [[...{SOURCE}.data.x.keys()].find((i) => !{rows}.includes(i))]")
     tab.get_by_text("is not beside this page").first.wait_for()
     tab.close()
+
+
+@pytest.fixture(scope="module")
+def run_page(tmp_path_factory):
+    here = tmp_path_factory.mktemp("driven")
+    store = open_store(here / "store", create=True)
+    add_world(store, here)
+    start, end = lanes((0.0,), -12.0, 12.0)
+    table = segments("driven", start, end, start_ns=10**18)
+    add_run(store, "driven", table, track=driven(table), tags={"site": "<b>\x1b[31m'\"&"})
+    return Path(report(store.runs()[0].where)[0].path)
+
+
+@pytest.fixture(params=[LOOKS[0], LOOKS[3]], ids=by_look)
+def driving(request, chromium, run_page):
+    with quiet_page(chromium, run_page, request.param) as tab:
+        yield tab
+
+
+RANGE = "(({ start, end }) => [start, end])(page.model('NAME').x_range)"
+
+
+def test_one_cursor_runs_through_map_and_plots_of_a_run(driving):
+    fits_and_can_be_read_by_everyone(driving)
+    assert "5.60 s" in driving.locator("#chosen").inner_text()  # the middle of the first segment
+    assert "tcpipe explain 'driven-1000000000000000000'" in driving.locator("#chosen").inner_text()
+    driving.locator("figure", has=driving.locator(".plot")).nth(2).scroll_into_view_if_needed()
+    driving.mouse.click(*driving.evaluate(PLACE, ["power", 2.0, 150.0]))
+    driving.wait_for_function("page.model('cursor height').location < 3")
+    said = driving.locator("#chosen").inner_text()
+    assert "Not used" in said
+    assert "it stands" in said
+    driving.locator("figure").first.scroll_into_view_if_needed()
+    x, y = driving.evaluate("(({ x1, y1 }) => [x1[9], y1[9]])(page.model('segments').data_source.data)")
+    driving.mouse.click(*driving.evaluate(PLACE, ["map", x, y]))
+    driving.wait_for_function("document.getElementById('chosen').innerText.startsWith('Segment 1')")
+    assert "±" in driving.locator("#chosen").inner_text()
+    assert driving.evaluate("page.model('layer classes').visible") is False
+    driving.select_option("#ground", "classes")
+    assert driving.evaluate("page.model('layer classes').visible") is True
+
+
+def test_a_run_is_worked_by_keyboard_and_all_its_plots_zoom_as_one(driving):
+    driving.locator("#after").focus()
+    driving.keyboard.press("Enter")
+    assert "Segment 2 of 24" in driving.locator("#chosen").inner_text()
+    driving.locator("#in").focus()
+    driving.keyboard.press("Enter")
+    zoomed = driving.evaluate(RANGE.replace("NAME", "gates"))
+    assert zoomed[1] - zoomed[0] == pytest.approx(0.5 * (5.0 + 24 * 1.2), rel=0.01)
+    assert driving.evaluate(RANGE.replace("NAME", "label plot")) == zoomed
+    driving.wait_for_function(f"page.model('line 0').data_source.data.t.every((t) => t > {zoomed[0] - 0.1})")
+    driving.select_option("#label", "E")
+    assert driving.evaluate("page.model('label plot').left[0].axis_label") == "E [J], ± σ"
+    assert len(driving.pdf()) > 20_000

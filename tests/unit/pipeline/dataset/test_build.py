@@ -1,4 +1,3 @@
-import importlib
 import json
 import resource
 
@@ -336,7 +335,6 @@ def test_a_place_that_cannot_be_written(store, tmp_path):
 @pytest.mark.parametrize("limit_bytes", [10_000, 40_000, 70_000])
 def test_a_disk_that_fills_up_leaves_nothing_half_written(store, tmp_path, limit_bytes):
     """A limit on the size of files stands for a full disk: the write itself fails."""
-    importlib.import_module("tcpipe.report.figures")  # fonts are cached before the disk is full
     add(store)
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, hard))
