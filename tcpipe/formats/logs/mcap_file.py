@@ -515,17 +515,18 @@ class McapPart:
         return [chunk for chunk in self._contents.chunks if chunk.index and channel in chunk.index]
 
     def _times(self, channel: int) -> tuple[int | None, int | None]:
-        """Return the channel's first and last log time, from the message indexes of the chunks at both ends."""
-        holding = self._holding(channel)
-        if not holding:
-            return None, None
-        first, last = min(holding, key=lambda c: c.start_ns), max(holding, key=lambda c: c.end_ns)
-        try:
-            begin = self._index_entries((first.index or {})[channel], channel)
-            end = self._index_entries((last.index or {})[channel], channel)
-        except DamageError:
-            return None, None
-        return (int(begin[:, 0].min()), int(end[:, 0].max())) if len(begin) and len(end) else (None, None)
+        """Return the channel's first and last log time, by the message indexes of the chunks that reach beyond what is found."""
+        first: list[int] = []
+        last: list[int] = []
+        for found_ns, sign in ((first, 1), (last, -1)):
+            reaches_ns = [(sign * (c.start_ns if sign > 0 else c.end_ns), c) for c in self._holding(channel)]
+            for reach_ns, chunk in sorted(reaches_ns, key=lambda pair: pair[0]):
+                if not found_ns or reach_ns < min(sign * stamp_ns for stamp_ns in found_ns):
+                    try:
+                        found_ns.extend(self._index_entries((chunk.index or {})[channel], channel)[:, 0].tolist())
+                    except DamageError:
+                        return None, None
+        return min(first, default=None), max(last, default=None)
 
     def _tally(self, channel: int, count: int, start_ns: int, end_ns: int) -> None:
         tally = self._tallies.setdefault(channel, _Tally())

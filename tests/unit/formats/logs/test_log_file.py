@@ -250,6 +250,17 @@ def test_topics_come_from_the_index_with_their_times(tmp_path):
     assert "float32 r" in topic.definition
 
 
+def test_a_topic_that_was_appended_to_the_file_has_its_own_times(tmp_path):
+    """The chunk that it begins in ends with the drive, its own messages go on in others that end before."""
+    messages = random_messages(18, count=60, types=TYPES[:2])
+    latest = max(messages, key=lambda message: message.log_time_ns)
+    one_after_the_other = sorted(messages, key=lambda message: message.topic != latest.topic)
+    with open_log(write_mcap(tmp_path / "run.mcap", one_after_the_other, chunk_bytes=50_000)) as log:
+        for name, topic in log.topics.items():
+            stamps = [message.log_time_ns for message in messages if message.topic == name]
+            assert (topic.start_ns, topic.end_ns) == (min(stamps), max(stamps))
+
+
 def test_identity_is_size_and_sha256(tmp_path):
     path = write_mcap(tmp_path / "run.mcap", random_messages(17, count=3, types=TYPES[:1]))
     with open_log(path) as log:
