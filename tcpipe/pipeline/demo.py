@@ -75,8 +75,12 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
     if problems:
         raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
-    say(f"$ tcpipe add-map site --height {height} --ortho {ortho} --terrain {terrain} --classes {classes}")
-    added = add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store_path)
+    say(
+        f"$ tcpipe add-map site --height {height} --ortho {ortho} --ortho-bands rgb --terrain {terrain} --classes {classes}"
+    )
+    added = add_map(
+        "site", height=height, ortho=ortho, ortho_bands="rgb", terrain=terrain, classes=classes, store=store_path
+    )
     say(f"$ tcpipe build-dataset {dataset_path} --split {site.region}")
     built = build_dataset(dataset_path, store=store_path, split=site.region, recipe=Recipe())
     say(f"$ tcpipe report {dataset_path}")

@@ -17,6 +17,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.published import REPORT_PATCHES
 from tcpipe.report.pictures import ACROSS, class_picture, picture_bytes, picture_uri, relief_picture, sheet
 from tcpipe.tables.columns import floats
+from tcpipe.terrain.layers import COLOURS
 
 MOST_PATCHES = 500
 _PX = 48
@@ -76,12 +77,21 @@ def thinned_by(patch_px: int) -> int:
 
 def sheets(rows: Sequence[int], pixels: Mapping[str, NDArray[Any]], files: PatchFiles) -> Json:
     """Return thinned patches, (N, px, px) by layer, as a sheet for each layer, and the rows of the page that they belong to."""
+    pixels = _in_colour(pixels)
     return {
         "rows": rows,
         "px": next(iter(pixels.values())).shape[1],
         "across": ACROSS,
         "layers": [{"name": name, "uri": _uri(name, stack, files)} for name, stack in pixels.items()],
     }
+
+
+def _in_colour(pixels: Mapping[str, NDArray[Any]]) -> Mapping[str, NDArray[Any]]:
+    """Return one orthophoto in colour, (N, px, px, 3), in the place of its grey and its three colours."""
+    if not set(COLOURS) <= set(pixels):
+        return pixels
+    colour = np.stack([pixels[name] for name in COLOURS], axis=-1)
+    return {name: colour if name == "ortho" else stack for name, stack in pixels.items() if name not in COLOURS}
 
 
 def _uri(name: str, stack: NDArray[np.generic], files: PatchFiles) -> str:
@@ -91,7 +101,8 @@ def _uri(name: str, stack: NDArray[np.generic], files: PatchFiles) -> str:
 
 def folder_of(card: DatasetCard) -> tuple[str, int]:
     """Return where the pictures of all of this dataset's patches lie from its page, and how many there are."""
-    return f"{REPORT_PATCHES}/{card.inputs[:16]}", len(card.layers) * -(-card.samples // PER_SHEET)
+    layers = len(card.layers) - (len(COLOURS) if set(COLOURS) <= set(card.layers) else 0)
+    return f"{REPORT_PATCHES}/{card.inputs[:16]}", layers * -(-card.samples // PER_SHEET)
 
 
 def all_patches(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes]]:
@@ -106,10 +117,12 @@ def all_patches(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes
     samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
     every = _patches(directory, card, samples)
     ranges = (
-        {name: _range(stack) for name, stack in every.read(every.some(samples)).items()} if samples.num_rows else {}
+        {name: _range(stack) for name, stack in _in_colour(every.read(every.some(samples))).items()}
+        if samples.num_rows
+        else {}
     )
     for number, first in enumerate(range(0, samples.num_rows, PER_SHEET)):
-        stacks = every.read(np.arange(first, min(first + PER_SHEET, samples.num_rows)))
+        stacks = _in_colour(every.read(np.arange(first, min(first + PER_SHEET, samples.num_rows))))
         for layer, (name, stack) in enumerate(stacks.items()):
             pixels, exact = _picture(name, stack, every.files, ranges[name])
             yield f"{layer}-{number}.webp", picture_bytes(pixels, exact=exact)

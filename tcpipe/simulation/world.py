@@ -126,6 +126,8 @@ class World:
     """Ripples of the rolling resistance that no map shows, as a fraction."""
     surface: Surface | None = field(default=None, metadata=ABSENT)
     """What the ground of a class is like from metre to metre; None: everywhere the same."""
+    sun: tuple[float, float, float] | None = field(default=None, metadata=ABSENT)
+    """Unit vector east, north, up to the sun that the orthophoto was taken in; None: under an even sky."""
 
     def height_m(self, x_map_m: Float, y_map_m: Float) -> Float:
         """Return the height above the geoid [m]."""
@@ -178,6 +180,10 @@ class World:
         shade = 1.0 + ripple(self.texture, u, v)
         if self.surface is not None:
             shade = shade * self.surface.shade(self.terrain_class(x_map_m, y_map_m), u, v)
+        if self.sun is not None:
+            gx, gy = self.gradient(x_map_m, y_map_m)
+            east, north, up = self.sun
+            shade = shade * np.maximum(1.0 - (east * gx + north * gy) / up, 0.0) / np.sqrt(1.0 + gx**2 + gy**2)
         return rgb * shade[..., None]
 
     def mapped(self, x_map_m: Float, y_map_m: Float) -> NDArray[np.bool_]:

@@ -10,6 +10,7 @@ import numpy as np
 import pyproj
 import pytest
 from installed_command import tcpipe, told
+from page_reading import data_of
 from scipy.interpolate import CubicHermiteSpline
 
 import tcpipe as package
@@ -231,7 +232,7 @@ def test_two_runs_and_any_number_of_workers_give_the_same_bytes(demo: Demo, tmp_
     )
     rasters = {"height": "height.tif", "ortho": "ortho.tif", "terrain": "terrain.tif", "classes": "classes.csv"}
     layers = [item for name, file in rasters.items() for item in (f"--{name}", site / "maps" / file)]
-    _run("add-map", "site", *layers, "--quiet", cwd=tmp_path)
+    _run("add-map", "site", *layers, "--ortho-bands", "rgb", "--quiet", cwd=tmp_path)
     _run("build-dataset", "--split", site / "region.geojson", *jobs, cwd=tmp_path)
     alone, by_two = _hashes(here / "dataset", "*"), _hashes(tmp_path / "dataset", "*")
     assert alone.pop("report.html") != by_two.pop("report.html")  # the demo's leads to its runs, which lie beside it
@@ -278,6 +279,8 @@ def test_demo_runs_everything_and_says_what_to_open(demo: Demo) -> None:
     for name in ("site", "store", "dataset", "dataset/report.html"):
         assert (here / name).exists()
         assert name in done.stdout
+    sheets = data_of((here / "dataset/report.html").read_text(encoding="utf-8"))["patches"]
+    assert [layer["name"] for layer in sheets["layers"]] == ["ortho", "terrain", "height"]  # the first in colour
     train = package.open_dataset(here / "dataset")["train"]
     assert train.patches.shape[1:] == (40, 40, 3)
     assert train.labels.shape == (len(train), 2)

@@ -248,6 +248,13 @@ def test_demo_drives_every_traversable_class_and_slope():
     assert min(slopes) < -15 < 15 < max(slopes)
 
 
+def test_what_the_demo_shows_beside_the_small_world_changes_no_drive():
+    demo = scenario("demo")
+    for spec in demo.drives:
+        shown, plain = (spec.plan.plan(world, np.random.default_rng(1)) for world in (demo.world, small_world()))
+        assert shown == plain
+
+
 def test_an_unknown_scenario_lists_those_there_are(tmp_path):
     with pytest.raises(UsageError, match="demo, hills12"):
         simulate(tmp_path, scenario="moon")

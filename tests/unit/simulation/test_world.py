@@ -1,5 +1,7 @@
 """The analytic world against finite differences and hand-computed points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pyproj import Proj
@@ -71,6 +73,19 @@ def test_slopes_reach_the_papers_and_not_much_more():
     y = SITE.south_m + np.arange(0.25, 80.0, 0.5)[:, None]
     steepest = np.degrees(np.arctan(np.hypot(*world.gradient(x, y)))).max()
     assert 22.5 < steepest < 28.0
+
+
+def test_the_sun_shades_by_the_angle_that_it_falls_in():
+    """Against the normal by differences of the height; level ground keeps its colour."""
+    sun = np.array([0.48, -0.36, 0.8])
+    lit, (x, y) = replace(small_world(), sun=tuple(sun.tolist())), places(200, seed=4)
+    east = (lit.height_m(x + 0.01, y) - lit.height_m(x - 0.01, y)) / 0.02
+    north = (lit.height_m(x, y + 0.01) - lit.height_m(x, y - 0.01)) / 0.02
+    normal = np.column_stack([-east, -north, np.ones(200)]) / np.sqrt(1 + east**2 + north**2)[:, None]
+    ratio = lit.ortho(x, y) / small_world().ortho(x, y)
+    np.testing.assert_allclose(ratio, np.repeat((normal @ sun / sun[2])[:, None], 3, axis=1), atol=1e-6)
+    assert ratio.min() < 0.9
+    assert ratio.max() > 1.1
 
 
 def test_grid_north_and_scale_are_the_projections():
