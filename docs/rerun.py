@@ -3,14 +3,16 @@
     python docs/rerun.py docs/tutorials/first-dataset.md docs/how-to/damaged-logs.md
 
 Blocks fenced as ``console`` hold commands after ``$ ``, blocks fenced as ``pycon`` Python after ``>>> ``; the rest of such a block is
-output and is replaced. Pages given together share one empty directory, shown as ~; a page that says ``mkdir NAME && cd NAME`` runs in
-NAME there, as its reader does. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA). tests/end_to_end/test_docs.py runs
-the pages the same way and compares, numbers aside.
+output and is replaced. A block fenced as ``toml`` that begins with ``# tcpipe.toml`` is added to that file. Each page runs in a directory
+of its own below ~: the NAME of its line ``mkdir NAME && cd NAME``, or what the page is called. A page that goes on from another, by
+``../NAME/``, finds that one followed. ``$DATA`` is the directory of third-party files (TCPIPE_TEST_DATA).
+tests/end_to_end/test_docs.py runs the pages the same way and compares, numbers aside.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import os
 import re
@@ -21,19 +23,31 @@ from code import InteractiveConsole
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+_DOCS = Path(__file__).resolve().parent
 _HOME = re.compile(r"^mkdir (\S+) && cd \1$", re.MULTILINE)
-_BLOCK = re.compile(r"^```(console|pycon)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+_BLOCK = re.compile(r"^```(console|pycon|toml)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 _MARK = "\x01"
 
 
-def rerun(text: str, directory: Path) -> str:
-    """Return a page's text with the output of its blocks as it is today; they run in ``directory``, or the page's own in it, in order."""
-    console, own = InteractiveConsole(locals={}), _HOME.search(text)
-    home = directory / own[1] if own else directory
-    home.mkdir(exist_ok=True)
+@functools.cache
+def rerun(page: Path, directory: Path) -> str:
+    """Return a page's text with the output of its blocks as it is today; they run in the page's own place in ``directory``."""
+    text, console = page.read_text(encoding="utf-8"), InteractiveConsole(locals={})
+    for other in sorted(_DOCS.rglob("*.md")):
+        made = _HOME.search(other.read_text(encoding="utf-8"))
+        if made and f"../{made[1]}/" in text:
+            rerun(other, directory)
+    own = _HOME.search(text)
+    home = directory / (own[1] if own else page.stem)
+    home.mkdir()
 
     def block(found: re.Match[str]) -> str:
         kind, body = found[1], found[2]
+        if kind == "toml":
+            if body.startswith("# tcpipe.toml\n"):
+                with (home / "tcpipe.toml").open("a", encoding="utf-8") as recipe:
+                    recipe.write(body)
+            return found[0]
         said = _shell(body, home) if kind == "console" else _python(body, home, console)
         return f"```{kind}\n{said.replace(str(directory), '~')}```"
 
@@ -105,8 +119,8 @@ def main(names: Sequence[str]) -> None:
     with tempfile.TemporaryDirectory() as directory:
         here = Path(directory).resolve()
         for name in names:
-            page = Path(name)
-            page.write_text(rerun(page.read_text(encoding="utf-8"), here), encoding="utf-8")
+            page = Path(name).resolve()
+            page.write_text(rerun(page, here), encoding="utf-8")
             sys.stdout.write(f"ran {page}\n")
 
 

@@ -1,4 +1,4 @@
-"""The tutorial and the pages that go with it: every command runs, and prints what the page says, numbers aside."""
+"""The tutorials and the pages that go with it: every command runs, and prints what the page says, numbers aside."""
 
 import importlib.util
 import re
@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-DOCS = Path(__file__).parents[2] / "docs"
-PAGES = ("tutorials/first-dataset.md", "how-to/damaged-logs.md")
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGES = (*(f"tutorials/{page.name}" for page in sorted((DOCS / "tutorials").glob("*.md"))), "how-to/damaged-logs.md")
 
 
 def _masked(text: str) -> list[str]:
@@ -30,13 +30,13 @@ def rerun():
 
 @pytest.fixture(scope="module")
 def readers_directory(tmp_path_factory) -> Path:
-    """Where one reader follows all pages, in any order."""
+    """Where one reader follows all pages, in any order, each in a directory of its own."""
     return tmp_path_factory.mktemp("reader").resolve()
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_page_prints_what_it_says(page: str, rerun, readers_directory: Path) -> None:
     written = (DOCS / page).read_text(encoding="utf-8")
-    today = rerun(written, readers_directory)
+    today = rerun(DOCS / page, readers_directory)
     assert "Traceback" not in today
     assert _masked(today) == _masked(written), f"run 'python docs/rerun.py docs/{page}', read it, and commit the page"

@@ -4,6 +4,7 @@ import contextlib
 import os
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -147,13 +148,15 @@ def datasets(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 @pytest.mark.filterwarnings("default")  # of other libraries
-def test_snippets_run(snippet: str, datasets: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_snippets_run(snippet: str, datasets: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(os.environ, "KERAS_BACKEND", "torch")
     for name in re.findall(r"^(?:import|from) (\w+)", snippet, re.MULTILINE):
         pytest.importorskip(name)
-    monkeypatch.chdir(datasets)
+    for name in ("dataset", "dataset-parquet"):
+        shutil.copytree(datasets / name, tmp_path / name)
+    monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(os.environ, "HF_HUB_OFFLINE", "1")
-    monkeypatch.setitem(os.environ, "HF_HOME", str(datasets / "cache"))
+    monkeypatch.setitem(os.environ, "HF_HOME", str(tmp_path / "cache"))
     names: dict[str, object] = {}
     if "train" in snippet and "open_dataset" not in snippet and "polars" not in snippet:
         exec('import tcpipe; train = tcpipe.open_dataset("dataset")["train"]', names)  # noqa: S102  ours
