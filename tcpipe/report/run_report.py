@@ -191,7 +191,7 @@ def _segments(segments: pa.Table, timeline: Timeline, ground: RunMap) -> Json:
         name: ("f32", timeline.seconds(integers(segments, f"{name}_ns"), epoch)) for name in ("start", "end")
     }
     for number, end in enumerate(ground.ends_xy_m):
-        columns |= {f"{axis}{number}": ("f32", end[:, place]) for place, axis in enumerate("xy")}
+        columns |= {f"{axis}{number}": ("steps", end[:, place]) for place, axis in enumerate("xy")}
     for name, (value, std, digits) in _LABELS.items():
         columns[name], columns[f"{name}_std"] = (
             shown_to(digits, floats(segments, value)),

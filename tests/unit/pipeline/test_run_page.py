@@ -75,6 +75,10 @@ def test_every_sensor_and_every_gate_stands_in_the_page_as_it_lies_in_the_store(
     dropped = unpacked(spans, "bits") != 0
     rows = (track.column("dropped_by").to_numpy() != 0).sum()
     assert seconds[dropped].sum() == pytest.approx(rows / 20.0, abs=0.01)
+    step_m = np.hypot(
+        np.diff(unpacked(carried, "x")), np.diff(unpacked(carried, "y"))
+    )  # a float32 has steps of half a metre here
+    assert step_m.max() < 0.2
     segments = run.segments()
     assert unpacked(told["segments"], "energy_std") == pytest.approx(segments["energy_std_joule"].to_numpy(), rel=5e-3)
     ids = [f"{told['run']}-{start}" for start in told["starts"]]
