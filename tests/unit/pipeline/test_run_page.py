@@ -78,7 +78,8 @@ def test_every_sensor_and_every_gate_stands_in_the_page_as_it_lies_in_the_store(
     step_m = np.hypot(
         np.diff(unpacked(carried, "x")), np.diff(unpacked(carried, "y"))
     )  # a float32 has steps of half a metre here
-    assert step_m.max() < 0.2
+    wanted_m = np.hypot(np.diff(track.column("x_m").to_numpy()), np.diff(track.column("y_m").to_numpy()))
+    assert step_m == pytest.approx(wanted_m, abs=0.02, rel=0.01)
     segments = run.segments()
     assert unpacked(told["segments"], "energy_std") == pytest.approx(segments["energy_std_joule"].to_numpy(), rel=5e-3)
     ids = [f"{told['run']}-{start}" for start in told["starts"]]
