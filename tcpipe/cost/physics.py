@@ -231,7 +231,7 @@ def _fitted(metres: Metres, terms: Sequence[tuple[str, str]], standing_watt: flo
         driven = traction == 0.0
         if (~driven).sum() < _FEWEST_DOWNHILL:
             traction, recovered = np.zeros_like(force), 0.0
-        elif ("grade", ALL) in terms:
+        elif ("drivetrain", ALL) in terms:  # which hangs on the bend; without it the others would lose
             clear = np.minimum(1.0, np.abs(wanted) / max(_BEND * value[terms.index(("grade", ALL))], 1e-9)) ** 2
         made = np.column_stack([np.where(always | driven[:, None], design, recovered * design), traction])
         off = force - made[:, :count] @ value
