@@ -16,7 +16,8 @@ _FOLDS = 5  # contiguous: neighbours of a held-out metre are held out, too
 _BLOCK = 10  # consecutive segments that are drawn together
 _DRAWS = 2000
 _SEED = 20260101
-_UNITS = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
+PHYSICS_UNITS = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
+"""Of the terms of physics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +49,7 @@ def physics_of(metres: Metres, *, standing_watt: float | None) -> PhysicsFit | N
     return PhysicsFit(
         segments=found.segments,
         terms=tuple(
-            PhysicsTerm(term, terrain, value, np.sqrt(found.covariance[at, at]).item(), _UNITS[term])
+            PhysicsTerm(term, terrain, value, np.sqrt(found.covariance[at, at]).item(), PHYSICS_UNITS[term])
             for at, ((term, terrain), value) in enumerate(zip(found.terms, found.value.tolist(), strict=True))
         ),
         rolling_resistance={

@@ -17,7 +17,7 @@ from tcpipe.formats.geojson import PolygonGeometry, read_polygons
 from tcpipe.report.dataset_samples import SamplesShown
 from tcpipe.report.overview import Bounds, joint_bounds_m
 from tcpipe.report.pictures import picture_uri, read_picture
-from tcpipe.report.plots import Plot, new_plot
+from tcpipe.report.plots import Plot, lay_picture, new_plot
 
 _MOST_PLACES = 200
 """Places to drive next that are drawn, the most wanted first."""
@@ -97,7 +97,6 @@ def map_plots(directory: Path, card: DatasetCard, shown: SamplesShown) -> tuple[
 
 
 def _draw_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds: Bounds) -> list[str]:
-    x_min_m, y_min_m, x_max_m, y_max_m = bounds
     photographed = any("ortho" in grid.layers for grid in card.maps)
     pictures = {"orthophoto" if photographed else "hillshade": OVERVIEW, "hillshade ": RELIEF, "classes": CLASSES}
     lost = []
@@ -108,18 +107,7 @@ def _draw_pictures(plot: Plot, directory: Path, card: DatasetCard, bounds: Bound
         if pixels is None:
             lost.append(f"{file} is lost or damaged: the map has no {name.strip()}")
             continue
-        uri = picture_uri(pixels, exact=file == CLASSES)
-        drawn = plot.figure.image_url(
-            url=[uri],
-            x=x_min_m,
-            y=y_max_m,
-            w=x_max_m - x_min_m,
-            h=y_max_m - y_min_m,
-            anchor="top_left",
-            name=f"layer {name.strip()}",
-        )
-        drawn.level = "image"
-        drawn.visible = number == 0
+        lay_picture(plot, name.strip(), picture_uri(pixels, exact=file == CLASSES), bounds, visible=number == 0)
     return lost
 
 

@@ -117,6 +117,22 @@ def new_plot(
     return Plot(drawn, alt, legend or {})
 
 
+def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, float, float], *, visible: bool) -> None:
+    """Lay a picture over ``bounds_m`` (least x and y, greatest x and y) under all else, as ``layer <name>``."""
+    x_min_m, y_min_m, x_max_m, y_max_m = bounds_m
+    drawn = plot.figure.image_url(
+        url=[uri],
+        x=x_min_m,
+        y=y_max_m,
+        w=x_max_m - x_min_m,
+        h=y_max_m - y_min_m,
+        anchor="top_left",
+        name=f"layer {name}",
+    )
+    drawn.level = "image"
+    drawn.visible = visible
+
+
 def add_cursor(plot: Plot) -> None:
     """Add a line across, ``cursor <name>``, which is nowhere until the page's script says where."""
     name = f"cursor {plot.figure.name}"

@@ -120,12 +120,7 @@ page.ready.then(async () => {
     if (key === "quality") {
       const entries = [["segment", told.kept], ["with a flag", told.doubted], ["kept, in no segment", told.unused], ...told.reasons
         .filter(([bit]) => spans.bits.some((bits) => bits & bit)).map(([, name, , colour]) => [name, colour])];
-      at("scale").replaceChildren(...entries.map(([text, colour]) => {
-        const [entry, dot] = [make("span"), make("i")];
-        dot.style.background = colour;
-        entry.append(dot, text);
-        return entry;
-      }));
+      at("scale").replaceChildren(...page.legend(entries));
       return flagged;
     }
     const values = s[names[key][1]];

@@ -16,7 +16,7 @@ from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import CURSOR
 from tcpipe.report.overview import class_overview, ortho_overview, relief_overview
 from tcpipe.report.pictures import picture_uri
-from tcpipe.report.plots import Plot, new_plot
+from tcpipe.report.plots import Plot, lay_picture, new_plot
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, lonlat_deg
 
@@ -121,17 +121,7 @@ def _draw_ground(plot: Plot, source: MapFile) -> tuple[str, ...]:
     layers = source.layers
     looks = [("orthophoto", ortho_overview)] if any(name.startswith("ortho") for name in layers) else []
     looks += [("hillshade", relief_overview), *([("classes", class_overview)] if "terrain" in layers else [])]
-    x_min_m, y_min_m, x_max_m, y_max_m = source.grid.bounds_m
     for number, (name, look) in enumerate(looks):
-        drawn = plot.figure.image_url(
-            url=[picture_uri(look(source), exact=name == "classes")],
-            x=x_min_m,
-            y=y_max_m,
-            w=x_max_m - x_min_m,
-            h=y_max_m - y_min_m,
-            anchor="top_left",
-            name=f"layer {name}",
-        )
-        drawn.level = "image"
-        drawn.visible = number == 0
+        uri = picture_uri(look(source), exact=name == "classes")
+        lay_picture(plot, name, uri, source.grid.bounds_m, visible=number == 0)
     return tuple(name for name, _ in looks)

@@ -143,8 +143,9 @@ def track_series(track: pa.Table, timeline: Timeline, xy_m: Floats) -> Series:
         "chord_std": floats(track, "displacement_std_1s_m"),
     }
     told = {name: (TRACK_DIGITS[name], part) for name, part in values.items() if np.isfinite(part).any()}
-    t_s = timeline.seconds(integers(track, "stamp_ns"), integers(track, "epoch"))
-    return thinned("track", t_s, told, sampled={"x": ("steps", xy_m[:, 0]), "y": ("steps", xy_m[:, 1])})
+    return thinned(
+        "track", _seconds(track, timeline), told, sampled={"x": ("steps", xy_m[:, 0]), "y": ("steps", xy_m[:, 1])}
+    )
 
 
 def rail_series(power: pa.Table, timeline: Timeline) -> Iterator[Series]:

@@ -8,13 +8,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.formats.json_files import Json
 from tcpipe.motion.remedies import StoreLoss, losses_of
 from tcpipe.report.colours import CLASS_COLOURS
 from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.plots import Plot, new_plot, waterfall
 from tcpipe.report.store_runs import FIELDS, StoredRun, StoreFacts, dataset_names, day, runs_shown
-from tcpipe.report.store_verdict import UNITS, store_verdict
+from tcpipe.report.store_verdict import store_verdict
 
 MOST_ROWS = 200
 """Runs that can be read without scripts: with them, all."""
@@ -207,5 +208,5 @@ def _data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:
         "robots": [list(of) for of in _robots(runs)],
         "datasets": dataset_names(store.datasets),
         "causes": [next(iter(of.values())) for of in store.causes[:_MOST_CAUSES]],
-        "terms": [f"{term} [{UNITS.get(term.partition(' ')[0], '')}]" for term in terms],
+        "terms": [f"{term} [{PHYSICS_UNITS.get(term.partition(' ')[0], '')}]" for term in terms],
     }

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.motion.remedies import StoreLoss
 from tcpipe.report.page import Verdict
 from tcpipe.report.store_runs import StoredRun, StoreFacts
@@ -17,9 +18,6 @@ _FEWEST, _LATEST, _MOST_LATEST = 12, 0.25, 20
 """So many runs tell a change; the latest of them are so large a share, or so many."""
 _BEYOND, _WORTH = 3.0, 0.05
 """A change is that many robust standard deviations of the runs before, and that share of their median."""
-
-UNITS: Mapping[str, str] = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
-"""Of the terms of physics."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,10 +128,10 @@ def _measures(run: StoredRun) -> Iterator[tuple[str, str, float]]:
     if run.floor is not None:
         yield "The noise floor of E", "%", 100.0 * run.floor
     if run.facts.standing_watt is not None:
-        yield "Standing power", UNITS["standing"], run.facts.standing_watt
+        yield "Standing power", PHYSICS_UNITS["standing"], run.facts.standing_watt
     for term, (value, std) in run.facts.physics.items():
         if not term.startswith("standing") and abs(value) > _BEYOND * std:
-            yield f"Physics' {term}", UNITS.get(term.partition(" ")[0], ""), value
+            yield f"Physics' {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 
 def _to_do(store: StoreFacts, runs: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> Iterator[Verdict]:
