@@ -2,7 +2,7 @@
 // The dataset's page: samples on the map and in the plot, one of them in words with its patch, and the gallery.
 page.ready.then(async () => {
   const told = page.data;
-  const { at, make, fillSelect, pairs } = page;
+  const { at, make, fillSelect, pairs, ramp } = page;
 
   const below = [at("chosen"), at("stepping")];
   at("chosen").closest("section").append(...below);
@@ -18,7 +18,6 @@ page.ready.then(async () => {
   };
   const label = (name) => kinds[name][0] + (kinds[name][1] ? ` [${kinds[name][1]}]` : "");
   const classes = new Map(told.classes.map((one) => [one.id, one]));
-  const ramp = ["#00224e", "#2a3f6d", "#575d6d", "#7d7c78", "#a59c74", "#d2c060", "#fee838"];
   const shades = Array.from({ length: 64 }, (_, i) => {
     const place = (i / 63) * (ramp.length - 1), low = Math.min(Math.floor(place), ramp.length - 2), share = place - low;
     const part = (k) => Math.round(parseInt(ramp[low].slice(k, k + 2), 16) * (1 - share) + parseInt(ramp[low + 1].slice(k, k + 2), 16) * share);
@@ -43,8 +42,7 @@ page.ready.then(async () => {
       fill = Array.from(c.run, (r) => told.colours[r % told.colours.length]);
       told.runs.slice(0, 12).forEach((r, i) => legend.push([r.id, told.colours[i % told.colours.length]]));
     } else {
-      const known = Float32Array.from(c[name]).filter(Number.isFinite).sort();
-      const low = known[Math.floor(0.02 * (known.length - 1))], high = known[Math.ceil(0.98 * (known.length - 1))];
+      const [low, high] = page.ends(c[name]);
       fill = Array.from(c[name], (v) => Number.isFinite(v)
         ? shades[Math.max(0, Math.min(63, Math.floor(63 * (v - low) / ((high - low) || 1))))] : told.unknown);
       legend.push([low, high]);
@@ -53,9 +51,7 @@ page.ready.then(async () => {
     scale.replaceChildren();
     scale.className = "controls legend";
     if (typeof legend[0]?.[0] === "number") {
-      const bar = make("span", "", { className: "ramp" });
-      bar.style.background = `linear-gradient(to right, ${ramp.join()})`;
-      scale.append(make("span", `${label(name)}: ${digits(legend[0][0], name)}`), bar, make("span", `${digits(legend[0][1], name)} (98 of 100 lie between)`));
+      scale.append(...page.scale(`${label(name)}: ${digits(legend[0][0], name)}`, digits(legend[0][1], name)));
     } else {
       scale.append(...page.legend(legend));
     }
@@ -66,9 +62,7 @@ page.ready.then(async () => {
   fillSelect(at("colour"), there(Object.keys(kinds)), (name) => kinds[name][0]);
   fillSelect(at("across"), there(["slope", "velocity", "turn", "residual"]), (name) => kinds[name][0]);
   fillSelect(at("up"), there(["power", "energy", "velocity"]), (name) => kinds[name][0]);
-  const layers = told.ground.map((name) => page.model(`layer ${name}`));
-  fillSelect(at("ground"), [...told.ground, "none"]);
-  at("ground").onchange = () => layers.forEach((layer, i) => { layer.visible = told.ground[i] === at("ground").value; });
+  page.chooseGround(told.ground);
   for (const [id, name] of [["next", "drive next"], ["leaks", "leaks"]]) {
     const drawn = page.model(name);
     at(id).onchange = () => {
@@ -110,8 +104,8 @@ page.ready.then(async () => {
     if (told.samples.cell_m !== null) return [[`mean of ${c.count[i]} samples`, ""], ...rows];
     const run = told.runs[c.run[i]];
     rows.push(["run", run.href ? make("a", run.id, { href: run.href }) : run.id]);
-    rows.push(["time", `${new Date(Number(start(i) / 1000000n)).toISOString().replace("T", " ").replace("Z", "")} UTC`]);
-    rows.push(["where from", make("code", `tcpipe explain '${idOf(i).replaceAll("'", "'\\''")}' --dataset DIR`)]);
+    rows.push(["time", page.clock(Number(start(i) / 1000000n))]);
+    rows.push(["where from", page.explain(idOf(i))]);
     return rows;
   }
   function show(chosen) {

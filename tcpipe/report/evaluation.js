@@ -50,7 +50,7 @@ page.ready.then(async () => {
     });
     return [
       ...rows, ["slope", Number.isFinite(c.slope[i]) ? `${c.slope[i].toFixed(1)}°` : "none"], ["ground", classOf(i).name], ["split", splitOf(i).name],
-      ["where from", make("code", `tcpipe explain '${c.id[i].replaceAll("'", "'\\''")}' --dataset DIR`)],
+      ["where from", page.explain(c.id[i])],
     ];
   }
   function show(places) {

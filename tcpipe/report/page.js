@@ -18,6 +18,7 @@ const page = (() => {
   matchMedia("print").addEventListener("change", repaint);
 
   // What the pages' own scripts share.
+  const model = (name) => drawn && Bokeh.documents[0].get_model_by_name(name);
   const at = (id) => document.getElementById(id);
   const make = (tag, text = "", more = {}) => Object.assign(document.createElement(tag), { textContent: text }, more);
   function fillSelect(select, names, text = (name) => name) {
@@ -56,6 +57,24 @@ const page = (() => {
     entry.append(dot, text);
     return entry;
   });
+  // Of a number's colours, the values at both ends: 2 of 100 lie below the lower, 2 above the upper.
+  const ramp = ["#00224e", "#2a3f6d", "#575d6d", "#7d7c78", "#a59c74", "#d2c060", "#fee838"];
+  function ends(values) {
+    const known = Float64Array.from(values).filter(Number.isFinite).sort();
+    return [0.02, 0.98].map((share, end) => known[Math[end ? "ceil" : "floor"](share * (known.length - 1))]);
+  }
+  function scale(low, high) {
+    const bar = make("span", "", { className: "ramp" });
+    bar.style.background = `linear-gradient(to right, ${ramp.join()})`;
+    return [make("span", low), bar, make("span", `${high} (96 of 100 lie between)`)];
+  }
+  const clock = (ms) => `${new Date(ms).toISOString().replace("T", " ").replace("Z", "")} UTC`;
+  const explain = (id) => make("code", `tcpipe explain '${id.replaceAll("'", "'\\''")}' --dataset DIR`);
+  // Pictures under a map, one of which is seen.
+  function chooseGround(names) {
+    fillSelect(at("ground"), [...names, "none"]);
+    at("ground").onchange = () => names.forEach((name) => { model(`layer ${name}`).visible = name === at("ground").value; });
+  }
   // Patches as buttons (gallery.html): `of(row)` gives a row's class, split and words, `choose(row)` is what a click does.
   function gallery(sheets, of, choose) {
     let most = 60;
@@ -99,10 +118,10 @@ const page = (() => {
     }));
   }
   return {
-    at, make, fillSelect, pairs, patches, legend, gallery, unpack,
+    at, make, fillSelect, pairs, patches, legend, ramp, ends, scale, clock, explain, chooseGround, gallery, unpack,
     data: read("page-data"),
     ready,
     plots,
-    model: (name) => drawn && Bokeh.documents[0].get_model_by_name(name),
+    model,
   };
 })();

@@ -1,7 +1,7 @@
 "use strict";
 // A run's page: its map and its plots over time under one cursor, and what is chosen, in words.
 page.ready.then(async () => {
-  const { at, make, fillSelect, pairs, model } = page;
+  const { at, make, fillSelect, pairs, model, ramp } = page;
   const told = page.data;
   const series = {};
   for (const [name, { packed, gap_s }] of Object.entries(told.series)) series[name] = { ...(await page.unpack(packed)), gap_s };
@@ -113,7 +113,6 @@ page.ready.then(async () => {
   at("on").onclick = () => about(1, 0.5);
 
   // Segments on the map and in their own plot.
-  const ramp = ["#00224e", "#2a3f6d", "#575d6d", "#7d7c78", "#a59c74", "#d2c060", "#fee838"];
   const flagged = Array.from(s.quality, (bits) => (bits ? told.doubted : told.kept));
   const number = (value, [, , unit, digits]) => (finite(value) ? `${value.toFixed(digits)} ${unit}` : "none");
   function coloured(key) {
@@ -124,11 +123,8 @@ page.ready.then(async () => {
       return flagged;
     }
     const values = s[names[key][1]];
-    const known = Float64Array.from(values).filter(finite).sort();
-    const low = known[Math.floor(0.02 * (known.length - 1))], high = known[Math.ceil(0.98 * (known.length - 1))];
-    const bar = make("span", "", { className: "ramp" });
-    bar.style.background = `linear-gradient(to right, ${ramp.join()})`;
-    at("scale").replaceChildren(make("span", number(low, names[key])), bar, make("span", `${number(high, names[key])} (96 of 100 lie between)`));
+    const [low, high] = page.ends(values);
+    at("scale").replaceChildren(...page.scale(number(low, names[key]), number(high, names[key])));
     return Array.from(values, (value) => finite(value)
       ? ramp[Math.max(0, Math.min(ramp.length - 1, Math.floor((ramp.length * (value - low)) / ((high - low) || 1))))] : told.unused);
   }
@@ -154,9 +150,8 @@ page.ready.then(async () => {
     colour.push(told.reasons.find(([bit]) => spans.bits[i] & bit)?.[3] ?? told.unused);
   }
   model("track").data_source.data = { xs, ys, colour };
-  fillSelect(at("ground"), [...told.ground, "none"]);
+  page.chooseGround(told.ground);
   at("ground").closest("label").hidden = !told.ground.length;
-  at("ground").onchange = () => told.ground.forEach((name) => { model(`layer ${name}`).visible = name === at("ground").value; });
   fillSelect(at("colour"), ["quality", ...there], (key) => (key === "quality" ? "use and quality" : names[key][0]));
   fillSelect(at("label"), there, (key) => names[key][0]);
   at("label").closest("label").hidden = !there.length;
@@ -167,7 +162,7 @@ page.ready.then(async () => {
   const clock = (t) => {
     const epoch = told.epochs.findLast(([start]) => t >= start - 0.5) ?? told.epochs[0];
     const ns = BigInt(epoch[1]) + BigInt(Math.round((t - epoch[0]) * 1e6)) * 1000n;
-    return `${new Date(Number(ns / 1000000n)).toISOString().replace("T", " ").replace("Z", "")} UTC`;
+    return page.clock(Number(ns / 1000000n));
   };
   const segmentAt = (t) => { for (let i = 0; i < n; i++) if (s.start[i] <= t && t <= s.end[i]) return i; return -1; };
   const bitsAt = (t) => { for (let i = 0; i < spans.start.length; i++) if (spans.start[i] <= t && t <= spans.end[i]) return spans.bits[i]; return null; };
@@ -194,14 +189,13 @@ page.ready.then(async () => {
     if (i >= 0) {
       at("row").value = i + 1;
       const flags = told.quality.filter(([bit]) => s.quality[i] & bit).map(([, words]) => words);
-      const id = `${told.run}-${told.starts[i]}`;
       left.append(make("b", `Segment ${i + 1} of ${n}`), pairs([
         ...Object.values(names).filter(([, name]) => s[name] !== undefined).map((kind) => {
           const std = s[`${kind[1]}_std`]?.[i];
           return [kind[0], finite(std) && finite(s[kind[1]][i]) ? `${s[kind[1]][i].toFixed(kind[3])} ± ${std.toPrecision(2)} ${kind[2]}` : number(s[kind[1]][i], kind)];
         }),
         ["quality", flags.length ? flags.join("; ") : "clean"],
-        ["in a dataset", make("code", `tcpipe explain '${id.replaceAll("'", "'\\''")}' --dataset DIR`)]]));
+        ["in a dataset", page.explain(`${told.run}-${told.starts[i]}`)]]));
     } else {
       left.append(make("b", bitsAt(t) === null ? "No track here" : why.length ? "Not used" : "Kept, but in no segment"),
         pairs(why.length ? why.map(([, name, words]) => [name, words]) : [["why", bitsAt(t) === null

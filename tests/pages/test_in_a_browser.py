@@ -3,6 +3,7 @@
 import shutil
 from contextlib import contextmanager
 from pathlib import Path
+from time import monotonic
 
 import pytest
 from synthetic_store import add_run, add_world, driven, lanes, segments
@@ -72,6 +73,14 @@ def quiet_page(chromium, path, look):
     context.close()
 
 
+def until(tab, holds):
+    """Ask again until it holds: the page's own policy forbids ``wait_for_function``, which compiles text inside the page."""
+    give_up = monotonic() + 60.0
+    while not tab.evaluate(holds):
+        assert monotonic() < give_up, f"never held: {holds}"
+        tab.wait_for_timeout(50)
+
+
 def by_look(look):
     return f"{look[0]} {look[1]}"
 
@@ -110,7 +119,7 @@ def test_a_metre_that_is_clicked_tells_its_label_and_shows_its_patch(opened):
     x, y = opened.evaluate(f"(() => {{ const data = {SOURCE}.data; return [data.x[7], data.y[7]]; }})()")
     opened.locator("#s1 figure").first.scroll_into_view_if_needed()
     opened.mouse.click(*opened.evaluate(PLACE, ["map", x, y]))
-    opened.wait_for_function(f"{SOURCE}.selected.indices.length > 0")
+    until(opened, f"{SOURCE}.selected.indices.length > 0")
     said = opened.locator("#chosen").inner_text()
     assert "±" in said
     assert "tcpipe explain '" in said
@@ -132,7 +141,7 @@ def test_layers_switch_and_a_box_in_the_plot_chooses_on_the_map(opened):
     opened.mouse.down()
     opened.mouse.move(box["x"] + 0.95 * box["width"], box["y"] + 0.8 * box["height"], steps=4)
     opened.mouse.up()
-    opened.wait_for_function(f"{SOURCE}.selected.indices.length > 1")
+    until(opened, f"{SOURCE}.selected.indices.length > 1")
     assert " chosen" in opened.locator("#chosen").inner_text()
 
 
@@ -169,7 +178,7 @@ def test_an_evaluation_says_what_a_metre_was_and_was_predicted_to_be(judged):
     x, y = judged.evaluate(f"[{SOURCE}.data.measured[3], {SOURCE}.data.predicted[3]]")
     judged.locator("figure", has=judged.locator(".plot")).first.scroll_into_view_if_needed()
     judged.mouse.click(*judged.evaluate(PLACE, ["against", x, y]))
-    judged.wait_for_function(f"{SOURCE}.selected.indices.some((i) => Math.abs({SOURCE}.data.measured[i] - {x}) < 1e-6)")
+    until(judged, f"{SOURCE}.selected.indices.some((i) => Math.abs({SOURCE}.data.measured[i] - {x}) < 1e-6)")
 
 
 def test_an_evaluation_answers_to_quantity_and_split_and_shows_the_worst(judged):
@@ -257,14 +266,14 @@ def test_one_cursor_runs_through_map_and_plots_of_a_run(driving):
     assert "tcpipe explain 'driven-1000000000000000000'" in driving.locator("#chosen").inner_text()
     driving.locator("figure", has=driving.locator(".plot")).nth(2).scroll_into_view_if_needed()
     driving.mouse.click(*driving.evaluate(PLACE, ["power", 2.0, 150.0]))
-    driving.wait_for_function("page.model('cursor height').location < 3")
+    until(driving, "page.model('cursor height').location < 3")
     said = driving.locator("#chosen").inner_text()
     assert "Not used" in said
     assert "it stands" in said
     driving.locator("figure").first.scroll_into_view_if_needed()
     x, y = driving.evaluate("(({ x1, y1 }) => [x1[9], y1[9]])(page.model('segments').data_source.data)")
     driving.mouse.click(*driving.evaluate(PLACE, ["map", x, y]))
-    driving.wait_for_function("document.getElementById('chosen').innerText.startsWith('Segment 1')")
+    until(driving, "document.getElementById('chosen').innerText.startsWith('Segment 1')")
     assert "±" in driving.locator("#chosen").inner_text()
     assert driving.evaluate("page.model('layer classes').visible") is False
     driving.select_option("#ground", "classes")
@@ -280,7 +289,7 @@ def test_a_run_is_worked_by_keyboard_and_all_its_plots_zoom_as_one(driving):
     zoomed = driving.evaluate(RANGE.replace("NAME", "gates"))
     assert zoomed[1] - zoomed[0] == pytest.approx(0.5 * (5.0 + 24 * 1.2), rel=0.01)
     assert driving.evaluate(RANGE.replace("NAME", "label plot")) == zoomed
-    driving.wait_for_function(f"page.model('line 0').data_source.data.t.every((t) => t > {zoomed[0] - 0.1})")
+    until(driving, f"page.model('line 0').data_source.data.t.every((t) => t > {zoomed[0] - 0.1})")
     driving.select_option("#label", "E")
     assert driving.evaluate("page.model('label plot').left[0].axis_label") == "E [J], ± σ"
     assert len(driving.pdf()) > 20_000
