@@ -22,6 +22,7 @@ from tcpipe.report.dataset_patches import sheets, thinned_by
 from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.report.page import Section, Shaded
 from tcpipe.report.plots import Plot, new_plot
+from tcpipe.tables.arrays import texts
 from tcpipe.tables.columns import floats
 
 MEASURED, PREDICTED = DROPPED, SPLIT_COLOURS["train"]
@@ -45,42 +46,36 @@ class EvaluatedSamples:
     """What the page shows of samples: ``predictions.parquet`` and sheets of the worst metres' patches, None without any."""
 
     table: pa.Table
+    shown: NDArray[np.int64]
+    """The rows that the page holds, rising: the first of each split, and the worst."""
     patches: Json
 
 
 def evaluated_samples(table: pa.Table, data: Dataset) -> EvaluatedSamples:
     """Return what a page shows of the samples of ``table``, with patches of the dataset that they are of."""
-    rows = worst_rows(table, _WORST)
-    split = table.column("split").to_numpy(zero_copy_only=False)[rows]
+    rows, every = worst_rows(table, _WORST), texts(table.column("split"))
+    first = [np.flatnonzero(every == name)[:_MOST_SHOWN] for name in dict.fromkeys(every.tolist())]
+    shown, split = np.unique(np.concatenate([*first, rows])), every[rows]
     parts: list[dict[str, NDArray[np.generic]]] = []
     for name in dict.fromkeys(split.tolist()):
         ids = table.column("sample_id").take(pa.array(rows[split == name]))
         known = pa.array(data[name].column("sample_id").tolist(), pa.string())
         parts.append(data[name].layers(pc.index_in(ids.combine_chunks(), value_set=known).to_numpy()))
     if not parts:
-        return EvaluatedSamples(table, None)
+        return EvaluatedSamples(table, shown, None)
     step = thinned_by(data.card.patch_px)
     pixels = {layer: np.concatenate([part[layer][:, ::step, ::step] for part in parts]) for layer in parts[0]}
-    at = np.searchsorted(_shown_rows(table), rows)
     files = data[str(split[0])].view.stored.files
-    return EvaluatedSamples(table, sheets(at.tolist(), pixels, files))
-
-
-def _shown_rows(table: pa.Table) -> NDArray[np.int64]:
-    """Return the rows that the page holds, rising: the first of each split, and the worst."""
-    split = table.column("split").to_numpy(zero_copy_only=False)
-    first = [np.flatnonzero(split == name)[:_MOST_SHOWN] for name in dict.fromkeys(split.tolist())]
-    return np.unique(np.concatenate([*first, worst_rows(table, _WORST)]))
+    return EvaluatedSamples(table, shown, sheets(np.searchsorted(shown, rows).tolist(), pixels, files))
 
 
 def page_data(samples: EvaluatedSamples) -> Json:
     """Return what the page's script is told."""
-    rows = _shown_rows(samples.table)
-    table = samples.table.take(pa.array(rows))
-    split, name = (table.column(of).to_numpy(zero_copy_only=False).astype(np.str_) for of in ("split", "terrain_name"))
+    table = samples.table.take(pa.array(samples.shown))
+    split, name = (texts(table.column(of)) for of in ("split", "terrain_name"))
     splits, class_id = list(dict.fromkeys(split.tolist())), table.column("terrain_class").to_numpy()
     columns: dict[str, Column] = {
-        "id": ("text", table.column("sample_id").to_numpy(zero_copy_only=False)),
+        "id": ("text", texts(table.column("sample_id"))),
         "split": ("u8", np.array([splits.index(of) for of in split.tolist()], np.int64)),
         "class": ("u8", class_id),
         "slope": ("half", np.degrees(floats(table, "slope_rad"))),
@@ -115,20 +110,20 @@ def sample_sections(samples: EvaluatedSamples, audits: Mapping[str, str]) -> lis
         "Look for what they share: a class that the map has wrong, a step that the heights miss, a label with a large σ."
     )
     return [
-        _against(samples.table),
+        _against(samples),
         Section("Worst metres", worst, controls="gallery.html"),
         *(_by_class_and_slope(samples.table, split, audit) for split, audit in audits.items()),
         _calibration(samples.table),
     ]
 
 
-def _against(table: pa.Table) -> Section:
+def _against(samples: EvaluatedSamples) -> Section:
     text = (
         "Each point is a metre; on the line it is predicted right. Hover for its figures, click it for σ, intervals and where it is from, "
         "or draw a box; Next goes on to the one that is less off."
     )
-    if table.num_rows > (shown := len(_shown_rows(table))):
-        text += f" {shown} of {table.num_rows} are shown, drawn at random, and the worst."
+    if samples.table.num_rows > len(samples.shown):
+        text += f" {len(samples.shown)} of {samples.table.num_rows} are shown, drawn at random, and the worst."
     corners = {name: [0.0, 1.0] for name in ("measured", "predicted", "slope", "error")}
     start = {**corners, "fill": ["#ffffff"] * 2, "class": [""] * 2}  # until the page's script has unpacked the samples
     against, points = _scatter("against", "samples", "measured", "predicted", start)
@@ -167,7 +162,7 @@ def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
     part = table.filter(pc.and_(pc.equal(table.column("split"), split), pc.is_valid(table.column("slope_rad"))))
     off, ranges = errors_joule(part), slope_ranges(floats(part, "slope_rad"))
     energy, low, high = (floats(part, column_of("E", of)) for of in ("", "predicted_low", "predicted_high"))
-    classes = part.column("terrain_name").to_numpy(zero_copy_only=False)
+    classes = texts(part.column("terrain_name"))
     names = [
         name for _, name in sorted(set(zip(part.column("terrain_class").to_pylist(), classes.tolist(), strict=True)))
     ]

@@ -12,6 +12,7 @@ from scipy.special import ndtri
 from tcpipe.cost.prediction_errors import COVERAGE
 from tcpipe.learning.metrics import QUANTITIES, UNITS, Array, Spread
 from tcpipe.learning.predictions import CALLED, Measured
+from tcpipe.tables.arrays import texts
 from tcpipe.tables.columns import Column, floats
 
 _SUFFIX = {"w": "watt", "v": "mps", "T": "s", "E": "joule"}
@@ -87,7 +88,7 @@ def errors_joule(table: pa.Table) -> Array:
 
 def worst_rows(table: pa.Table, count: int) -> NDArray[np.int64]:
     """Return the rows of the ``count`` samples of each split whose E is furthest off, the furthest first, split by split."""
-    off, split = np.abs(errors_joule(table)), table.column("split").to_numpy(zero_copy_only=False)
+    off, split = np.abs(errors_joule(table)), texts(table.column("split"))
     found = [np.empty(0, np.int64)]
     for name in dict.fromkeys(split.tolist()):
         rows = np.flatnonzero((split == name) & np.isfinite(off))

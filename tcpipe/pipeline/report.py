@@ -18,6 +18,7 @@ from tcpipe.report.dataset_patches import all_patches, folder_of
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.dataset_samples import MOST_SAMPLES
 from tcpipe.report.physics import physics_in_words
+from tcpipe.report.run_map import Pictures
 from tcpipe.report.run_report import run_report
 from tcpipe.report.store_report import store_report
 from tcpipe.store import Store, inside_store, is_store, run_at
@@ -69,7 +70,8 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
         there = is_url(path) or Path(path).exists()
         what = "is no dataset, run or store" if there else "there is no such directory"
         raise UsageError(f"{path}: {what}; give a dataset, a run of a store, or a store")
-    return [_of_run(found[0], run) for run in found[1]]
+    of_maps: dict[str, Pictures] = {}
+    return [_of_run(found[0], run, of_maps) for run in found[1]]
 
 
 def _of_store(store: Store, *, runs: bool) -> list[Page]:
@@ -78,9 +80,10 @@ def _of_store(store: Store, *, runs: bool) -> list[Page]:
     store.keep_index(found)
     facts = store_facts(store, found, will_be=found.finished if runs else ())
     page, pages, problems = _write(store.place, store_report(facts), ()), list[Page](), list[str]()
+    of_maps: dict[str, Pictures] = {}
     for run in found.finished if runs else ():
         try:
-            pages.append(_of_run(store, run))
+            pages.append(_of_run(store, run, of_maps))
         except StoreError as error:
             problems += error.problems
     if problems:
@@ -89,8 +92,8 @@ def _of_store(store: Store, *, runs: bool) -> list[Page]:
     return [page, *pages]
 
 
-def _of_run(store: Store, run: RunDirectory) -> Page:
-    return _write(run.place, run_report(store, run), _physics_of(run))
+def _of_run(store: Store, run: RunDirectory, of_maps: dict[str, Pictures]) -> Page:
+    return _write(run.place, run_report(store, run, of_maps), _physics_of(run))
 
 
 def _of_dataset(path: Path | str, *, patches: bool) -> Page:

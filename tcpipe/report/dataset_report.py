@@ -30,6 +30,7 @@ from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
 from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
 from tcpipe.report.quality import QUALITY_WORDS, quality_sections
+from tcpipe.tables.arrays import texts
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats
 
@@ -166,7 +167,7 @@ def _quality_counts(samples: pa.Table) -> dict[str, int]:
 
 def _apart(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
     """Yield how far what tests lies from what trains, where every sample is shown and both are there."""
-    split = samples.column("split").to_numpy(zero_copy_only=False).astype(np.str_)
+    split = texts(samples.column("split"))
     if shown.cell_m is not None:
         return
     there = [name for name in ("test", "unseen") if np.isfinite(shown.apart_m[split == name]).any()]

@@ -16,6 +16,7 @@ from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import Json
 from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.splits.assignment import SPLITS
+from tcpipe.tables.arrays import texts
 from tcpipe.tables.columns import floats, lonlat_deg
 
 MOST_SAMPLES = 100_000
@@ -78,7 +79,7 @@ def nearest_train_m(xy_m: Floats, split: NDArray[np.str_]) -> tuple[Floats, Ints
 def samples_shown(card: DatasetCard, table: pa.Table) -> SamplesShown:
     """Return what the page holds of the samples."""
     xy_m = middles_m(card, table)
-    split = table.column("split").to_numpy(zero_copy_only=False).astype(np.str_)
+    split = texts(table.column("split"))
     apart_m, nearest = nearest_train_m(xy_m, split)
     values = _values(card, table, apart_m) | {"x": xy_m[:, 0], "y": xy_m[:, 1], "count": np.ones(len(xy_m))}
     cell_m, row_of = None, np.arange(table.num_rows)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, MutableMapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.maps.map_files import MapFile, open_map
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.report.colours import CURSOR
-from tcpipe.report.overview import class_overview, ortho_overview, relief_overview
+from tcpipe.report.overview import Bounds, class_overview, ortho_overview, relief_overview
 from tcpipe.report.pictures import picture_uri
 from tcpipe.report.plots import Plot, lay_picture, new_plot
 from tcpipe.store import Store
@@ -38,10 +38,22 @@ class RunMap:
     missing: tuple[str, ...]
 
 
-def run_map(store: Store, run: RunDirectory, track: pa.Table, segments: pa.Table, *, located: bool) -> RunMap:
-    """Return the map; ``located`` is whether the track has a place on Earth."""
+Pictures = MutableMapping[str, str]
+"""Pictures of a map by name, as data URIs."""
+
+
+def run_map(
+    store: Store,
+    run: RunDirectory,
+    track: pa.Table,
+    segments: pa.Table,
+    *,
+    located: bool,
+    of_maps: MutableMapping[str, Pictures],
+) -> RunMap:
+    """Return the map; ``located`` is whether the track has a place on Earth, ``of_maps`` are the pictures of maps drawn so far, by name."""
     lonlat = np.column_stack([floats(track, "lon_deg"), floats(track, "lat_deg")])
-    found, missing = _map_under(store, run, lonlat) if located else (None, [])
+    found, missing = _map_under(store, run, lonlat, of_maps) if located else (None, [])
     if found is None:
         ends = tuple(
             np.column_stack([floats(segments, f"{end}_{axis}_m") for axis in "xy"]) for end in ("start", "end")
@@ -51,13 +63,13 @@ def run_map(store: Store, run: RunDirectory, track: pa.Table, segments: pa.Table
         return RunMap(
             plot, xy_m, (ends[0], ends[1]), (), (*missing, *_absent(store, located=located, lost=bool(missing)))
         )
-    source, to_map = found
+    to_map, bounds_m, pictures = found
     xy_m = to_map(lonlat)
     plot = _empty("map", ("easting [m]", "northing [m]"), xy_m)
-    ground = _draw_ground(plot, source)
-    return RunMap(
-        plot, xy_m, (to_map(lonlat_deg(segments, "start")), to_map(lonlat_deg(segments, "end"))), ground, tuple(missing)
-    )
+    for number, (name, uri) in enumerate(pictures.items()):
+        lay_picture(plot, name, uri, bounds_m, visible=number == 0)
+    ends_xy_m = to_map(lonlat_deg(segments, "start")), to_map(lonlat_deg(segments, "end"))
+    return RunMap(plot, xy_m, ends_xy_m, tuple(pictures), tuple(missing))
 
 
 def _absent(store: Store, *, located: bool, lost: bool) -> Sequence[str]:
@@ -68,11 +80,14 @@ def _absent(store: Store, *, located: bool, lost: bool) -> Sequence[str]:
     return ["No map of the store lies under the track." if store.maps() else "The store has no map ('tcpipe add-map')."]
 
 
-_Under = tuple[MapFile, Callable[[Floats], Floats]]
+_Under = tuple[Callable[[Floats], Floats], Bounds, Pictures]
+"""The way into a map's plane, its bounds there, its pictures."""
 
 
-def _map_under(store: Store, run: RunDirectory, lonlat: Floats) -> tuple[_Under | None, list[str]]:
-    """Return the first map that holds most of the track with the way into its plane, and which maps cannot be read."""
+def _map_under(
+    store: Store, run: RunDirectory, lonlat: Floats, of_maps: MutableMapping[str, Pictures]
+) -> tuple[_Under | None, list[str]]:
+    """Return the first map that holds most of the track, and which maps cannot be read."""
     lost: list[str] = []
     for name in store.maps():
         try:
@@ -83,7 +98,9 @@ def _map_under(store: Store, run: RunDirectory, lonlat: Floats) -> tuple[_Under 
                 return np.column_stack(turned.transform(*places_deg.T)).reshape(-1, 2)
 
             if source.grid.contains(to_map(lonlat)).mean() > _MOSTLY:
-                return (source, to_map), lost
+                if name not in of_maps:
+                    of_maps[name] = _pictures(source)
+                return (to_map, source.grid.bounds_m, of_maps[name]), lost
         except (TcpipeError, OSError) as error:
             lost.append(f"Map {name} cannot be shown: {plain_line(str(error))}.")
     return None, lost
@@ -116,12 +133,9 @@ def _empty(name: str, axes: tuple[str, str], xy_m: Floats) -> Plot:
     return plot
 
 
-def _draw_ground(plot: Plot, source: MapFile) -> tuple[str, ...]:
-    """Draw the map's pictures, the first to be seen; return their names."""
+def _pictures(source: MapFile) -> Pictures:
+    """Return a map's pictures, the one to be seen first."""
     layers = source.layers
     looks = [("orthophoto", ortho_overview)] if any(name.startswith("ortho") for name in layers) else []
     looks += [("hillshade", relief_overview), *([("classes", class_overview)] if "terrain" in layers else [])]
-    for number, (name, look) in enumerate(looks):
-        uri = picture_uri(look(source), exact=name == "classes")
-        lay_picture(plot, name, uri, source.grid.bounds_m, visible=number == 0)
-    return tuple(name for name, _ in looks)
+    return {name: picture_uri(look(source), exact=name == "classes") for name, look in looks}

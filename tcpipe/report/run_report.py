@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 
@@ -22,7 +22,7 @@ from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
 from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
 from tcpipe.report.quality import QUALITY_WORDS, quality_sections
-from tcpipe.report.run_map import RunMap, run_map
+from tcpipe.report.run_map import Pictures, RunMap, run_map
 from tcpipe.report.run_plots import SPEED_ROLES, Line, lines_of, reasons_told, time_plots
 from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.report.run_series import (
@@ -61,15 +61,18 @@ class _Drawn:
     missing: tuple[str, ...] = ()
 
 
-def run_report(store: Store, run: RunDirectory) -> str:
-    """Return the HTML page of a run of the store; a map of the store that lies under the run is its background."""
+def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pictures] | None = None) -> str:
+    """Return the HTML page of a run of the store; a map of the store that lies under the run is its background.
+
+    ``of_maps`` keeps pictures of maps by name, for who writes the pages of many runs.
+    """
     track, segments, manifest, refused = run.track().table, run.segments(), run.manifest, run.rejections()
     label = manifest.info.findings.facts.label
     known = store.run_json(run.run_id)
     ledger, total = manifest.ledger_m, sum(manifest.ledger_m.values())
     bits = integers(segments, "quality")
     quality = {name_of(bit): int(((bits & int(bit)) != 0).sum()) for bit in Quality}
-    drawn = _drawn(store, run, track, segments, refused)
+    drawn = _drawn(store, run, track, segments, refused=refused, of_maps={} if of_maps is None else of_maps)
     return render_page(
         title=f"Run {run.run_id}",
         lead=f"Robot {manifest.robot}, recipe {run.recipe_id}, {_source_line(known)}",
@@ -108,13 +111,21 @@ def _mean(segments: pa.Table, name: str, unit: str, *, digits: int = 0) -> str:
     return f"{values.mean():.{digits}f} {unit}" if len(values) else "none"
 
 
-def _drawn(store: Store, run: RunDirectory, track: pa.Table, segments: pa.Table, refused: pa.Table) -> _Drawn:
+def _drawn(
+    store: Store,
+    run: RunDirectory,
+    track: pa.Table,
+    segments: pa.Table,
+    *,
+    refused: pa.Table,
+    of_maps: MutableMapping[str, Pictures],
+) -> _Drawn:
     """Return map and plots over time with what their script needs; what cannot be drawn is said."""
     if not track.num_rows:
         return _Drawn(missing=("No track: nothing was recorded that could be fused.",))
     info = run.manifest.info
     timeline = timeline_of(track)
-    ground = run_map(store, run, track, segments, located=info.datum is not None)
+    ground = run_map(store, run, track, segments, located=info.datum is not None, of_maps=of_maps)
     told, lost = _told_series(store, run, timeline)
     series = [track_series(track, timeline, ground.track_xy_m), *told]
     lines, spans = lines_of(series), gate_spans(track, timeline, info.rate_hz)
