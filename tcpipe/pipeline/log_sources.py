@@ -111,10 +111,10 @@ def find_sources(
     With ``as_one`` they are all parts of one. For what lies in object storage there are stand-ins in ``staging``. A folder that holds one
     of the files of ``tables`` is a log.
     """
-    paths: dict[Path, tuple[Path, str]] = {}
+    paths: dict[str, tuple[Path, str]] = {}
     urls: dict[Path, str] = {}
     problems: dict[str, tuple[str, ...]] = {}
-    folders: dict[str, Path] = {}
+    folders: dict[str, str] = {}
     transient = False
     for number, entry in enumerate(logs):
         try:
@@ -122,7 +122,7 @@ def find_sources(
                 remote = remote_logs(str(entry), staging / str(number))
                 urls.update(remote)
                 for path, url in remote.items():
-                    paths.setdefault(path, (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
+                    paths.setdefault(str(path), (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
             else:
                 above = Path(entry)
                 for path in _logs_at(above, tables or {}):
@@ -169,7 +169,7 @@ def _parts_alone(paths: set[Path], *, together: bool) -> Iterator[tuple[Path, st
     """Yield the files that are parts of a ROS 2 bag, given without the others: what does not change stands in the first part only."""
     folders: dict[str, list[Path]] = {}
     for path in paths:
-        if path.name.endswith(STORAGE_SUFFIXES):
+        if str(path).endswith(STORAGE_SUFFIXES):
             folders.setdefault(os.path.dirname(path), []).append(path)  # noqa: PTH120  of thousands
     for bag, mine in sorted(folders.items()):
         parts = frozenset(storage_files(Path(bag)) if is_one_bag(Path(bag)) else ())
@@ -205,9 +205,9 @@ def remote_logs(url: str, directory: Path) -> dict[Path, str]:
     """Return stand-ins for the logs at or below a URL, and the URL of each."""
     directory.mkdir(parents=True)
     place = stand_ins(url, directory, wanted=belongs_to_a_log)
-    folders: dict[str, Path] = {}
+    folders: dict[str, str] = {}
     return {
-        _real(path, folders): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)
+        Path(_real(path, folders)): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)
     }
 
 
@@ -231,14 +231,14 @@ def in_turns(sources: Sequence[LogSource]) -> list[list[int]]:
     return turns
 
 
-def _real(path: Path, folders: dict[str, Path]) -> Path:
+def _real(path: Path, folders: dict[str, str]) -> str:
     """Return where a log really lies; a link that leads nowhere is where it is. ``folders`` keeps where folders lie."""
-    if path.is_symlink() or path.name in ("", ".."):
-        return path.resolve() if path.exists() else path.absolute()
-    folder = os.path.dirname(path)  # noqa: PTH120  of thousands
+    folder, name = os.path.split(path)  # of thousands: no Path for each
+    if name in ("", "..") or os.path.islink(path):  # noqa: PTH114
+        return str(path.resolve() if path.exists() else path.absolute())
     if folder not in folders:
-        folders[folder] = path.parent.resolve()
-    return folders[folder] / path.name
+        folders[folder] = str(path.parent.resolve())
+    return f"{folders[folder].rstrip('/')}/{name}"
 
 
 def _as_named(path: Path) -> Path:
@@ -249,7 +249,9 @@ def _as_named(path: Path) -> Path:
 
 
 def _place_in(path: Path, entry: Path) -> str:
-    return path.relative_to(entry).as_posix() if path != entry else path.name or path.resolve().name
+    if path == entry:
+        return path.name or path.resolve().name
+    return os.fspath(path).removeprefix(os.fspath(entry)).lstrip("/") if str(entry) != "." else os.fspath(path)
 
 
 def _files(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
