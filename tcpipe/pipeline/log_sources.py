@@ -207,7 +207,8 @@ def remote_logs(url: str, directory: Path) -> dict[Path, str]:
     place = stand_ins(url, directory, wanted=belongs_to_a_log)
     folders: dict[str, str] = {}
     return {
-        Path(_real(path, folders)): "/".join((url.rstrip("/"), *path.relative_to(place).parts)) for path in find_logs(place)
+        Path(_real(path, folders)): "/".join((url.rstrip("/"), *path.relative_to(place).parts))
+        for path in find_logs(place)
     }
 
 

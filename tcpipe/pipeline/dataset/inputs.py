@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -74,8 +75,18 @@ def choose_inputs(
     covariates: tuple[CovariateTable, ...] = (),
 ) -> Inputs:
     """Return the runs of one robot ingested with this recipe and the maps, or raise `DatasetError` that lists the candidates."""
-    names = choose_maps(store, map_names)
-    chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
+    problems = list[str]()
+    try:
+        chosen = choose_runs(store, recipe, robot=robot, tags=tags or {})
+        _refuse_without_segments(chosen.runs)
+    except DatasetError as error:
+        problems += error.problems
+    try:
+        names = choose_maps(store, map_names)
+    except DatasetError as error:
+        problems += error.problems
+    if problems:
+        raise DatasetError(*problems)
     once = each_drive_once(chosen.runs, {run_id: log.sha256 for run_id, log in chosen.logs.items()})
     runs = once.runs
     documents = tuple(store.map_document(name) for name in names)
@@ -99,6 +110,21 @@ def choose_inputs(
     )
     warnings = (*chosen.warnings, *once.warnings)
     return Inputs(runs, sources, names, maps, map_sha256, once.again, fingerprint, chosen, warnings, covariates)
+
+
+def _refuse_without_segments(runs: Sequence[RunDirectory]) -> None:
+    if any(run.facts.segments for run in runs):
+        return
+    lost_m = Counter[str]()
+    for run in runs:
+        lost_m.update(run.facts.ledger_m)
+    where = ", ".join(
+        f"{metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost_m.most_common(4) if metres > 0
+    )
+    raise DatasetError(
+        f"{len(runs)} runs, but no segment in them: {where or 'the robot did not move'} "
+        "('tcpipe status' says what wins metres back)"
+    )
 
 
 def _map_files(store: Store, maps: Sequence[MapDocument]) -> tuple[tuple[Path, FetchedShards | None], ...]:

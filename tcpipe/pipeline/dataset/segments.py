@@ -48,15 +48,11 @@ def pool_segments(
     ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}
     path, counts = directory / "segments.arrow", list[_Count]()
     write_pieces(path, LABELLED_SEGMENTS.arrow(), _usable(runs, again or {}, counts))
-    every, powered, located = (
-        sum(getattr(count, name) for count in counts) for name in ("every", "powered", "located")
-    )
-    if every == 0:
-        lost = sorted(((metres, name) for name, metres in ledger_m.items() if metres > 0.0), reverse=True)
-        where = ", ".join(f"{metres:.0f} m {name.replace('_', ' ')}" for metres, name in lost[:4])
-        raise DatasetError(f"{len(runs)} runs, but no segment in them: {where or 'the robot did not move'}")
     segments = map_table(path)
     if segments.num_rows == 0:
+        every, powered, located = (
+            sum(getattr(count, name) for count in counts) for name in ("every", "powered", "located")
+        )
         lack = "power where there is GNSS" if powered and located else "GNSS" if powered else "power"
         raise DatasetError(
             f"{len(runs)} runs, {every} segments, but none with {lack}: "

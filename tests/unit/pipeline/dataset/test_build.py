@@ -159,6 +159,14 @@ def test_no_segments(store, tmp_path):
     assert "no segment in them: 3 m standing" in refused(store, tmp_path)
 
 
+def test_what_the_runs_and_the_maps_lack_is_said_at_once(tmp_path):
+    with pytest.raises(DatasetError) as caught:
+        build(open_store(tmp_path / "bare", create=True), tmp_path)
+    runs, maps = caught.value.problems
+    assert "no runs in the store" in runs
+    assert "no map in the store" in maps
+
+
 def test_the_card_says_what_the_power_of_any_run_feeds(store, tmp_path):
     add(store)
     for run_id, y_m, what in (("b", 3.0, "user ports"), ("c", 6.0, "computers"), ("d", 9.0, "computers")):
