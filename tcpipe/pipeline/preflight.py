@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -26,14 +26,14 @@ from tcpipe.motion.remedies import REMEDIES
 from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.run_stages import run_stages
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import roles_by
 from tcpipe.tables.columns import integers
 from tcpipe.tables.findings import EnergyBudget, RunFacts
 from tcpipe.tables.levels import LabelledSegments
 
-MISSING: Mapping[str, str] = {
+MISSING: Mapping[Role, str] = {
     "gnss": "the track has no place on a map, and there are no samples",
     "imu": "attitude and turning rest on the other sensors alone, and there is no vibration",
     "wheel_odometry": "speed rests on fixes or a camera alone, and slip is not told",
@@ -176,17 +176,14 @@ def preflight(
     with opened(path, message_definitions=message_definitions, tables=recipe.tables) as found:
         seen = replace(inspect_log(found, recipe, robot, full=False), path=str(log))
         topics = tuple(found.topics.values())
-        cast = roles_by(recipe.read_of(found.topics), topics, robot, known=profiles_of(recipe))
+        read = recipe.read_of(found.topics)
+        cast = roles_by(read, topics, robot, known=profiles_of(recipe))
         record = record_command(
             topics, [*(name for role in cast.roles.values() for name in role.topics), *cast.transforms]
         )
-        missing = {
-            role: what
-            for role, what in MISSING.items()
-            if role not in cast.roles and not (role == "gnss" and "pose" in cast.roles)
-        }
+        missing = dict(_missing_roles(cast.roles, read))
         try:
-            streams = read_run(found, recipe.read_of(found.topics), robot=robot, known=profiles_of(recipe))
+            streams = read_run(found, read, robot=robot, known=profiles_of(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
             return _told(seen, None, missing, record, problems=error.problems)
@@ -264,6 +261,14 @@ def _topics(facts: RunFacts, span_s: float) -> Iterator[RoleTopic]:
             yield RoleTopic(
                 role, name, topic.rate_hz, WANTED_HZ.get(role), min(topic.rows / whole, 1.0) if whole else 1.0
             )
+
+
+def _missing_roles(played: Collection[str], read: ReadConfig) -> Iterator[tuple[str, str]]:
+    """Yield the roles that no topic plays and what that costs; nothing of one that the recipe does without, unless no sample is left."""
+    for role, what in MISSING.items():
+        without = role not in ("gnss", "power") and read.topics.get(role) == []
+        if role not in played and not without and not (role == "gnss" and "pose" in played):
+            yield role, what
 
 
 def _missing(missing: Mapping[str, str]) -> Iterator[str]:

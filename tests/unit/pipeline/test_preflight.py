@@ -7,7 +7,8 @@ import pytest
 
 from tcpipe.logs.topics import Topic
 from tcpipe.motion.remedies import REMEDIES
-from tcpipe.pipeline.preflight import Promise, RoleTopic, _hourly_std, _mend, record_command
+from tcpipe.pipeline.preflight import Promise, RoleTopic, _hourly_std, _mend, _missing_roles, record_command
+from tcpipe.recipe import ReadConfig
 from tcpipe.tables.bits import DropReason, Loss, name_of
 from tcpipe.tables.findings import EnergyBudget
 
@@ -40,6 +41,12 @@ def test_what_is_slow_or_absent_for_most_of_the_time_is_said():
     assert [line[:7] for line in _mend((), promise(segments=0), 20.0)] == ["the log", "there i"]
     (line,) = _mend((), replace(promise(segments=0), ledger_m={"gap": 90.0, "standing": 1.0}), 60.0)
     assert "positions too uncertain" in line, "driving straighter would win nothing"
+
+
+def test_a_role_that_the_recipe_does_without_is_not_missed_unless_no_sample_is_left():
+    without = ReadConfig(topics={"wheel_odometry": [], "power": []})
+    assert list(dict(_missing_roles({"pose", "imu"}, without))) == ["power", "command"]
+    assert list(dict(_missing_roles({"imu"}, ReadConfig()))) == ["gnss", "wheel_odometry", "power", "command"]
 
 
 def test_the_deviation_of_a_count_is_that_of_its_windows():
