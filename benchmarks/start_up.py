@@ -3,7 +3,7 @@
 Run by hand, on idle cores: ``python benchmarks/start_up.py [--quick]``. Each line is CPU time of a process (and of what it starts) beside
 that of ``import numpy, pyarrow, numba`` in the same run, the least of some times: the floor that nothing can go below. ``kernel`` is that
 floor with one cached kernel called, for which numba loads much more. ``ingest`` is half a minute of driving less what the same ingest takes
-once more in the same process. The last lines are wall times of two logs of twelve minutes, the least of some turns: with one worker
+once more in the same process. The last lines are wall times of two logs of an hour of driving, the least of some turns: with one worker
 against two, by two processes that are started at once, which is what two cores of this machine can do, and by two workers of a Dask
 cluster, which were there before; ``--quick`` leaves them out.
 """
@@ -16,11 +16,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
+import numpy as np
 from dask_cluster import dask_cluster  # beside the tests
+from scale import LOGS_PER_HOUR, drive_streams, later
+
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
 
 KERNEL = """
 import numpy as np, pyarrow
@@ -67,7 +72,7 @@ def main() -> None:
 
 
 def second_worker(here: Path, turns: int) -> None:
-    logs = [simulated(here / f"hills{seed}", "hills12", seed) for seed in (1, 2)]
+    logs = [long_log(here / f"hour-{number}.mcap", number) for number in range(2)]
     with dask_cluster(here) as cluster:
         ways = {"one": [[*logs, "--jobs", 1]], "two": [[*logs, "--jobs", 2]], "apart": [[log] for log in logs]}
         ways["dask"] = [[*logs, "--cluster", cluster.address]]
@@ -97,6 +102,23 @@ def wall_of(shares: list[list[object]], here: Path) -> float:
     codes = [process.wait() for process in running]
     assert codes == [0] * len(shares), codes
     return time.perf_counter() - began
+
+
+def long_log(path: Path, number: int) -> Path:
+    """Return a log of an hour of driving, half an hour between its parts: a task that takes long beside what is around it."""
+    parts = [
+        [later(stream, 1_800 * part, seed=LOGS_PER_HOUR * number + part) for part in range(LOGS_PER_HOUR)]
+        for stream in drive_streams()
+    ]
+    write_mcap(path, [_joined(of) for of in parts])
+    return path
+
+
+def _joined(parts: list[MessageStream]) -> MessageStream:
+    columns = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
+    said = [part.publish_time_ns for part in parts if part.publish_time_ns is not None]
+    at = np.concatenate([part.log_time_ns for part in parts])
+    return replace(parts[0], columns=columns, log_time_ns=at, publish_time_ns=np.concatenate(said) if said else None)
 
 
 def simulated(place: Path, scenario: str, seed: int) -> Path:

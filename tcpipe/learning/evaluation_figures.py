@@ -213,6 +213,7 @@ def _calibration(table: pa.Table) -> Section:
             legend={_CALLED[q]: _COLOURS[q] for q in found},
             height_px=320,
             tools="save,hover",
+            waits=True,
         )
         plot.figure.hover.tooltips = [("", "$name"), ("stated", "@stated{0 %}"), ("found", "@found{0.0 %}")]
         plot.figure.line([0, 1], [0, 1], color=FAINT, line_dash="dashed", line_width=2, name="known")
@@ -263,11 +264,11 @@ def _by_patch(told: Plotted, quantity: str, label: str) -> list[Plot]:
     legend = {"measured": MEASURED, "predicted": PREDICTED}
     values = new_plot(
         f"patches {quantity}", alt=f"Measured and predicted {label} of some patches of every class.", axes=("", label),
-        legend=legend, tools="xpan,xwheel_zoom,reset,save", tooltips=tips,
+        legend=legend, tools="xpan,xwheel_zoom,reset,save", tooltips=tips, waits=True,
     )  # fmt: skip
     errors = new_plot(
         f"patch errors {quantity}", alt="Their absolute error in percent.", axes=("", "absolute error [%]"),
-        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, beside=values,
+        tools="xpan,xwheel_zoom,reset,save", tooltips=tips, beside=values, waits=True,
     )  # fmt: skip
     for name, colour in legend.items():
         values.figure.line("patch", name, source=source, color=colour, line_width=1.5)

@@ -1,6 +1,6 @@
 "use strict";
 // The dataset's page: samples on the map and in the plot, one of them in words with its patch, and the gallery.
-page.ready.then(async () => {
+page.start(async () => {
   const told = page.data;
   const { at, make, fillSelect, pairs, ramp } = page;
 
@@ -23,7 +23,7 @@ page.ready.then(async () => {
     const part = (k) => Math.round(parseInt(ramp[low].slice(k, k + 2), 16) * (1 - share) + parseInt(ramp[low + 1].slice(k, k + 2), 16) * share);
     return `rgb(${part(1)},${part(3)},${part(5)})`;
   });
-  const digits = (value, name) => Number.isFinite(value) ? `${value.toFixed(kinds[name][2])} ${kinds[name][1]}` : "none";
+  const digits = (value, name) => Number.isFinite(value) ? `${value.toFixed(kinds[name][2])}\u00a0${kinds[name][1]}` : "none";
 
   function coloured(name) {
     const legend = [];
@@ -155,5 +155,4 @@ page.ready.then(async () => {
       return { kind, split, words: `${kind} ${digits(c.slope[i], "slope")}, ${digits(c.power[i], "power")}, ${split}` };
     }, (i) => choose([i]));
   }
-  document.documentElement.dataset.ready = "yes";
 });

@@ -180,6 +180,7 @@ def _apart(samples: pa.Table, shown: SamplesShown) -> Iterator[Plot]:
         legend={name: SPLIT_COLOURS[name] for name in there},
         height_px=240,
         tools="save",
+        waits=True,
     )
     for name in there:
         sorted_m = np.sort(shown.apart_m[split == name])

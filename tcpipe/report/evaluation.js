@@ -1,6 +1,6 @@
 "use strict";
 // An evaluation's page: samples measured against predicted and over slope, one of them in words, and the worst with their patches.
-page.ready.then(async () => {
+page.start(async () => {
   const told = page.data;
   const { at, make, fillSelect, pairs } = page;
   at("chosen").closest("section").append(at("chosen"), at("stepping"));
@@ -95,5 +95,4 @@ page.ready.then(async () => {
       choose([shown.indexOf(i)]);
     });
   }
-  document.documentElement.dataset.ready = "yes";
 });

@@ -2,23 +2,35 @@
 // The frame's script: it draws the page's figures, and draws them again when the colour scheme turns. `page` is what other scripts need.
 const page = (() => {
   const read = (id) => JSON.parse(document.getElementById(id).textContent);
-  const drawn = read("page-figures");
+  const documents = read("page-figures");
   const plots = [];
-  let ready = Promise.resolve();
-  if (drawn !== null) {
-    Bokeh.set_log_level("warn");
-    const roots = drawn.roots.map((root) => root.id);
+  async function draw(figures) {
+    const roots = figures.roots.map((root) => root.id);
     const item = { docid: "page", root_ids: roots, roots: Object.fromEntries(roots.map((id) => [id, id])) };
-    ready = Bokeh.embed.embed_items({ page: drawn }, [item]).then((managers) => {
-      for (const manager of managers) plots.push(...[...manager].filter((view) => "request_paint" in view));
-    });
+    for (const manager of await Bokeh.embed.embed_items({ page: figures }, [item])) {
+      plots.push(...[...manager].filter((view) => "request_paint" in view));
+    }
   }
+  // The first document is what scripts ask for; the others follow when the page answers.
+  if (documents.length) Bokeh.set_log_level("warn");
+  const first = documents.length ? draw(documents[0]) : Promise.resolve();
+  let work = async () => {};
+  document.addEventListener("DOMContentLoaded", async () => {
+    await first;
+    await work();
+    document.documentElement.dataset.ready = "yes";
+    for (const figures of documents.slice(1)) {
+      await new Promise((next) => setTimeout(next, 0));
+      await draw(figures);
+    }
+    document.documentElement.dataset.whole = "yes";
+  });
   const repaint = () => plots.forEach((plot) => plot.request_paint());
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
   matchMedia("print").addEventListener("change", repaint);
 
   // What the pages' own scripts share.
-  const model = (name) => drawn && Bokeh.documents[0].get_model_by_name(name);
+  const model = (name) => documents.length ? Bokeh.documents[0].get_model_by_name(name) : null;
   const at = (id) => document.getElementById(id);
   const make = (tag, text = "", more = {}) => Object.assign(document.createElement(tag), { textContent: text }, more);
   function fillSelect(select, names, text = (name) => name) {
@@ -120,7 +132,8 @@ const page = (() => {
   return {
     at, make, fillSelect, pairs, patches, legend, ramp, ends, scale, clock, explain, chooseGround, gallery, unpack,
     data: read("page-data"),
-    ready,
+    // What a page's own script does when the figures that it asks for are drawn.
+    start: (of) => { work = of; },
     plots,
     model,
   };

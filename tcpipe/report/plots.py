@@ -40,6 +40,8 @@ class Plot:
     figure: Any
     alt: str
     legend: Mapping[str, str] = field(default_factory=dict)
+    waits: bool = False
+    """Whether no script of the page asks for it: it is drawn when all that a reader can work with is there."""
 
 
 def new_plot(
@@ -57,6 +59,7 @@ def new_plot(
     over_time: bool = False,
     beside: Plot | None = None,
     ends: tuple[float, float] | None = None,
+    waits: bool = False,
 ) -> Plot:
     """Return an empty plot as wide as the page.
 
@@ -86,6 +89,8 @@ def new_plot(
         A plot whose horizontal axis moves together with this one's.
     ends
         Of the horizontal axis; it follows what is drawn without.
+    waits
+        No script of the page asks for it, and it is drawn last.
 
     """
     own = DataRange1d() if ends is None else Range1d(start=ends[0], end=ends[1])
@@ -114,7 +119,7 @@ def new_plot(
     drawn.axis.minor_tick_line_color = None
     if tooltips:
         drawn.add_tools(HoverTool(tooltips=list(tooltips)))
-    return Plot(drawn, alt, legend or {})
+    return Plot(drawn, alt, legend or {}, waits)
 
 
 def lay_picture(plot: Plot, name: str, uri: str, bounds_m: tuple[float, float, float, float], *, visible: bool) -> None:
@@ -159,6 +164,7 @@ def waterfall(ledger_m: Mapping[str, float]) -> Plot:
         tools="save",
         names=names[::-1],
         tooltips=[("", "@name"), ("metres", "@metres{0.0}"), ("share", "@share{0.0} %")],
+        waits=True,
     )
     plot.figure.hbar(
         y="name",
@@ -186,7 +192,7 @@ def histogram(name: str, values: NDArray[np.float64], *, label: str, of_what: st
     finite = values[np.isfinite(values)]
     lost = len(values) - len(finite)
     alt = f"Histogram of {label} of {len(finite)} {of_what}" + (f"; {lost} have none" if lost else "")
-    plot = new_plot(name, alt=f"{alt}.", axes=(label, of_what), height_px=220, tools="save")
+    plot = new_plot(name, alt=f"{alt}.", axes=(label, of_what), height_px=220, tools="save", waits=True)
     if len(finite):
         counts, edges = np.histogram(finite, bins=min(40, max(5, int(np.sqrt(len(finite))))))
         plot.figure.quad(left=edges[:-1], right=edges[1:], bottom=0, top=counts, color=SPLIT_COLOURS["train"])
@@ -200,14 +206,33 @@ def script() -> str:
     return (Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
 
 
-def document(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
-    """Return the JSON of plots and the id of each; the same plots have the same ids, whatever was drawn before in this process."""
+def documents(plots: Sequence[Plot]) -> tuple[list[Json], list[str]]:
+    """Return the JSON of plots and the id of each; the same plots have the same ids, whatever was drawn before in this process.
+
+    All plots that scripts ask for are one document, the first. Those that wait follow, each with the plots that share something with it.
+    """
+    shared = [[plot for plot in plots if not plot.waits]] if any(not plot.waits for plot in plots) else []
+    for plot in plots:
+        if plot.waits:
+            beside = next((of for of in shared if of[0].waits and _share(of[-1], plot)), None)
+            if beside is None:
+                shared.append([plot])
+            else:
+                beside.append(plot)
+    ids: dict[str, str] = {}
+    told = [_document(of, ids) for of in shared]
+    return told, [ids[plot.figure.id] for plot in plots]
+
+
+def _share(one: Plot, other: Plot) -> bool:
+    return not one.figure.references().isdisjoint(other.figure.references())
+
+
+def _document(plots: Sequence[Plot], ids: dict[str, str]) -> Json:
     whole = Document()
     for plot in plots:
         whole.add_root(plot.figure)
-    ids: dict[str, str] = {}
-    told = _told(cast("Json", whole.to_json(deferred=False)), ids)
-    return told, [ids[plot.figure.id] for plot in plots]
+    return _told(cast("Json", whole.to_json(deferred=False)), ids)
 
 
 def _told(value: Json, ids: dict[str, str]) -> Json:

@@ -1,6 +1,6 @@
 "use strict";
 // A run's page: its map and its plots over time under one cursor, and what is chosen, in words.
-page.ready.then(async () => {
+page.start(async () => {
   const { at, make, fillSelect, pairs, model, ramp } = page;
   const told = page.data;
   const series = {};
@@ -259,5 +259,4 @@ page.ready.then(async () => {
   redraw();
   if (n) pick(0);
   else choose(first);
-  document.documentElement.dataset.ready = "yes";
 });

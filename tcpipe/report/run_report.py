@@ -247,6 +247,7 @@ def _physics_plots(segments: pa.Table) -> Iterator[Plot]:
         axes=("w by physics [W]", "w [W]"),
         height_px=220,
         tools="save",
+        waits=True,
     )
     ends: NDArray[np.float64] = np.array([fitted[known].min(), fitted[known].max()]) if known.any() else np.zeros(2)
     plot.figure.scatter(

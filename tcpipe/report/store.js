@@ -1,6 +1,6 @@
 "use strict";
 // The store's page: a table of all runs that sorts and filters, and plots over time; what is chosen in one is chosen in the other.
-page.ready.then(() => {
+page.start(() => {
   const { data: told, at, make, fillSelect } = page;
   const runs = told.rows.map((row, number) => Object.assign({ number }, ...told.fields.map((name, i) => ({ [name]: row[i] }))));
   const kind = (run) => run.state.startsWith("superseded") ? "superseded" : run.state;
@@ -108,5 +108,4 @@ page.ready.then(() => {
     filtered();
   };
   draw();
-  document.documentElement.dataset.ready = "yes";
 });
