@@ -196,7 +196,7 @@ def _of_one(result: IngestResult, *, several: bool) -> Iterator[str]:
 
 def _print_warnings(summary: IngestSummary) -> None:
     """Print a line for each cause of warnings, that of most runs first."""
-    from tcpipe.pipeline.dataset.findings import by_cause
+    from tcpipe.tables.findings import by_cause
 
     made = [result for result in summary.results if result.run_id and result.status != "unchanged"]
     causes = by_cause((str(result.run_id), result.warnings) for result in made)

@@ -11,12 +11,12 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.record_files import DatasetMade
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
 from tcpipe.pipeline.calls import latest_calls
-from tcpipe.pipeline.dataset.findings import by_cause
 from tcpipe.pipeline.known_trouble import Trouble, known_trouble
 from tcpipe.pipeline.prune import is_replaced
 from tcpipe.pipeline.status import failed_for_now
 from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts
 from tcpipe.store import Store
+from tcpipe.tables.findings import by_cause
 
 
 def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirectory] = ()) -> StoreFacts:

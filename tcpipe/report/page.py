@@ -22,6 +22,7 @@ from tcpipe.errors import plain_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
+from tcpipe.tables.findings import by_cause
 
 _UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Characters that cannot be seen in a page, or turn its text round: a name may hold them."""
@@ -108,7 +109,7 @@ def render_page(
     Parameters
     ----------
     title, lead, numbers, warnings, verdict
-        What stands at the top, in the order verdict, numbers, warnings.
+        What stands at the top, in the order verdict, numbers, warnings; of warnings of one cause the first, the others folded below it.
     sections
         In the order of the page; the table of contents is made of their titles.
     links
@@ -130,7 +131,7 @@ def render_page(
         title=title,
         lead=lead,
         numbers=numbers,
-        warnings=warnings,
+        warnings=[list(of.values()) for of in by_cause((number, [line]) for number, line in enumerate(warnings))],
         verdict=verdict,
         links=links,
         pictures="'self' file: " if reads_pictures else "",

@@ -5,7 +5,8 @@ Counts and metres are by the names of roles, of reasons or of the ledger's entri
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
@@ -13,6 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 F = TypeVar("F")
+K = TypeVar("K", bound=Hashable)
+
+_FIGURES = re.compile(r"(?<!\w)/\w[\w/]*|[-+]?\d[\d.,]*(e[-+]?\d+)?")
+"""What differs between warnings of one cause: topics and figures."""
 
 LEFT_OUT: Mapping[str, tuple[object, ...]] = {"json": (None, {}, [], ())}
 """Metadata of a field which, while it is None or empty, is no key of the JSON object."""
@@ -436,6 +441,15 @@ class RunFacts:
     gate: GateFacts | None = field(default=None, metadata=LEFT_OUT)
     segment: SegmentFacts | None = field(default=None, metadata=LEFT_OUT)
     label: LabelFacts | None = field(default=None, metadata=LEFT_OUT)
+
+
+def by_cause(warnings: Iterable[tuple[K, Sequence[str]]]) -> list[dict[K, str]]:
+    """Return warnings by cause: lines that differ by figures and topics alone are one; of each key its first line of the cause."""
+    told: dict[str, dict[K, str]] = {}
+    for key, lines in warnings:
+        for line in lines:
+            told.setdefault(_FIGURES.sub("#", line), {}).setdefault(key, line)
+    return list(told.values())
 
 
 NOTHING_FOUND = Findings((), RunFacts())

@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pyarrow as pa
 
 from tcpipe.formats.dataset_card import Doubtful, RunFinding, RunSource
 from tcpipe.tables.bits import Quality, name_of
+from tcpipe.tables.findings import by_cause
 
-_FIGURES = re.compile(r"(?<!\w)/\w[\w/]*|[-+]?\d[\d.,]*(e[-+]?\d+)?")
-"""What differs from run to run: topics and figures."""
 _MOST_SHOWN = 8
-
-
-def by_cause(warnings: Iterable[tuple[str, Sequence[str]]]) -> list[dict[str, str]]:
-    """Return the warnings of runs, by run, lines that differ by figures and topics alone together."""
-    told: dict[str, dict[str, str]] = {}
-    for run_id, lines in warnings:
-        for line in lines:
-            told.setdefault(_FIGURES.sub("#", line), {}).setdefault(run_id, line)
-    return list(told.values())
 
 
 def findings_of_runs(runs: Sequence[RunSource]) -> tuple[RunFinding, ...]:

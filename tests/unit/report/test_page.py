@@ -78,6 +78,16 @@ def test_a_name_is_text_wherever_it_stands():
     assert "\\\\(" not in figures
 
 
+def test_warnings_of_one_cause_are_one_line_with_the_others_folded_below_it():
+    late = [f"/gps_{n}/fix: message {n}: 0.{n} s late" for n in range(1, 40)]
+    html = render_page(title="t", lead="", numbers=[], warnings=["no power", *late, "no power"], sections=[])
+    shown = re.search('<ul class="warnings".*', html)[0]
+    top = re.sub("<details>.*?</details>", "", shown)
+    assert re.findall("<li>(.*?)</li>", top) == ["no power", late[0]]
+    assert re.findall("<summary>([0-9]+) more", shown) == ["1", "38"]
+    assert re.findall("<li>([^<]*)", shown) == ["no power", "no power", *late]
+
+
 def test_what_scripts_ask_for_is_drawn_first_and_what_shares_an_axis_together():
     def plot(name, **more):
         made = new_plot(name, alt=name, axes=("x", "y"), **more)
