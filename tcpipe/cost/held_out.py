@@ -16,6 +16,7 @@ _FOLDS = 5  # contiguous: neighbours of a held-out metre are held out, too
 _BLOCK = 10  # consecutive segments that are drawn together
 _DRAWS = 2000
 _SEED = 20260101
+_LEAST_JPM = 10.0  # a percentage of less says nothing, as in `tcpipe.learning.metrics`
 PHYSICS_UNITS = {"standing": "W", "drivetrain": "N", "rolling": "N", "grade": "N", "turning": "W s/rad"}
 """Of the terms of physics."""
 
@@ -94,7 +95,9 @@ def _score(held: _HeldOut) -> PhysicsScore:
     off = held.true - held.said
     spread = float(np.square(held.true - held.true.mean()).sum())
     r2 = 1.0 - float(np.square(off).sum()) / spread if spread > 0.0 else 0.0
-    return PhysicsScore(r2, float(np.mean(np.abs(off) / np.abs(held.true))))
+    enough = np.abs(held.true) >= _LEAST_JPM
+    counted = enough if enough.any() else held.true != 0.0
+    return PhysicsScore(r2, float(np.mean(np.abs(off[counted] / held.true[counted]))) if counted.any() else 0.0)
 
 
 def _gain(scored: _HeldOut | None, without: _HeldOut | None) -> tuple[float, float] | None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from skid_steered import STANDING_WATT, made
 
-from tcpipe.cost.held_out import physics_of
+from tcpipe.cost.held_out import _HeldOut, _score, physics_of
 
 
 def test_shares_and_scores_of_an_exact_robot():
@@ -32,6 +32,12 @@ def test_where_turning_costs_nothing_it_is_worth_nothing():
     low, high = fit.gain_of_turning
     assert low < 0.01
     assert abs(high) < 0.05
+
+
+def test_a_metre_that_takes_nearly_nothing_is_in_no_percentage():
+    true = np.array([100.0, 200.0, 0.01, -0.5])
+    assert _score(_HeldOut(true, true + np.array([10.0, -10.0, 50.0, 50.0]))).mape == pytest.approx(0.075)
+    assert _score(_HeldOut(true[2:], true[2:] + np.array([0.01, 0.5]))).mape == pytest.approx(1.0), "all there is"
 
 
 def test_no_metres_no_fit():
