@@ -83,11 +83,10 @@ def _completing(names: Callable[[click.Context], Iterable[str]]) -> Complete:
 
 
 def _robots(context: click.Context) -> Iterable[str]:
-    from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+    from tcpipe.formats.recipe_toml import recipe_of
     from tcpipe.formats.robot_files import profiles_of
 
-    given = context.params.get("recipe")
-    return sorted(profiles_of(load_recipe(find_recipe(given and Path(given), Path.cwd()))).robots)
+    return sorted(profiles_of(recipe_of(context.params.get("recipe"))).robots)
 
 
 def _store(context: click.Context) -> Store | None:

@@ -62,47 +62,37 @@ class BucketPlace:
 
     def check(self) -> None:
         """Raise `StoreError` where nothing can be listed here."""
-        import obstore  # noqa: PLC0415
-
         store, key = self._store()
         with told(self.url, StoreError):
-            next(iter(obstore.list(store, prefix=key or None, chunk_size=1)), None)
+            next(iter(store.list(prefix=key or None, chunk_size=1)), None)
 
     def read(self, name: str) -> bytes | None:
         """Return a whole object; None where there is none."""
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(name)
         with suppress(FileNotFoundError), told(self.where(name), StoreError):
-            return bytes(obstore.get(store, key).bytes())
+            return bytes(store.get(key).bytes())
         return None
 
     def read_range(self, name: str, start: int, size: int) -> bytes:
         """Return ``size`` bytes from ``start`` on."""
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(name)
         with _gone(self.where(name)), told(self.where(name), StoreError):
-            return bytes(obstore.get_range(store, key, start=start, length=size)) if size else b""
+            return bytes(store.get_range(key, start=start, length=size)) if size else b""
 
     def size(self, name: str) -> int | None:
         """Return how large an object is [byte]."""
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(name)
         with suppress(FileNotFoundError), told(self.where(name), StoreError):
-            return int(obstore.head(store, key)["size"])
+            return int(store.head(key)["size"])
         return None
 
     def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
         """Return the objects below ``prefix/``, by name; so many a request that a large store takes few."""
         del but
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(prefix)
         cut = len(self._store()[1]) + 1 if self._store()[1] else 0
         with told(self.where(prefix), StoreError):
-            found = [meta for batch in obstore.list(store, prefix=key or None) for meta in batch]
+            found = [meta for batch in store.list(prefix=key or None) for meta in batch]
         entries = (
             Entry(meta["path"][cut:], meta["size"], round(meta["last_modified"].timestamp() * 1e6) * 1000)
             for meta in found
@@ -118,30 +108,25 @@ class BucketPlace:
         return sorted(meta["path"].rpartition("/")[2] for meta in self._in(prefix)["objects"])
 
     def _in(self, prefix: str) -> ListResult[Sequence[ObjectMeta]]:
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(prefix)
         with told(self.where(prefix), StoreError):
-            return obstore.list_with_delimiter(store, prefix=key or None)
+            return store.list_with_delimiter(prefix=key or None)
 
     def put(self, name: str, data: bytes, *, lasting: bool = True) -> None:
         """Write an object."""
         del lasting
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(name)
         with told(self.where(name), StoreError, what="written"):
-            obstore.put(store, key, data, use_multipart=False)
+            store.put(key, data, use_multipart=False)
 
     def put_new(self, name: str, data: bytes) -> bool:
         """Write an object by a conditional request."""
-        import obstore  # noqa: PLC0415
-        from obstore.exceptions import AlreadyExistsError  # noqa: PLC0415
+        from obstore.exceptions import AlreadyExistsError  # noqa: PLC0415  most runs stay on this machine
 
         store, key = self._store(name)
         with told(self.where(name), StoreError, what="written"):
             try:
-                obstore.put(store, key, data, mode="create", use_multipart=False)
+                store.put(key, data, mode="create", use_multipart=False)
             except AlreadyExistsError:
                 return False
         return True
@@ -152,13 +137,12 @@ class BucketPlace:
 
     def put_files(self, prefix: str, directory: Path) -> None:
         """Upload the files of a directory, several at once."""
-        import obstore  # noqa: PLC0415
 
         def upload(path: Path) -> None:
             name = "/".join(part for part in (prefix, path.relative_to(directory).as_posix()) if part)
             store, key = self._store(name)
             with told(self.where(name), StoreError, what="written"):
-                obstore.put(store, key, path)
+                store.put(key, path)
 
         side_by_side(self.url, upload, sorted(path for path in directory.rglob("*") if path.is_file()))
 
@@ -174,11 +158,9 @@ class BucketPlace:
 
     def delete(self, name: str) -> None:
         """Remove an object."""
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(name)
         with suppress(FileNotFoundError), told(self.where(name), StoreError, what="written"):
-            obstore.delete(store, key)
+            store.delete(key)
 
     def local(self, name: str, checksum: Checksum) -> Path:
         """Return the cached copy of an object with this content; `StoreError` where the object is gone or another."""
@@ -198,11 +180,9 @@ class BucketPlace:
 
     def pieces(self, name: str) -> Iterator[bytes]:
         """Yield an object piece by piece; `StoreError` where there is none."""
-        import obstore  # noqa: PLC0415
-
         store, key = self._store(name)
         with _gone(self.where(name)), told(self.where(name), StoreError):
-            for piece in obstore.get(store, key).stream(min_chunk_size=_PIECE_BYTES):
+            for piece in store.get(key).stream(min_chunk_size=_PIECE_BYTES):
                 yield bytes(piece)
 
     def _store(self, name: str = "") -> tuple[ObjectStore, str]:

@@ -88,12 +88,11 @@ class StoredObject:
 
     def _range(self, span: tuple[int, int]) -> memoryview:
         """Return one span of the object as it was when it was found; obstore asks again for what a broken connection cuts short."""
-        import obstore  # noqa: PLC0415  most runs stay on this machine
-        from obstore.exceptions import PreconditionError  # noqa: PLC0415
+        from obstore.exceptions import PreconditionError  # noqa: PLC0415  most runs stay on this machine
 
         options: GetOptions = {"range": span, "if_match": self.tag} if self.tag else {"range": span}
         try:
-            data = memoryview(obstore.get(self.store, self.name, options=options).bytes()).cast("B")
+            data = memoryview(self.store.get(self.name, options=options).bytes()).cast("B")
         except PreconditionError:
             raise LogError(f"{self.url}: changed while it was read; run it again") from None
         if len(data) != span[1] - span[0]:
@@ -243,16 +242,14 @@ def connected(url: str) -> tuple[ObjectStore, str]:
 
 def _found(store: ObjectStore, url: str, name: str, wanted: Callable[[str], bool]) -> Iterator[StoredObject]:
     """Yield the object of a name; where there is none, what is wanted below it."""
-    import obstore  # noqa: PLC0415
-
     if name:
         try:
-            yield _stored(store, url, name, obstore.head(store, name))
+            yield _stored(store, url, name, store.head(name))
         except (FileNotFoundError, IsADirectoryError):
             pass
         else:
             return
-    for listed in obstore.list(store, prefix=name or None):
+    for listed in store.list(prefix=name or None):
         yield from (_stored(store, url, name, meta) for meta in listed if wanted(PurePosixPath(meta["path"]).name))
 
 

@@ -20,23 +20,21 @@ ROWS_PER_GROUP = 1 << 17
 EMPTY_MEMBER = "structure_needs_at_least_one_member"
 
 
-def write_table(table: pa.Table, path: Path, *, rows_per_group: int = ROWS_PER_GROUP) -> None:
+def write_table(table: pa.Table, path: Path) -> None:
     """Write ``table`` to ``path`` whole or not at all; zstd level 1 without dictionaries (half the default's time)."""
-    with parquet_rows(path, table.schema, rows_per_group=rows_per_group) as write:
+    with parquet_rows(path, table.schema) as write:
         write(table)
 
 
 @contextmanager
-def parquet_rows(
-    path: Path, schema: pa.Schema, *, rows_per_group: int = ROWS_PER_GROUP
-) -> Iterator[Callable[[pa.Table], None]]:
+def parquet_rows(path: Path, schema: pa.Schema) -> Iterator[Callable[[pa.Table], None]]:
     """Yield a function that adds rows to ``path``, each call a row group or more; the file appears at the end, whole or not at all."""
     with atomic_file(path) as temporary, _writer(temporary, schema) as writer:
-        yield lambda table: writer.write_table(table.combine_chunks(), row_group_size=rows_per_group)
+        yield lambda table: writer.write_table(table.combine_chunks(), row_group_size=ROWS_PER_GROUP)
 
 
-def parquet_bytes(table: pa.Table, *, rows_per_group: int = ROWS_PER_GROUP) -> bytes:
-    """Return the file that `write_table` writes."""
+def parquet_bytes(table: pa.Table, *, rows_per_group: int) -> bytes:
+    """Return the file that `write_table` writes, in groups of so many rows."""
     sink = pa.BufferOutputStream()
     with _writer(sink, table.schema) as writer:
         writer.write_table(table.combine_chunks(), row_group_size=rows_per_group)
@@ -74,30 +72,31 @@ def _with_a_member(of: pa.DataType) -> pa.DataType:
     return pa.list_(_with_a_member(of.value_type)) if pa.types.is_list(of) else of
 
 
-def parquet_of(data: bytes, where: str, columns: list[str]) -> pa.Table:
-    """Return columns of the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
+@contextmanager
+def _damage_of(where: Path | str) -> Iterator[None]:
+    """Raise `StoreError` where the file cannot be read."""
     try:
-        with pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
-            return file.read(columns, use_threads=False)  # Arrow's threads could outlive a command that ends at once
+        yield
     except (OSError, pa.ArrowException) as error:
         raise StoreError(f"{where}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
 
 
+def parquet_of(data: bytes, where: str, columns: list[str]) -> pa.Table:
+    """Return columns of the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
+    with _damage_of(where), pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
+        return file.read(columns, use_threads=False)  # Arrow's threads could outlive a command that ends at once
+
+
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Read a Parquet file with its schema metadata; `StoreError` names a file that cannot be read."""
-    try:
+    with _damage_of(path):
         return pq.read_table(path, columns=columns, memory_map=True, partitioning=None, page_checksum_verification=True)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
 
 
 def read_row_group(path: Path, group: int, columns: list[str]) -> pa.Table:
     """Read columns of one row group of a Parquet file; `StoreError` names a file that cannot be read."""
-    try:
-        with pq.ParquetFile(path, page_checksum_verification=True) as file:
-            return file.read_row_group(group, columns=columns)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
+    with _damage_of(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
+        return file.read_row_group(group, columns=columns)
 
 
 def column_names(path: Path) -> list[str]:
@@ -107,10 +106,8 @@ def column_names(path: Path) -> list[str]:
 
 def read_schema(path: Path) -> pa.Schema:
     """Return the schema of a Parquet file, with its metadata, from its footer; `StoreError` names a file that cannot be read."""
-    try:
+    with _damage_of(path):
         return pq.read_schema(path)
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
 
 
 def lowest(path: Path, column: str) -> int:
@@ -125,13 +122,11 @@ def highest(path: Path, column: str) -> int:
 
 def _statistics(path: Path, column: str) -> list[tuple[int, int]]:
     """Return the lowest and the highest value of a column in every row group that has rows."""
-    try:
+    with _damage_of(path):
         about = pq.read_metadata(path)
         groups = [about.row_group(index) for index in range(about.num_row_groups)]
         at = about.schema.to_arrow_schema().get_field_index(column)
         found = [group.column(at).statistics for group in groups if at >= 0 and group.num_rows]
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{path}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
     if not found or not all(of is not None and of.has_min_max for of in found):
         raise StoreError(f"{path}: has no statistics of {column}")
     return [(int(of.min), int(of.max)) for of in found]

@@ -10,7 +10,6 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
@@ -20,7 +19,7 @@ import google_crc32c
 
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.atomic import lasting_scratch, scratch_directory
-from tcpipe.formats.bucket import open_place
+from tcpipe.formats.bucket import open_place, side_by_side
 from tcpipe.formats.content_cache import cached, is_cached
 from tcpipe.formats.json_files import parse_json, typed
 from tcpipe.formats.object_storage import is_url
@@ -38,7 +37,6 @@ REPORT_PATCHES = "report-patches"
 CLAIM = "writing.json"
 """The card of who puts a directory there, as long as that goes on."""
 _CRC_BYTES = 4
-_AT_ONCE = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +64,7 @@ class FetchedShards:
     def expect(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
         """Have pieces (shard, offset, size) cached that are read soon, fetched side by side."""
         absent = [piece for piece in pieces if not is_cached(self._key(*piece))]
-        if absent:
-            with ThreadPoolExecutor(min(_AT_ONCE, len(absent))) as pool:
-                list(pool.map(lambda piece: self._held(*piece), absent))
+        side_by_side(self.place.where(), lambda piece: self._held(*piece), absent)
 
     def whole(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
@@ -117,8 +113,7 @@ def anew(url: str) -> Iterator[Path]:
     """
     place = open_place(url)
     with scratch_directory() as held:
-        root = held.joinpath(*(part for part in url.split("/") if part not in ("", "..")))
-        root.mkdir(parents=True)
+        root = _below(held, url)
 
         def bring(name: str) -> None:
             if (data := place.read(name)) is not None:
@@ -126,8 +121,7 @@ def anew(url: str) -> Iterator[Path]:
                 (root / name).write_bytes(data)
 
         _, checksums, _ = _card_of(place, url)
-        with ThreadPoolExecutor(_AT_ONCE) as pool:
-            list(pool.map(bring, [*checksums, *CARDS, *_UNLISTED]))
+        side_by_side(url, bring, [*checksums, *CARDS, *_UNLISTED])
         yield root
 
 
@@ -170,7 +164,7 @@ def _card_of(place: Place, url: str) -> tuple[str, Mapping[str, Checksum], bytes
 def _mirrored(url: str, wanted: Callable[[str], bool]) -> tuple[Path, FetchedShards]:
     place = open_place(url)
     name, checksums, data = _card_of(place, url)
-    root = _directory_of(url, data)
+    root = _below(_kept(url, data), url)
     (root / name).write_bytes(data)
     for unlisted in _UNLISTED:
         if (page := place.read(unlisted)) is not None:
@@ -187,7 +181,7 @@ def files_here(
     """
     if isinstance(place, DirectoryPlace):
         return place.root, None
-    root = _directory_of(place.where(), repr(sorted(checksums.items())).encode())
+    root = _below(_kept(place.where(), repr(sorted(checksums.items())).encode()), place.where())
     return root, _brought(place, root, checksums, lambda name: not by_range(name))
 
 
@@ -196,8 +190,7 @@ def _brought(
 ) -> FetchedShards:
     """Bring what is wanted of a place's files below ``root``; return where the others are read."""
     absent = [(file, checksum) for file, checksum in checksums.items() if wanted(file) and not (root / file).exists()]
-    with ThreadPoolExecutor(_AT_ONCE) as pool:
-        list(pool.map(lambda of: _bring(place, of[0], of[1], root / of[0]), absent))
+    side_by_side(place.where(), lambda of: _bring(place, *of, root / of[0]), absent)
     return FetchedShards(place, root, checksums)
 
 
@@ -208,9 +201,9 @@ def _kept(url: str, card: bytes) -> Path:
     return lasting_scratch()
 
 
-def _directory_of(url: str, card: bytes) -> Path:
-    """Return where a copy lies: so that lines about its files show where they are from."""
-    path = _kept(url, card).joinpath(*(part for part in url.split("/") if part not in ("", "..")))
+def _below(directory: Path, url: str) -> Path:
+    """Return where a copy of what lies at a URL lies in a directory: so that lines about its files show where they are from."""
+    path = directory.joinpath(*(part for part in url.split("/") if part not in ("", "..")))
     path.mkdir(parents=True, exist_ok=True)
     return path
 

@@ -52,6 +52,13 @@ def load_recipe(path: Path | None) -> Recipe:
         raise RecipeError(f"{path}: not valid TOML: {error}") from None
 
 
+def recipe_of(given: Recipe | str | Path | None) -> Recipe:
+    """Return a recipe: the one given, itself or by its path, else the one that rules here, as `find_recipe` says."""
+    if isinstance(given, Recipe):
+        return given
+    return load_recipe(find_recipe(None if given is None else Path(given), Path.cwd()))
+
+
 def parse_recipe(values: Mapping[str, Any], *, where: str) -> Recipe:
     """Check recipe values; `RecipeError` carries one line for every wrong key."""
     return from_values(Recipe, values, where=where)

@@ -18,7 +18,7 @@ from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+from tcpipe.formats.recipe_toml import recipe_of
 from tcpipe.formats.record_files import Call, record_name
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.store_mark import gone_if_empty
@@ -132,7 +132,7 @@ def ingest(
 
     """
     watch = started()
-    ruling = recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(_as_path(recipe), Path.cwd()))
+    ruling = recipe_of(recipe)
     robot = robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
@@ -289,7 +289,3 @@ def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[P
     """Return a temporary directory, where a log is named by its URL."""
     remote = any(is_url(log) for log in logs)
     return scratch_directory() if remote else nullcontext(Path())
-
-
-def _as_path(value: str | Path | None) -> Path | None:
-    return None if value is None else Path(value)

@@ -17,7 +17,7 @@ from tcpipe.formats.dataset_files import CARD, read_card
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.numbered import numbers, read_sealed_at, stem_and_number
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
-from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
+from tcpipe.formats.recipe_toml import ingest_key, recipe_of
 from tcpipe.formats.record_files import DatasetMade
 from tcpipe.formats.store_mark import SPOOL
 from tcpipe.formats.stored_runs import Ingestions
@@ -92,9 +92,7 @@ def prune(
         There is no store, or something cannot be removed; what went before is gone.
 
     """
-    ruling = (
-        recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(Path(recipe) if recipe else None, Path.cwd()))
-    )
+    ruling = recipe_of(recipe)
     opened = open_store(store)
     found = opened.ingestions()
     unknown = set(keep) - {name for key in found.rows for name in key}

@@ -44,7 +44,7 @@ from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
 from tcpipe.formats.published import has_card, here_by_range, published, settle
-from tcpipe.formats.recipe_toml import find_recipe, load_recipe
+from tcpipe.formats.recipe_toml import recipe_of
 from tcpipe.formats.record_files import Call, DatasetMade, record_name
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
@@ -334,8 +334,7 @@ def _result(place: Path | str, status: str, card: DatasetCard, problems: Sequenc
 
 def _ruling(recipe: Recipe | str | Path | None, *, holdout: str | None, seed: int | None) -> Recipe:
     """Return the recipe with the command's own choices in it."""
-    if not isinstance(recipe, Recipe):
-        recipe = load_recipe(find_recipe(None if recipe is None else Path(recipe), Path.cwd()))
+    recipe = recipe_of(recipe)
     kind, _, tag = (holdout or recipe.split.holdout).partition(":")
     rules = replace(
         recipe.split,
