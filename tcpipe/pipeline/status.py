@@ -140,13 +140,14 @@ def status(
         found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
     mine = found.sources if shard is None else in_shard(found.sources, shard)
     passing = failed_for_now(calls)
+    failures = _failures(opened) if known.failed else {}
     groups: dict[tuple[State, str], list[IngestTask]] = {}
     for source in mine:
         task_source = remembered(source, known.seen.get(source.lineage, ()))
         task = IngestTask(
             task_source, opened.root, ruling, robot or ruling.robot, {}, force, message_definitions, definitions, retry_failed, min_age_s
         )  # fmt: skip
-        groups.setdefault(_standing(task, opened, known, passing), []).append(task)
+        groups.setdefault(_standing(task, opened, known, passing, failures), []).append(task)
     told = tuple(
         Group(state, cause, tuple(task.source.name for task in tasks), sum(_bytes(task) for task in tasks))
         for (state, cause), tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
@@ -155,7 +156,13 @@ def status(
     return replace(_summed(opened, told, found, known, calls, sources=given, jobs=jobs), losses=losses_of(ledgers_m))
 
 
-def _standing(task: IngestTask, store: Store, known: KnownRuns, passing: Mapping[str, str]) -> tuple[State, str]:
+def _standing(
+    task: IngestTask,
+    store: Store,
+    known: KnownRuns,
+    passing: Mapping[str, str],
+    failures: Mapping[str, Sequence[Trouble]],
+) -> tuple[State, str]:
     """Return where a log stands, and why."""
     source, sha256 = task.source, None if task.force else task.source.sha256
     made = known.made.get(sha256, []) if sha256 else []
@@ -164,13 +171,16 @@ def _standing(task: IngestTask, store: Store, known: KnownRuns, passing: Mapping
         return _standing_of(current, task, store)
     failed = None if task.force or task.retry_failed else store.recall(task.failure, Trouble)
     if failed is not None:
-        accepted = replace(failed, kind="failed").is_accepted(store)
-        return "quarantined" if accepted else "failed_permanent", _cause("".join(failed.lines[:1]), task)
+        return "quarantined" if failed.is_accepted(store) else "failed_permanent", _cause(
+            "".join(failed.lines[:1]), task
+        )
     if too_young(task):
         return "growing", ""
     if source.name in passing:
         return "failed_transient", _cause(passing[source.name], task)
-    return ("outdated", _why_outdated(made[-1], task)) if made else ("pending", _why_pending(task, known))
+    return (
+        ("outdated", _why_outdated(made[-1], task)) if made else ("pending", _why_pending(task, store, known, failures))
+    )
 
 
 def _standing_of(made: RunFacts, task: IngestTask, store: Store) -> tuple[State, str]:
@@ -183,12 +193,32 @@ def _standing_of(made: RunFacts, task: IngestTask, store: Store) -> tuple[State,
     return ("done", "damaged, accepted") if trouble.is_accepted(store) else ("partial", _cause(made.damage[0], task))
 
 
-def _why_pending(task: IngestTask, known: KnownRuns) -> str:
+def _why_pending(task: IngestTask, store: Store, known: KnownRuns, failures: Mapping[str, Sequence[Trouble]]) -> str:
     """Return why a log that was seen before is to be ingested; "" of a new one."""
     sha256 = task.source.sha256
+    if before := failures.get(sha256 or task.source.files_digest):
+        accepted = ", accepted" if any(of.is_accepted(store) for of in before) else ""
+        return f"{_how_it_failed(before, task)}{accepted}; to be tried again"
     if sha256 and any(run_id.endswith(f"-{sha256[:8]}") for run_id, _ in known.runs.damaged):
         return "its run is not as it was written"
     return "its content is another than before" if task.source.lineage in known.seen and not sha256 else ""
+
+
+def _failures(store: Store) -> dict[str, list[Trouble]]:
+    """Return what failed, however it was read, by content."""
+    failures: dict[str, list[Trouble]] = {}
+    for of in store.records("failed", Trouble):
+        failures.setdefault(of.content, []).append(of)
+    return failures
+
+
+def _how_it_failed(before: Sequence[Trouble], task: IngestTask) -> str:
+    if task.force or task.retry_failed:
+        return "failed before"
+    latest = max(of.version or "" for of in before)
+    if __version__ not in {of.version for of in before}:
+        return f"failed with {f'tcpipe {latest}' if latest else 'another version'}"
+    return "failed under another recipe, for another robot or with other message definitions"
 
 
 def _why_outdated(made: RunFacts, task: IngestTask) -> str:

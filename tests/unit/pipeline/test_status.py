@@ -9,10 +9,12 @@ import pytest
 from click.testing import CliRunner
 from wheel_drives import START_NS, drive_at
 
+from tcpipe import __version__
 from tcpipe.cli import cli
 from tcpipe.errors import UsageError
 from tcpipe.formats.record_files import Call
-from tcpipe.pipeline import calls
+from tcpipe.pipeline import calls, known_trouble
+from tcpipe.pipeline import status as status_module
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.known_trouble import accept
 from tcpipe.pipeline.status import status
@@ -132,6 +134,36 @@ def test_a_run_of_another_recipe_or_superseded_is_told_so(first_night):
     (group,) = [group for group in found.groups if group.state == "outdated"]
     assert group.cause.startswith("made under another recipe (")
     assert len(group.logs) == 3
+
+
+def test_a_failure_that_was_accepted_is_tried_again_under_another_recipe_and_says_why(
+    first_night, tmp_path, monkeypatch
+):
+    logs, store = tmp_path / "logs", tmp_path / "store"
+    shutil.copytree(first_night / "store", store)
+    logs.mkdir()
+    shutil.copy2(first_night / "logs" / "junk.bag", logs)
+    other = replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
+
+    def told(recipe, **how):
+        (group,) = where(tmp_path, recipe=recipe, **how).groups
+        return group.state, group.cause
+
+    assert told(Recipe()) == ("pending", "")
+    ingest([logs], store=store, recipe=Recipe())
+    why = "failed under another recipe, for another robot or with other message definitions"
+    assert told(other) == ("pending", f"{why}; to be tried again")
+    accept([str(logs / "junk.bag")], store=store)
+    assert told(Recipe())[0] == "quarantined"
+    assert told(other) == ("pending", f"{why}, accepted; to be tried again")
+    assert told(Recipe(), retry_failed=True) == ("pending", "failed before, accepted; to be tried again")
+    again = ingest([logs], store=store, recipe=other)
+    assert [(of.status, of.accepted) for of in again.results] == [("failed", True)]
+    assert again.exit_code == 0
+    assert told(other)[0] == "quarantined"
+    for module in (known_trouble, status_module):
+        monkeypatch.setattr(module, "__version__", "9.9.9")
+    assert told(other) == ("pending", f"failed with tcpipe {__version__}, accepted; to be tried again")
 
 
 def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_path):
