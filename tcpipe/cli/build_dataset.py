@@ -14,12 +14,14 @@ from tcpipe.cli.options import (
     SEED,
     cluster_option,
     complete_maps,
-    complete_robots,
+    dry_run_option,
+    jobs_option,
     json_option,
     quiet_option,
     recipe_option,
+    robot_option,
     store_option,
-    tag_values,
+    tag_option,
 )
 
 
@@ -46,20 +48,11 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
     multiple=True,
     help="Map to sample from (default: the only one in the store); repeat it for several, the first rules where they overlap.",
 )
-@click.option("--robot", metavar="NAME", shell_complete=complete_robots, help="Only runs of this robot.")
-@click.option(
-    "--tag",
-    "tags",
-    multiple=True,
-    metavar="K=V",
-    callback=tag_values,
-    help="Only runs with this tag; repeat it for several, all of them.",
-)
+@robot_option("Only runs of this robot.")
+@tag_option("Only runs with this tag; repeat it for several, all of them.")
 @store_option
 @recipe_option
-@click.option(
-    "--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help="Runs sampled side by side."
-)
+@jobs_option("Runs sampled")
 @cluster_option
 @click.option("--format", "file_format", default="zarr", show_default=True, type=click.Choice(["zarr", "parquet"]))
 @click.option(
@@ -93,7 +86,7 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
     is_flag=True,
     help="For the public: moved to 0 N 0 E as a whole, and no log, run, topic, path, host or user is named.",
 )
-@click.option("--dry-run", is_flag=True, help="Say what would be done, and what it would take; do nothing.")
+@dry_run_option
 @json_option
 @quiet_option
 def build_dataset(

@@ -10,12 +10,12 @@ import click
 
 from tcpipe.cli.options import (
     PUBLISHED,
-    SEALED,
     FloatRange,
     LonLat,
     cluster_option,
     json_option,
     map_option,
+    model_argument,
     quiet_option,
     speed_option,
     store_option,
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @click.command("cost-map", short_help="Directional cost maps of a whole map")
-@click.argument("model", type=SEALED, metavar="MODEL")
+@model_argument
 @click.argument("out", default="cost-map", type=PUBLISHED, metavar="[OUT]")
 @map_option
 @click.option(

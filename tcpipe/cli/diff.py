@@ -13,13 +13,9 @@ from tcpipe.cli.options import SEALED, json_option
 @json_option
 def diff(a: str, b: str, *, as_json: bool) -> int:
     """Name what changed from A to B and why (log, recipe key, map, region, code), with the labels' shift; exit code 1 if they differ."""
-    from tcpipe.cli.output import print_json, say
+    from tcpipe.cli.output import say_result
     from tcpipe.pipeline.diff import diff as run
 
     found = run(a, b)
-    if as_json:
-        print_json(found)
-    else:
-        for line in found.lines():
-            say(line)
+    say_result(found, as_json=as_json)
     return 0 if found.same else 1

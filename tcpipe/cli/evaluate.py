@@ -10,13 +10,14 @@ from tcpipe.cli.options import (
     SEED,
     json_option,
     map_option,
+    model_argument,
     quiet_option,
     store_option,
 )
 
 
 @click.command(short_help="Measure a model, beside the paper's tables")
-@click.argument("model", type=SEALED, metavar="MODEL")
+@model_argument
 @click.argument("dataset", type=SEALED, metavar="DATASET")
 @click.argument("out", default="evaluation", type=PUBLISHED, metavar="[OUT]")
 @click.option(

@@ -11,14 +11,16 @@ import click
 from tcpipe.cli.options import (
     ONE_OF_SEVERAL,
     cluster_option,
-    complete_robots,
-    duration_value,
+    dry_run_option,
+    jobs_option,
+    min_age_option,
     msgdef_option,
     quiet_option,
     recipe_option,
+    robot_option,
     shard_value,
     store_option,
-    tag_values,
+    tag_option,
 )
 from tcpipe.cli.output import say
 
@@ -31,16 +33,11 @@ if TYPE_CHECKING:
 @click.argument("logs", nargs=-1, required=True, type=ONE_OF_SEVERAL, metavar="LOG...")
 @store_option
 @recipe_option
-@click.option(
-    "--robot",
-    metavar="NAME",
-    shell_complete=complete_robots,
-    help="Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise).",
+@robot_option(
+    "Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise)."
 )
-@click.option(
-    "--tag", "tags", multiple=True, metavar="K=V", callback=tag_values, help="Free tag on the runs; repeatable."
-)
-@click.option("--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help="Logs side by side.")
+@tag_option("Free tag on the runs; repeatable.")
+@jobs_option("Logs")
 @cluster_option
 @click.option("--as-one", is_flag=True, help="All logs are parts of one drive (splits; power logged apart).")
 @msgdef_option
@@ -50,18 +47,10 @@ if TYPE_CHECKING:
     callback=shard_value,
     help="Only the I-th of N shares of the logs: one for each task of an array.",
 )
-@click.option(
-    "--min-age",
-    "min_age_s",
-    default="0",
-    show_default=True,
-    metavar="T",
-    callback=duration_value,
-    help="A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.",
-)
+@min_age_option("0", "A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.")
 @click.option("--retry-failed", is_flag=True, help="Try again what is known to fail.")
 @click.option("--force", is_flag=True, help="Do again what is there already, and what is known to fail.")
-@click.option("--dry-run", is_flag=True, help="Say what would be done, and what it would take; do nothing.")
+@dry_run_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
 @quiet_option
 def ingest(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcpipe.cli.options import LOG, complete_robots, json_option, msgdef_option, recipe_option
+from tcpipe.cli.options import LOG, json_option, msgdef_option, recipe_option, robot_option
 from tcpipe.cli.output import say
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @click.command(short_help="What is in a log, map, dataset or store")
 @click.argument("path", type=LOG, metavar="PATH")
 @click.option("--full", is_flag=True, help="Read everything: damage and gaps, not the index alone.")
-@click.option("--robot", metavar="NAME", shell_complete=complete_robots, help="Robot profile.")
+@robot_option()
 @recipe_option
 @msgdef_option
 @json_option

@@ -68,6 +68,7 @@ class LonLat(click.ParamType[tuple[float, float]]):
         return lon, lat
 
 
+Option: TypeAlias = Callable[[Any], Any]
 Complete: TypeAlias = Callable[[click.Context, click.Parameter, str], list[str]]
 
 
@@ -199,6 +200,39 @@ speed_option = click.option(
     help="Commanded speed, for a model trained with --beside (default: the mean of its training).",
 )
 """``--speed``: what speed is planned to be commanded."""
+
+model_argument = click.argument("model", type=SEALED, metavar="MODEL")
+"""``MODEL``: a trained model, here or in a bucket."""
+
+
+def robot_option(about: str = "Robot profile.") -> Option:
+    """Return ``--robot``."""
+    return click.option("--robot", metavar="NAME", shell_complete=complete_robots, help=about)
+
+
+def tag_option(about: str) -> Option:
+    """Return ``--tag``, which may be repeated."""
+    return click.option("--tag", "tags", multiple=True, metavar="K=V", callback=tag_values, help=about)
+
+
+def jobs_option(about: str) -> Option:
+    """Return ``--jobs``."""
+    return click.option(
+        "--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help=f"{about} side by side."
+    )
+
+
+def min_age_option(default: str, about: str) -> Option:
+    """Return ``--min-age``."""
+    return click.option(
+        "--min-age", "min_age_s", default=default, show_default=True, metavar="T", callback=duration_value, help=about
+    )
+
+
+dry_run_option = click.option(
+    "--dry-run", is_flag=True, help="Say what would be done, and what it would take; do nothing."
+)
+"""``--dry-run``: nothing is done."""
 
 _SECONDS = {"": 1.0, "s": 1.0, "m": 60.0, "h": 3600.0, "d": 86400.0}
 _MOST_SHARDS = 100_000

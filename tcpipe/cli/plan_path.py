@@ -14,6 +14,7 @@ from tcpipe.cli.options import (
     LonLat,
     complete_maps,
     json_option,
+    model_argument,
     physics_option,
     quiet_option,
     speed_option,
@@ -22,7 +23,7 @@ from tcpipe.cli.options import (
 
 
 @click.command("plan-path", short_help="The path of least energy, time or distance")
-@click.argument("model", type=SEALED, metavar="MODEL")
+@model_argument
 @click.option("--from", "start", required=True, type=LonLat(), help="Where it begins (WGS84, degrees).")
 @click.option("--to", "goal", required=True, type=LonLat(), help="Where it ends.")
 @click.option(

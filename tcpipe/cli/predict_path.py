@@ -9,9 +9,9 @@ import click
 from tcpipe.cli.options import (
     INPUT_FILE,
     OUTPUT_FILE,
-    SEALED,
     json_option,
     map_option,
+    model_argument,
     physics_option,
     quiet_option,
     speed_option,
@@ -20,7 +20,7 @@ from tcpipe.cli.options import (
 
 
 @click.command("predict-path", short_help="Time and energy of a path")
-@click.argument("model", type=SEALED, metavar="MODEL")
+@model_argument
 @click.option(
     "--path",
     "path_file",

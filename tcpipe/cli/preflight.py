@@ -6,12 +6,12 @@ from pathlib import Path
 
 import click
 
-from tcpipe.cli.options import LOG, complete_robots, json_option, msgdef_option, quiet_option, recipe_option
+from tcpipe.cli.options import LOG, json_option, msgdef_option, quiet_option, recipe_option, robot_option
 
 
 @click.command(short_help="What a minute of recording promises")
 @click.argument("log", type=LOG, metavar="LOG")
-@click.option("--robot", metavar="NAME", shell_complete=complete_robots, help="Robot profile.")
+@robot_option()
 @recipe_option
 @msgdef_option
 @json_option

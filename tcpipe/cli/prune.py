@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import complete_runs, duration_value, json_option, recipe_option, store_option
+from tcpipe.cli.options import complete_runs, json_option, min_age_option, recipe_option, store_option
 
 
 @click.command(short_help="Remove what a store no longer needs")
@@ -17,15 +17,7 @@ from tcpipe.cli.options import complete_runs, duration_value, json_option, recip
     shell_complete=complete_runs,
     help="Nothing of this run or recipe goes; repeatable.",
 )
-@click.option(
-    "--min-age",
-    "min_age_s",
-    default="1d",
-    show_default=True,
-    metavar="T",
-    callback=duration_value,
-    help="What killed calls left is removed when it is so old (90, 90s, 10m, 2h, 1d).",
-)
+@min_age_option("1d", "What killed calls left is removed when it is so old (90, 90s, 10m, 2h, 1d).")
 @click.option("--dry-run", is_flag=True, help="Say what would be removed; do nothing.")
 @json_option
 def prune(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import OUTPUT_DIRECTORY, json_option, quiet_option
+from tcpipe.cli.options import OUTPUT_DIRECTORY, jobs_option, json_option, quiet_option
 
 
 @click.command(short_help="The paper's experiment, on a simulated site")
@@ -13,9 +13,7 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, json_option, quiet_option
 @click.option(
     "--seeds", default=1, show_default=True, type=click.IntRange(1, 100), help="Trainings; claims compare their means."
 )
-@click.option(
-    "--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help="Logs read side by side."
-)
+@jobs_option("Logs read")
 @click.option(
     "--hidden", default=1.0, show_default=True, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
     help="Variance of the resistance that nothing shows, over that of the frozen site.",

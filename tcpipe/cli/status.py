@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from tcpipe.cli.options import ONE_OF_SEVERAL, complete_robots, duration_value, json_option, recipe_option, store_option
+from tcpipe.cli.options import ONE_OF_SEVERAL, json_option, min_age_option, recipe_option, robot_option, store_option
 from tcpipe.cli.output import say
 
 
@@ -12,16 +12,8 @@ from tcpipe.cli.output import say
 @click.argument("paths", nargs=-1, type=ONE_OF_SEVERAL, metavar="[STORE] [LOG...]")
 @store_option
 @recipe_option
-@click.option("--robot", metavar="NAME", shell_complete=complete_robots, help="Robot profile that ingest is given.")
-@click.option(
-    "--min-age",
-    "min_age_s",
-    default="10m",
-    show_default=True,
-    metavar="T",
-    callback=duration_value,
-    help="A log that was written to since (90, 90s, 10m, 2h, 1d) is growing.",
-)
+@robot_option("Robot profile that ingest is given.")
+@min_age_option("10m", "A log that was written to since (90, 90s, 10m, 2h, 1d) is growing.")
 @json_option
 def status(
     paths: tuple[str, ...], *, store: str, recipe: str | None, robot: str | None, min_age_s: float, as_json: bool

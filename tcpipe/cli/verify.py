@@ -15,13 +15,9 @@ def verify(path: str, *, as_json: bool) -> int:
 
     Exit code 1: something is not as it was written.
     """
-    from tcpipe.cli.output import print_json, say
+    from tcpipe.cli.output import say_result
     from tcpipe.pipeline.verify import verify as run
 
     found = run(path)
-    if as_json:
-        print_json(found)
-    else:
-        for line in found.lines():
-            say(line)
+    say_result(found, as_json=as_json)
     return 1 if found.problems else 0

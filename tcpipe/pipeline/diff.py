@@ -50,12 +50,8 @@ class Difference:
     """Whether nothing differs."""
 
     def __str__(self) -> str:
-        """Return the lines as one text."""
-        return plain_lines(self.lines())
-
-    def lines(self) -> list[str]:
         """Return causes and effects as plain lines."""
-        return list(_lines(self))
+        return plain_lines(_lines(self))
 
 
 _CHANGES = ("only in a", "only in b", "other labels", "other columns", "other patches", "other fold")

@@ -43,15 +43,11 @@ class Verified:
     """What a redacted dataset does not tell."""
 
     def __str__(self) -> str:
-        """Return the lines as one text."""
-        return plain_lines(self.lines())
-
-    def lines(self) -> list[str]:
         """Return a line of what was read, and one for each problem."""
         read = ", ".join(f"{count} {what}" for what, count in self.read.items()) or "nothing"
         count = len(self.problems)
         verdict = f"{count} problem{'s' if count > 1 else ''}" if count else "all as it was written"
-        return [f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes]
+        return plain_lines((f"{self.path}: {self.kind}; {read} read again: {verdict}", *self.problems, *self.notes))
 
 
 def verify(path: Path | str) -> Verified:

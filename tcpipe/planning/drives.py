@@ -21,10 +21,9 @@ from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
 from tcpipe.splits.neighbours import CLOSE, PLACES, are_near, middles_deg
 from tcpipe.store import Store
 from tcpipe.tables.bits import names_of
-from tcpipe.tables.columns import floats
+from tcpipe.tables.columns import floats, lonlat_deg
 from tcpipe.terrain.patches import patch_frames
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
-from tcpipe.terrain.tiles import MapReader
+from tcpipe.terrain.tiles import MapReader, projection_to
 
 Floats = NDArray[np.float64]
 
@@ -172,13 +171,8 @@ def drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dat
 
 def _said(model: CostModel, source: MapReader, segments: pa.Table, data: Dataset) -> Verdicts:
     """Return what the model says of each segment, where it was driven."""
-    crs = parse_crs(source.grid.crs, where=f"map {source.name}")
-    gnss_crs = parse_crs(data.card.recipe.read.gnss_crs, where="gnss_crs")
-    projection = Projection(gnss_crs, crs, area_of(crs, source.grid.bounds_m))
-    start, end = (
-        projection.forward(np.column_stack([floats(segments, name) for name in names]))
-        for names in (PLACES[:2], PLACES[2:])
-    )
+    projection = projection_to(source, data.card.recipe.read.gnss_crs)
+    start, end = (projection.forward(lonlat_deg(segments, name)) for name in ("start", "end"))
     turn_radpm = floats(segments, "turn_rate_radps") * floats(segments, "duration_s") / floats(segments, "arc_length_m")
     frames = patch_frames(start, end, floats(segments, "chord_m"))
     return joined(verdicts_of(model, source, in_batches(frames), turn_radpm=turn_radpm))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyproj import CRS, Geod
+from pyproj import Geod
 
 from tcpipe.cost.prediction_errors import COVERAGE, errors_of
 from tcpipe.errors import PathError
@@ -21,12 +21,10 @@ from tcpipe.planning.turning import turning_of, turns_between
 from tcpipe.planning.verdicts import Verdicts, in_batches, joined, verdicts_of
 from tcpipe.tables.bits import names_of
 from tcpipe.terrain.patches import corners_on, footprints
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
-from tcpipe.terrain.tiles import MapReader
+from tcpipe.terrain.projection import Projection, area_of
+from tcpipe.terrain.tiles import MapReader, projection_to
 
 Floats = NDArray[np.float64]
-
-_WGS84 = CRS.from_epsg(4326)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,8 +64,7 @@ class PathCost:
 
 def projection_of(source: MapReader) -> Projection:
     """Return the operation from WGS 84 lon, lat [deg] to the map's CRS."""
-    crs = parse_crs(source.grid.crs, where=f"map {source.name}")
-    return Projection(_WGS84, crs, area_of(crs, source.grid.bounds_m))
+    return projection_to(source, "EPSG:4326")
 
 
 def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, where: str) -> PathCost:
@@ -109,11 +106,12 @@ def _turn_radpm(model: CostModel, planned_radpm: Floats) -> Floats:
 
 def pieces_of(source: MapReader, lonlat_deg: Floats, *, chord_m: float, where: str) -> Pieces:
     """Return the pieces of a path; `PathError` where it is shorter than one."""
-    crs, xy_m = parse_crs(source.grid.crs, where=f"map {source.name}"), projection_of(source).forward(lonlat_deg)
+    projection = projection_of(source)
+    xy_m = projection.forward(lonlat_deg)
     if not np.isfinite(xy_m).all():
         raise PathError(f"{where}: points of it lie outside the area where the CRS of map {source.name} is defined")
     length_m = float(np.linalg.norm(np.diff(xy_m, axis=0), axis=1).sum()) if len(xy_m) > 1 else 0.0
-    scale = ground_scale(crs, xy_m)
+    scale = ground_scale(projection.target, xy_m)
     if not length_m:
         raise PathError(f"{where}: is one point; wanted a path of at least {chord_m:g} m")
     pieces = cut_path(xy_m, chord_m=chord_m, scale=scale)

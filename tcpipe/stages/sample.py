@@ -7,16 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyproj import CRS
 
 from tcpipe.recipe import SampleConfig
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import floats, lonlat_deg
 from tcpipe.tables.levels import PLACED_SEGMENTS
 from tcpipe.terrain.patches import check_scale, corners_on, footprints, patch_frames, pitch_note
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.sampling import Patches, sample_patches
-from tcpipe.terrain.tiles import MapReader, TilePool, level_for
+from tcpipe.terrain.tiles import MapReader, TilePool, level_for, projection_to
 
 _LOSSES = (Loss.POSITION_UNCERTAIN, Loss.OUTSIDE_MAP, Loss.NODATA, Loss.NOT_TRAVERSABLE)
 
@@ -55,8 +54,7 @@ def sample_segments(
     TableError : chords and positions contradict each other. MapError : CRSs cannot be connected, or a tile is damaged.
     """
     PLACED_SEGMENTS.check(segments, more=True)
-    crs, chord_m = parse_crs(source.grid.crs, where=f"map {source.name}"), floats(segments, "chord_m")
-    projection = Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
+    chord_m, projection = floats(segments, "chord_m"), projection_to(source, gnss_crs)
     start, end = (projection.forward(lonlat_deg(segments, name)) for name in ("start", "end"))
     frames = patch_frames(start, end, chord_m)
     corners = footprints(frames, config.patch_m)
@@ -75,7 +73,7 @@ def sample_segments(
         map_index=np.zeros(kept.size, np.uint8),
         patches=patches,
         footprint_xy_m=corners[kept],
-        footprint_lonlat_deg=Projection(CRS.from_epsg(4326), crs, projection.area_deg).inverse(corners[kept]),
+        footprint_lonlat_deg=projection_to(source, "EPSG:4326").inverse(corners[kept]),
         lost_by=lost_by,
         warnings=_warnings(source, config, projection),
     )

@@ -8,15 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from pyproj import CRS
 
 from tcpipe.errors import MapError
 from tcpipe.recipe import SampleConfig
 from tcpipe.stages.sample import Sampled, sample_segments
 from tcpipe.tables.bits import Loss
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.sampling import joined
-from tcpipe.terrain.tiles import MapReader, TilePool
+from tcpipe.terrain.tiles import MapReader, TilePool, projection_to
 
 _ELSEWHERE = (Loss.OUTSIDE_MAP, Loss.NODATA)
 """What is lost so on one map may be found on the next; what is not traversable, or nobody knows where, is lost on all."""
@@ -71,10 +69,7 @@ def _in_first_plane(sampled: Sampled, source: MapReader, first: MapReader) -> ND
     """Return footprints in the CRS of the first map [m], in which splits are drawn and distances measured."""
     if source.grid.crs == first.grid.crs:
         return sampled.footprint_xy_m
-    crs = parse_crs(first.grid.crs, where=f"map {first.name}")
-    placed = Projection(CRS.from_epsg(4326), crs, area_of(crs, first.grid.bounds_m)).forward(
-        sampled.footprint_lonlat_deg
-    )
+    placed = projection_to(first, "EPSG:4326").forward(sampled.footprint_lonlat_deg)
     if not np.isfinite(placed).all():
         raise MapError(f"map {source.name}: lies too far from map {first.name} for one dataset; build one from each")
     return placed

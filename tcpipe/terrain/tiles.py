@@ -14,6 +14,7 @@ from tcpipe.terrain.classes import ClassTable
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import STACKS, Layer, Stack, missing, stacked
 from tcpipe.terrain.overviews import factor_for
+from tcpipe.terrain.projection import Projection, area_of, parse_crs
 from tcpipe.terrain.sampling_kernel import Tiles, morton
 
 CACHED_TILES = 96
@@ -74,6 +75,12 @@ def level_for(source: MapReader, pitch_m: float) -> MapReader:
     """Return the map's level whose pixels are nearest below ``pitch_m`` [m]: coarse enough not to alias, fine enough to show all."""
     factor = factor_for(source.factors, source.grid.pitch_m, pitch_m)
     return source if factor == 1 else source.at(factor)
+
+
+def projection_to(source: MapReader, gnss_crs: str) -> Projection:
+    """Return the operation from the longitudes and latitudes of a geographic CRS to the map's CRS; `MapError` where one of them is none."""
+    crs = parse_crs(source.grid.crs, where=f"map {source.name}")
+    return Projection(parse_crs(gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
 
 
 def groups_by_tile(px: NDArray[np.float64], source: MapReader) -> Iterator[NDArray[np.int64]]:

@@ -13,8 +13,9 @@ from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.recipe import Recipe
 from tcpipe.tables.columns import floats
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.registration import Registration, register_track
+from tcpipe.terrain.tiles import projection_to
 
 _WARN_M = 0.5
 """A shift longer than this is a warning [m]: half a patch."""
@@ -47,9 +48,7 @@ def register_runs(
         The map's heights are in feet.
 
     """
-    crs = parse_crs(source.grid.crs, where=f"map {source.name}")
-    gnss_crs = parse_crs(recipe.read.gnss_crs, where="gnss_crs")
-    projection = Projection(gnss_crs, crs, area_of(crs, source.grid.bounds_m))
+    projection = projection_to(source, recipe.read.gnss_crs)
     found, warnings = list[MapRegistration](), list[str]()
     for run in runs:
         registration, expected_m = _register(run, source, projection, max_std_m=recipe.sample.max_position_std_m)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import pyarrow as pa
@@ -19,7 +18,8 @@ from tcpipe.recipe import Recipe
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
 from tcpipe.terrain.point_classes import OFF_THE_MAP, classes_at
-from tcpipe.terrain.projection import Projection, area_of, parse_crs
+from tcpipe.terrain.projection import Projection
+from tcpipe.terrain.tiles import projection_to
 
 _COLUMNS = (
     *("stamp_ns", "epoch", "x_m", "y_m", "z_m", "east_velocity_mps", "north_velocity_mps", "up_velocity_mps"),
@@ -35,6 +35,10 @@ _REASONS = (
 )
 """Reason of each metre of a track; what is lost at sampling or to the split's buffer is one entry."""
 _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
+
+
+_Ground = tuple[MapFile, Projection]
+"""A map, and how places get onto it."""
 
 
 def removed_by_ground(
@@ -60,7 +64,9 @@ def removed_by_ground(
         ``read.gnss_crs`` rules.
 
     """
-    grounds = [_Ground(source, _projection(source, recipe)) for source in sources if "terrain" in source.layers]
+    grounds = [
+        (source, projection_to(source, recipe.read.gnss_crs)) for source in sources if "terrain" in source.layers
+    ]
     table = sources[0].classes
     names = ["off the map", "no data", *table.names().tolist()[1:]]
     spans = _Spans(segments, used)
@@ -121,23 +127,12 @@ def _metres(
     return length_m, reason, slope, _classes(grounds, 0.5 * (lonlat[1:] + lonlat[:-1]))
 
 
-@dataclass(frozen=True, slots=True)
-class _Ground:
-    source: MapFile
-    projection: Projection
-
-
-def _projection(source: MapFile, recipe: Recipe) -> Projection:
-    crs = parse_crs(source.grid.crs, where=f"map {source.name}")
-    return Projection(parse_crs(recipe.read.gnss_crs, where="gnss_crs"), crs, area_of(crs, source.grid.bounds_m))
-
-
 def _classes(grounds: Sequence[_Ground], lonlat_deg: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the class id under each point on the first map that has one there, else as `classes_at`; 0 without maps."""
     found = np.full(len(lonlat_deg), OFF_THE_MAP if grounds else 0, np.int64)
-    for ground in grounds:
+    for source, projection in grounds:
         open_yet = found <= 0
-        here = classes_at(ground.source, ground.projection.forward(lonlat_deg[open_yet]))
+        here = classes_at(source, projection.forward(lonlat_deg[open_yet]))
         found[open_yet] = np.maximum(here, found[open_yet])
     return found
 
