@@ -70,15 +70,12 @@ def run_all(
 
     Parameters
     ----------
-    jobs
-        Processes; this one for 1.
-    cluster
-        Address of a Dask scheduler (``tcp://host:8786``), whose workers do it instead. They see the same files under the same names.
+    jobs : processes; this one for 1.
+    cluster : address of a Dask scheduler (``tcp://host:8786``), whose workers do it instead. They see the same files under the same names.
 
     Raises
     ------
-    UsageError
-        There is no such scheduler, it has no workers, or they are not as they have to be.
+    UsageError : there is no such scheduler, it has no workers, or they are not as they have to be.
     """
     if cluster is not None and tasks:
         yield from _run_on_cluster(function, tasks, cluster)

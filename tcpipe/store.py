@@ -157,8 +157,7 @@ class Store:
 
         Raises
         ------
-        StoreError
-            It cannot be written, or another process has added a map of that name meanwhile, which stays.
+        StoreError : it cannot be written, or another process has added a map of that name meanwhile, which stays.
         """
         maps = self.place.below("maps")
         with maps.workshop() as directory:
@@ -532,8 +531,7 @@ def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
 
     Raises
     ------
-    StoreError
-        It is a run's, but holds no finished ingestion of this data-model version.
+    StoreError : it is a run's, but holds no finished ingestion of this data-model version.
     """
     inside = inside_store(path)
     if inside is None:
@@ -565,10 +563,8 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
 
     Raises
     ------
-    UsageError
-        It is missing (unless ``create``), a file, or of an earlier layout.
-    StoreError
-        It cannot be reached or written, or is of a data model that this version does not know.
+    UsageError : it is missing (unless ``create``), a file, or of an earlier layout.
+    StoreError : it cannot be reached or written, or is of a data model that this version does not know.
     """
     root = str(root).rstrip("/") if is_url(root) else local_output(root)
     if isinstance(root, str) and not root.startswith(_BUCKETS):

@@ -79,17 +79,11 @@ def count_cells(
 
     Parameters
     ----------
-    keys
-        Class ids and ranges of slope, and of speed where cells are to be cut by it too, each of shape (N,).
-    split
-        Split of every sample, shape (N,).
-    xy_m
-        Centres of the footprints [m], shape (N, 2).
-    correlations
-        Of the labels; the one that leaves least counts.
-    splits
-        The splits that count, ``train`` among them.
-
+    keys : class ids and ranges of slope, and of speed where cells are to be cut by it too, each of shape (N,).
+    split : split of every sample, shape (N,).
+    xy_m : centres of the footprints [m], shape (N, 2).
+    correlations : of the labels; the one that leaves least counts.
+    splits : the splits that count, ``train`` among them.
     """
     counted = np.flatnonzero(np.isin(split, splits))
     if not len(counted):

@@ -66,15 +66,10 @@ def correlations(
 
     Parameters
     ----------
-    residual_by_label
-        Of `residuals`, shape (N,) each.
-    xy_m
-        Centres of the footprints [m], shape (N, 2).
-    run, start_ns
-        Number of each sample's run, and its start [ns], shape (N,).
-    chord_m
-        Segment length [m].
-
+    residual_by_label : of `residuals`, shape (N,) each.
+    xy_m : centres of the footprints [m], shape (N, 2).
+    run, start_ns : number of each sample's run, and its start [ns], shape (N,).
+    chord_m : segment length [m].
     """
     rows = _stretches(run, start_ns)
     apart = pdist(xy_m[rows]) / chord_m

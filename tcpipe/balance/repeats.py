@@ -53,15 +53,10 @@ def repeated_pairs(xy_m: Floats, course_rad: Floats, terrain_class: Ints, *, cho
 
     Parameters
     ----------
-    xy_m
-        Centres of the footprints [m], shape (N, 2).
-    course_rad
-        Directions of travel [rad], shape (N,).
-    terrain_class
-        Class ids, shape (N,); across a border between classes two footprints are not the same ground.
-    chord_m
-        Segment length [m].
-
+    xy_m : centres of the footprints [m], shape (N, 2).
+    course_rad : directions of travel [rad], shape (N,).
+    terrain_class : class ids, shape (N,); across a border between classes two footprints are not the same ground.
+    chord_m : segment length [m].
     """
     if len(xy_m) < 2:
         return np.empty((0, 2), np.int64)
@@ -85,15 +80,10 @@ def repeatability(values: Floats, residual: Floats, pairs: Ints, xy_m: Floats, *
 
     Parameters
     ----------
-    values, residual
-        The label and its `correlation.residuals`, shape (N,).
-    pairs
-        Of `repeated_pairs`, shape (P, 2).
-    xy_m
-        Centres of the footprints [m], shape (N, 2).
-    chord_m
-        Segment length [m].
-
+    values, residual : the label and its `correlation.residuals`, shape (N,).
+    pairs : of `repeated_pairs`, shape (P, 2).
+    xy_m : centres of the footprints [m], shape (N, 2).
+    chord_m : segment length [m].
     """
     if not len(pairs):
         return None

@@ -86,13 +86,9 @@ def thin_ground(ground: MapGround, terrain_class: int, slope: int, driven_xy_m: 
 
     Parameters
     ----------
-    ground
-        The map's cells.
-    terrain_class, slope
-        Class id, and number of the range of slope.
-    driven_xy_m
-        Centres of the samples of that class and slope, shape (N, 2) [m].
-
+    ground : the map's cells.
+    terrain_class, slope : class id, and number of the range of slope.
+    driven_xy_m : centres of the samples of that class and slope, shape (N, 2) [m].
     """
     free = offered(ground, terrain_class, slope)
     row, col, on = ground.cells_of(driven_xy_m)

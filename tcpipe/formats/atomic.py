@@ -50,8 +50,7 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    StoreError
-        The place cannot be written.
+    StoreError : the place cannot be written.
     """
     with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
         temporary = holder / place.name
@@ -69,8 +68,7 @@ def atomic_directory(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    StoreError
-        The place cannot be written.
+    StoreError : the place cannot be written.
     """
     with _told(path), _parents_of(path) as place, _holder_beside(place) as holder:
         temporary = holder / place.name

@@ -26,13 +26,7 @@ _IN_USE_S = 60.0
 
 
 def cached(key: str, fetch: Callable[[Path], object]) -> Path:
-    """Return the file of a key; where there is none, ``fetch`` writes it.
-
-    Raises
-    ------
-    StoreError
-        The cache cannot be written.
-    """
+    """Return the file of a key; where there is none, ``fetch`` writes it. `StoreError`: the cache cannot be written."""
     path = _path_of(key)
     if _is_there(path):
         return path

@@ -95,8 +95,7 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
 
     Raises
     ------
-    DatasetError
-        It cannot be read, tells no time, or two of its rows are of one time and differ.
+    DatasetError : it cannot be read, tells no time, or two of its rows are of one time and differ.
     """
     try:
         lazy = pl.scan_parquet(path) if path.suffix.lower() == ".parquet" else _scan_csv(path)

@@ -107,7 +107,6 @@ def croissant(
     Returns
     -------
     JSON-LD.
-
     """
     samples_source = {"fileObject": {"@id": samples_file}}
     records = [

@@ -140,15 +140,10 @@ def zarr_drawers(
 
     Parameters
     ----------
-    pixels
-        The patches of all rows.
-    sample_ids
-        Gives the ids of the rows from one up to another.
-    compression
-        What the layers are encoded with.
-    threads
-        Chunks of a shard encoded side by side; the bytes do not depend on it.
-
+    pixels : the patches of all rows.
+    sample_ids : gives the ids of the rows from one up to another.
+    compression : what the layers are encoded with.
+    threads : chunks of a shard encoded side by side; the bytes do not depend on it.
     """
     n, px = len(pixels.slots), pixels.patch_px
     shard = min(SHARD_ROWS, max(-(-n // CHUNK_ROWS), 1) * CHUNK_ROWS)
@@ -194,13 +189,9 @@ def parquet_drawers(
 
     Parameters
     ----------
-    pixels
-        The patches of all rows.
-    samples
-        Gives, for some rows, what gives these rows of the samples table.
-    split
-        Split of every row, shape (N,).
-
+    pixels : the patches of all rows.
+    samples : gives, for some rows, what gives these rows of the samples table.
+    split : split of every row, shape (N,).
     """
     drawers = list[Drawer]()
     for name in SPLITS:
@@ -228,9 +219,7 @@ def read_card(directory: Path, *, proved: bool = True) -> DatasetCard:
 
     Raises
     ------
-    DatasetError
-        There is none; or it is of this data model and not as it was written, unless that is not to be ``proved``.
-
+    DatasetError : there is none; or it is of this data model and not as it was written, unless that is not to be ``proved``.
     """
     if not directory.exists():
         raise UsageError(f"{directory}: there is no such directory; run 'tcpipe build-dataset' first")
@@ -266,9 +255,7 @@ def read_current_card(directory: Path) -> DatasetCard:
 
     Raises
     ------
-    DatasetError
-        There is none, it is of another data model, or not as it was written.
-
+    DatasetError : there is none, it is of another data model, or not as it was written.
     """
     card = read_card(directory)
     if card.data_model_version not in READ_VERSIONS:
@@ -340,11 +327,8 @@ class PatchFiles:
 
         Parameters
         ----------
-        piece, layers
-            What is read.
-        out
-            Where to, `piece_rows` or more rows a layer; None makes new arrays.
-
+        piece, layers : what is read.
+        out : where to, `piece_rows` or more rows a layer; None makes new arrays.
         """
         rows = int(self.starts[piece + 1] - self.starts[piece])
         shape = (self.piece_rows, self.patch_px, self.patch_px)

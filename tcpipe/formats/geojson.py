@@ -49,7 +49,6 @@ def read_regions(path: Path) -> Regions:
     RegionError
         Not GeoJSON, no polygon, empty or self-crossing geometry, coordinates that are no lon/lat, an unknown ``split``,
         train_test and unseen over the same ground, no train_test region: all problems at once.
-
     """
     polygons: dict[str, list[BaseGeometry]] = {kind: [] for kind in KINDS}
     features, problems = read_polygons(path)
@@ -110,9 +109,7 @@ def read_polygons(path: Path) -> tuple[list[PolygonFeature], list[str]]:
 
     Raises
     ------
-    RegionError
-        Not GeoJSON, or in another CRS.
-
+    RegionError : not GeoJSON, or in another CRS.
     """
     features: list[PolygonFeature] = []
     problems: list[str] = []

@@ -41,9 +41,7 @@ def read_line(path: Path) -> NDArray[np.float64]:
 
     Raises
     ------
-    PathError
-        Not GeoJSON, in another CRS, no line or several, a line of one point, coordinates that are no lon/lat.
-
+    PathError : not GeoJSON, in another CRS, no line or several, a line of one point, coordinates that are no lon/lat.
     """
     try:
         features = list(read_features(path))

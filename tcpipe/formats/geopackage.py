@@ -43,9 +43,7 @@ def write_geopackage(path: Path, layers: Sequence[VectorLayer]) -> None:
 
     Raises
     ------
-    UsageError
-        pyogrio is not installed, or ``path`` is there and holds something else than such layers.
-
+    UsageError : pyogrio is not installed, or ``path`` is there and holds something else than such layers.
     """
     ogr = _pyogrio()
     if path.exists() and not _is_of(ogr, path, {layer.name for layer in layers}):

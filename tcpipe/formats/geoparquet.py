@@ -29,14 +29,10 @@ def located(
 
     Parameters
     ----------
-    table
-        With the column.
-    kind
-        Of all its geometries.
-    points_deg
-        Longitude and latitude of all their points, shape (N, 2), NaN where not known.
-    crs
-        Geographic CRS of the coordinates, of which longitude is the first whatever the CRS says.
+    table : with the column.
+    kind : of all its geometries.
+    points_deg : longitude and latitude of all their points, shape (N, 2), NaN where not known.
+    crs : geographic CRS of the coordinates, of which longitude is the first whatever the CRS says.
     """
     known = points_deg[np.isfinite(points_deg).all(axis=1)]
     column: dict[str, Any] = {"encoding": "WKB", "geometry_types": [kind]}

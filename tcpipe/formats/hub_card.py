@@ -29,13 +29,9 @@ def hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, pictur
 
     Parameters
     ----------
-    card
-        The dataset's, with the checksums of its files so far.
-    samples
-        Schema of its table of samples.
-    samples_file, picture
-        Where that table and an overview lie in the dataset.
-
+    card : the dataset's, with the checksums of its files so far.
+    samples : schema of its table of samples.
+    samples_file, picture : where that table and an overview lie in the dataset.
     """
     return f"---\n{_yaml(_head(card, samples, samples_file))}---\n\n{_body(card, picture)}"
 

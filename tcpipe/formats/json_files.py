@@ -133,9 +133,7 @@ def typed(value: object, cls: type[T], path: Path | str) -> T:
 
     Raises
     ------
-    StoreError
-        A value is missing, or of another type; the line names ``path`` and the key.
-
+    StoreError : a value is missing, or of another type; the line names ``path`` and the key.
     """
     try:
         with _CONVERTING:

@@ -70,8 +70,7 @@ class StoredObject:
 
         Raises
         ------
-        LogError
-            It cannot be had, also after some attempts, or the object is another than it was.
+        LogError : it cannot be had, also after some attempts, or the object is another than it was.
         """
         with told(self.url):
             if len(spans) == 1:
@@ -115,17 +114,13 @@ def laid_out(
 
     Parameters
     ----------
-    url
-        An object (``s3://bucket/drives/run.mcap``), or a prefix (``s3://bucket/drives/bag_directory``).
-    wanted
-        Whether an object of this name is laid out where a prefix was given.
-    by_range
-        Endings of the names of what is not copied.
+    url : an object (``s3://bucket/drives/run.mcap``), or a prefix (``s3://bucket/drives/bag_directory``).
+    wanted : whether an object of this name is laid out where a prefix was given.
+    by_range : endings of the names of what is not copied.
 
     Raises
     ------
-    LogError
-        There is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the path.
+    LogError : there is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the path.
     """
     with scratch_directory() as directory:
         laid = _laid_out(url, directory, wanted)
@@ -144,8 +139,7 @@ def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Pa
 
     Raises
     ------
-    LogError
-        There is no such object, or the store cannot be read.
+    LogError : there is no such object, or the store cannot be read.
     """
     _laid_out(url, directory, wanted)
     return _place_of(url, directory)

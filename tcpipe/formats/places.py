@@ -13,13 +13,7 @@ _LIKE_A_URL = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 
 
 def local_output(path: str | Path) -> Path:
-    """Return where something is written.
-
-    Raises
-    ------
-    UsageError
-        It is a URL, of which a local directory ``s3:`` would become.
-    """
+    """Return where something is written. `UsageError`: it is a URL, of which a local directory ``s3:`` would become."""
     if _LIKE_A_URL.match(str(path)):
         raise UsageError(
             f"{path}: is a URL; this version writes on this machine only: give a path, and copy from there what is made"

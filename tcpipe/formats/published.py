@@ -92,10 +92,8 @@ def here(path: str | Path) -> Path:
 
     Raises
     ------
-    UsageError
-        There is no card at the URL.
-    StoreError
-        It cannot be read, or a file is not as the card says.
+    UsageError : there is no card at the URL.
+    StoreError : it cannot be read, or a file is not as the card says.
     """
     return Path(path) if not is_url(path) else _mirrored(str(path).rstrip("/"), lambda _: True)[0]
 
@@ -106,10 +104,8 @@ def anew(url: str) -> Iterator[Path]:
 
     Raises
     ------
-    UsageError
-        There is no card at the URL.
-    StoreError
-        It cannot be read.
+    UsageError : there is no card at the URL.
+    StoreError : it cannot be read.
     """
     place = open_place(url)
     with scratch_directory() as held:
@@ -234,8 +230,7 @@ def published(url: str, card: str) -> Iterator[Path]:
 
     Raises
     ------
-    StoreError
-        Another one puts something else there, something lies there already, or the place cannot be written.
+    StoreError : another one puts something else there, something lies there already, or the place cannot be written.
     """
     place = open_place(url)
     refuse_others(place, card)

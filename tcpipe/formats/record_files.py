@@ -112,14 +112,7 @@ def record_name(digest: str) -> str:
 
 
 def put_record(place: Place, name: str, value: object) -> bool:
-    """Write a record, a dataclass, unless it is there already, whole; return whether this call did.
-
-    Raises
-    ------
-    StoreError
-        It cannot be written.
-
-    """
+    """Write a record, a dataclass, unless it is there already, whole; return whether this call did. `StoreError`: it cannot be written."""
     data = to_json(sealed(value)).encode()
     if place.put_new(f"{name}.json", data):
         return True

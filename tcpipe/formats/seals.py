@@ -73,9 +73,7 @@ def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lamb
 
     Raises
     ------
-    StoreError
-        It cannot be read, or is not as it was written.
-
+    StoreError : it cannot be read, or is not as it was written.
     """
     return proved(read_document(path), path, ours=ours)
 

@@ -76,9 +76,7 @@ class ShardedArray:
 
         Raises
         ------
-        StoreError
-            Its shard is gone or damaged.
-
+        StoreError : its shard is gone or damaged.
         """
         shard, place = self._shard_and_place(index)
         out = np.empty(self.chunk_shape, self.dtype) if out is None else out
@@ -149,11 +147,8 @@ class ShardedArray:
 
         Parameters
         ----------
-        values
-            At most ``shard_shape``.
-        threads
-            Chunks that are encoded side by side; the bytes do not depend on it.
-
+        values : at most ``shard_shape``.
+        threads : chunks that are encoded side by side; the bytes do not depend on it.
         """
         values = np.asarray(values, self.dtype)
         places = list(product(*(range(-(-n // c)) for n, c in zip(values.shape, self.chunk_shape, strict=True))))

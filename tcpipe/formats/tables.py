@@ -51,13 +51,7 @@ def column_names(path: Path) -> list[str]:
 
 
 def read_cells(path: Path, *, stamp: str, columns: list[str]) -> Cells:
-    """Read a column of stamps and columns of numbers; every other column is passed over.
-
-    Raises
-    ------
-    LogError
-        The file cannot be read as a table.
-    """
+    """Read a column of stamps and columns of numbers; every other column is passed over. `LogError`: the file cannot be read as a table."""
     wanted = list(dict.fromkeys(columns))
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

@@ -21,14 +21,7 @@ def write_arrays(path: Path, arrays: Mapping[str, NDArray[np.generic]]) -> None:
 
 
 def read_arrays(path: Path) -> dict[str, NDArray[np.generic]]:
-    """Return what `write_arrays` wrote.
-
-    Raises
-    ------
-    ModelError
-        The file is cut short, damaged, or none of its kind.
-
-    """
+    """Return what `write_arrays` wrote. `ModelError`: the file is cut short, damaged, or none of its kind."""
     if path.is_file() and not zipfile.is_zipfile(path):
         raise ModelError(f"{path}: cut short or damaged (no end of an archive in it)")
     try:

@@ -48,20 +48,13 @@ def add_array(
 
     Parameters
     ----------
-    group, name
-        Where it goes.
-    shape, dtype
-        Its extent and type.
-    chunks, shards
-        Elements per chunk, and per shard (a multiple of the chunks; None: one file a chunk).
-    dimensions
-        A name for each dimension, as xarray wants.
-    fill_value
-        What unwritten elements read as.
-    attributes
-        CF and other attributes.
-    compression, level
-        What its chunks are encoded with.
+    group, name : where it goes.
+    shape, dtype : its extent and type.
+    chunks, shards : elements per chunk, and per shard (a multiple of the chunks; None: one file a chunk).
+    dimensions : a name for each dimension, as xarray wants.
+    fill_value : what unwritten elements read as.
+    attributes : CF and other attributes.
+    compression, level : what its chunks are encoded with.
     """
     width = np.dtype(dtype).itemsize
     shuffle: Literal["bitshuffle", "noshuffle"] = "bitshuffle" if width > 1 else "noshuffle"
@@ -93,13 +86,7 @@ def consolidate(group: zarr.Group) -> None:
 
 
 def open_group(path: Path) -> zarr.Group:
-    """Open a group for reading.
-
-    Raises
-    ------
-    StoreError
-        There is none, or its description is damaged.
-    """
+    """Open a group for reading. `StoreError`: there is none, or its description is damaged."""
     if not path.is_dir():
         raise StoreError(f"{path}: there is no Zarr directory")
     try:

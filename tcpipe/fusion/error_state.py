@@ -65,8 +65,7 @@ def run_error_state(
 
     Raises
     ------
-    FusionError
-        The estimate is not finite.
+    FusionError : the estimate is not finite.
     """
     if measurements.imu is None and output_ns.size:
         initial = _levelled(measurements, initial, output_ns, gate_probability)

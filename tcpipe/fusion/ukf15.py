@@ -114,16 +114,11 @@ def run_ukf15(
 
     Parameters
     ----------
-    measurements
-        One stretch of a run.
-    initial
-        Where it starts, at its first measurement.
-    output_ns
-        Wanted stamps [ns], shape (K,), increasing.
-    gate_probability
-        A measurement less likely than this is refused (chi-square on its normalised innovation squared).
-    engine
-        ``compiled`` or ``filterpy``.
+    measurements : one stretch of a run.
+    initial : where it starts, at its first measurement.
+    output_ns : wanted stamps [ns], shape (K,), increasing.
+    gate_probability : a measurement less likely than this is refused (chi-square on its normalised innovation squared).
+    engine : ``compiled`` or ``filterpy``.
 
     Returns
     -------
@@ -169,20 +164,13 @@ def filter_forward(
 
     Parameters
     ----------
-    sources
-        What is measured. Of measurements with one stamp, the earlier source comes first.
-    gates
-        Per source, the largest normalised innovation squared that is fused.
-    x, P
-        State, shape (15,), and covariance, shape (15, 15), at ``start_ns``.
-    q
-        Variance that each state gains in a second, shape (15,).
-    start_ns
-        Stamp of the belief [ns]; nothing may be older.
-    output_ns
-        Wanted stamps [ns], shape (K,), increasing.
-    engine
-        ``compiled`` or ``filterpy``.
+    sources : what is measured. Of measurements with one stamp, the earlier source comes first.
+    gates : per source, the largest normalised innovation squared that is fused.
+    x, P : state, shape (15,), and covariance, shape (15, 15), at ``start_ns``.
+    q : variance that each state gains in a second, shape (15,).
+    start_ns : stamp of the belief [ns]; nothing may be older.
+    output_ns : wanted stamps [ns], shape (K,), increasing.
+    engine : ``compiled`` or ``filterpy``.
 
     Returns
     -------
@@ -228,10 +216,8 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
 
     Parameters
     ----------
-    measurements, initial
-        See `run_ukf15`.
-    end_ns
-        The constraints go on until here [ns].
+    measurements, initial : see `run_ukf15`.
+    end_ns : the constraints go on until here [ns].
 
     Returns
     -------

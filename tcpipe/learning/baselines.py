@@ -49,13 +49,9 @@ def compared(
 
     Parameters
     ----------
-    ours, data
-        The model, and the dataset whose training samples the baselines are fitted on.
-    sets, said
-        What was measured, and what the model says of it, by split.
-    seed
-        Of the bootstrap.
-
+    ours, data : the model, and the dataset whose training samples the baselines are fitted on.
+    sets, said : what was measured, and what the model says of it, by split.
+    seed : of the bootstrap.
     """
     kind = ours.card.training.config.model
     own = {"table": TREES, "physics": PHYSICS}.get(kind)

@@ -42,14 +42,7 @@ def write_checkpoint(
 
 
 def read_checkpoint(path: Path, key: str) -> tuple[TrainingProgress, dict[str, Arrays]]:
-    """Return what `write_checkpoint` wrote.
-
-    Raises
-    ------
-    ModelError
-        It is cut short, or of another dataset or other options.
-
-    """
+    """Return what `write_checkpoint` wrote. `ModelError`: it is cut short, or of another dataset or other options."""
     try:
         arrays = read_arrays(path)
         progress = _progress(json.loads(arrays.pop(_STATE).tobytes()))

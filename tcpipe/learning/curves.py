@@ -70,13 +70,9 @@ def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], label
 
     Parameters
     ----------
-    form
-        ``mean``: one number; ``linear``: straight in each third of the slopes; ``spline``: natural cubic.
-    slope_rad, class_id
-        Of the samples, finite, shape (N,), N at least 1.
-    labels
-        Finite, shape (N, outputs).
-
+    form : ``mean``: one number; ``linear``: straight in each third of the slopes; ``spline``: natural cubic.
+    slope_rad, class_id : of the samples, finite, shape (N,), N at least 1.
+    labels : finite, shape (N, outputs).
     """
     knots = np.unique(np.quantile(slope_rad, _KNOTS[form])) if _KNOTS[form] else np.empty(0)
     made = _functions(form, knots, slope_rad)

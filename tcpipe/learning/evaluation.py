@@ -89,7 +89,6 @@ def evaluate(
     ------
     ModelError, DatasetError
         The model is none or does not fit the dataset, or there is nothing to evaluate on.
-
     """
     ours = load_model(model)
     data = open_dataset(dataset, label=ours.label_energy)

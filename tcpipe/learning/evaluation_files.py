@@ -73,11 +73,8 @@ def run_evaluation(
 
     Raises
     ------
-    UsageError
-        ``out`` holds something else.
-    ModelError, DatasetError
-        As `evaluate`.
-
+    UsageError : ``out`` holds something else.
+    ModelError, DatasetError : as `evaluate`.
     """
     rules = config or EvaluateConfig()
     key = _key(model, dataset, rules, simulated=plant is not None)

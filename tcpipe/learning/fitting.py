@@ -123,15 +123,10 @@ def fit(task: Task, config: FitConfig, *, name: str, key: str, checkpoint: Path)
 
     Parameters
     ----------
-    task, config
-        What and how.
-    name
-        For the lines about progress.
-    key
-        Of dataset and options, kept in the checkpoint.
-    checkpoint
-        Written before the first epoch and after every one, or every so many short ones, and gone on from where it is.
-
+    task, config : what and how.
+    name : for the lines about progress.
+    key : of dataset and options, kept in the checkpoint.
+    checkpoint : written before the first epoch and after every one, or every so many short ones, and gone on from where it is.
     """
     scale = label_scale(task)
     factors = loss_factors(config.loss, scale)

@@ -141,15 +141,10 @@ def errors_by_class(
 
     Parameters
     ----------
-    predicted, measured
-        The same quantities, each of shape (N,).
-    class_ids
-        Terrain class of each sample, shape (N,).
-    names
-        Of the ids that occur.
-    spreads
-        What is stated of the predictions' errors, by quantity.
-
+    predicted, measured : the same quantities, each of shape (N,).
+    class_ids : terrain class of each sample, shape (N,).
+    names : of the ids that occur.
+    spreads : what is stated of the predictions' errors, by quantity.
     """
     found = {}
     for quantity in predicted:

@@ -225,14 +225,11 @@ def load_model(path: str | Path) -> Model:
 
     Parameters
     ----------
-    path
-        Its folder, or the URL of one in a bucket.
+    path : its folder, or the URL of one in a bucket.
 
     Raises
     ------
-    ModelError
-        There is no model, its training has not finished, a file is damaged or cut short, or it is of another schema.
-
+    ModelError : there is no model, its training has not finished, a file is damaged or cut short, or it is of another schema.
     """
     place = here(path)
     card = read_model_card(place)

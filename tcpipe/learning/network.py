@@ -124,13 +124,9 @@ def resnet18(shape: Architecture, *, seed: int, start: Sequence[float]) -> ResNe
 
     Parameters
     ----------
-    shape
-        Sizes.
-    seed
-        Of the weights.
-    start
-        What it predicts on average before training: the head's biases.
-
+    shape : sizes.
+    seed : of the weights.
+    start : what it predicts on average before training: the head's biases.
     """
     network, drawn = ResNet18(shape), torch.Generator().manual_seed(seed)
     for layer in network.modules():

@@ -33,15 +33,10 @@ def patch_features(patches: Patches, *, channels: Sequence[str], class_count: in
 
     Parameters
     ----------
-    patches
-        Values in [0, 1]; travel is along the columns.
-    channels
-        What the last axis holds.
-    class_count
-        Largest class id of the table that the terrain channel is scaled by.
-    patch_m
-        Side of a patch [m].
-
+    patches : values in [0, 1]; travel is along the columns.
+    channels : what the last axis holds.
+    class_count : largest class id of the table that the terrain channel is scaled by.
+    patch_m : side of a patch [m].
     """
     parts: list[NDArray[np.floating]] = []
     for at, channel in enumerate(channels):

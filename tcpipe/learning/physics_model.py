@@ -74,18 +74,13 @@ def fit_physics_model(beside: Beside, labels: Floats, *, standing_watt: float | 
 
     Parameters
     ----------
-    beside
-        Of N samples; without any turn it has no term for turning.
-    labels
-        Power [W] and velocity [m/s], finite, shape (N, 2).
-    standing_watt
-        What the robot was seen to draw while it stood; None where it was not.
+    beside : of N samples; without any turn it has no term for turning.
+    labels : power [W] and velocity [m/s], finite, shape (N, 2).
+    standing_watt : what the robot was seen to draw while it stood; None where it was not.
 
     Raises
     ------
-    ModelError
-        There are fewer than 20 samples.
-
+    ModelError : there are fewer than 20 samples.
     """
     names = np.where(beside.class_id > 0, beside.class_id.astype(np.str_), ALL)
     power, velocity = labels.T

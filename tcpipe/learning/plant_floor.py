@@ -27,11 +27,8 @@ def plant_costs(world: World, robot: SimulatedRobot, split: Split) -> dict[str, 
 
     Parameters
     ----------
-    world, robot
-        What was simulated.
-    split
-        Samples, by the ends of their chords and their turn.
-
+    world, robot : what was simulated.
+    split : samples, by the ends of their chords and their turn.
     """
     ends = [split.column(f"{end}_{axis}_deg").astype(np.float64) for end in ("start", "end") for axis in ("lon", "lat")]
     x0, y0 = world.site.map_xy_m(ends[0], ends[1])

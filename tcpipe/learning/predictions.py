@@ -49,11 +49,8 @@ def measured(split: Split, names: Mapping[int, str]) -> Measured:
 
     Parameters
     ----------
-    split
-        Of a dataset.
-    names
-        Of its classes, by id.
-
+    split : of a dataset.
+    names : of its classes, by id.
     """
     of = split.energy
     with_label = np.isfinite(split.labels).all(axis=1) & np.isfinite(split.column(of.energy).astype(np.float64))
@@ -87,13 +84,9 @@ def predicted_costs(
 
     Parameters
     ----------
-    model, split
-        Of the same channels.
-    noise
-        Channels that are replaced by noise, uniform in [0, 1], each pixel on its own (section V-C).
-    seed
-        Of that noise.
-
+    model, split : of the same channels.
+    noise : channels that are replaced by noise, uniform in [0, 1], each pixel on its own (section V-C).
+    seed : of that noise.
     """
     chosen = split.with_channels(*model.channels)
     rng = np.random.default_rng(list(seed))

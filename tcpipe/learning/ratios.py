@@ -48,7 +48,6 @@ def ratio_of_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *
         Of each sample, shape (N,): its run, or its block of ground.
     power, seed
         Of the ratio; of the draws.
-
     """
     _, at = np.unique(groups, return_inverse=True)
     sums = np.stack([np.bincount(at, losses) for losses in (ours, theirs)], axis=1)

@@ -150,7 +150,6 @@ def reproduce(
     ------
     UsageError
         ``directory`` holds something else.
-
     """
     place, plan = Path(directory), QUICK if quick else FULL
     plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))

@@ -39,22 +39,15 @@ def fit_at_once(task: Task, config: FitConfig, *, name: str, key: str, patch_m: 
 
     Parameters
     ----------
-    task, config
-        What, and how labels are weighed.
-    name
-        For the line about progress.
-    key
-        Of dataset and options.
-    patch_m
-        Side of a patch [m].
-    class_count
-        Largest class id of the dataset's table.
+    task, config : what, and how labels are weighed.
+    name : for the line about progress.
+    key : of dataset and options.
+    patch_m : side of a patch [m].
+    class_count : largest class id of the dataset's table.
 
     Raises
     ------
-    ModelError
-        LightGBM is not installed, or there are too few samples.
-
+    ModelError : LightGBM is not installed, or there are too few samples.
     """
     split, scale, began = task.train, label_scale(task), time.perf_counter()
     labels = labels_of(split, task.outputs).astype(np.float64)

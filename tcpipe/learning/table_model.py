@@ -59,20 +59,14 @@ def fit_table(
 
     Parameters
     ----------
-    features
-        Finite, shape (N, features): those of the channels, then any others.
-    labels, weights
-        Shape (N, outputs).
-    folds
-        Of each sample, shape (N,); at least two.
-    channels, class_count
-        What the features are of.
+    features : finite, shape (N, features): those of the channels, then any others.
+    labels, weights : shape (N, outputs).
+    folds : of each sample, shape (N,); at least two.
+    channels, class_count : what the features are of.
 
     Raises
     ------
-    ModelError
-        LightGBM is not installed, or cannot be loaded.
-
+    ModelError : LightGBM is not installed, or cannot be loaded.
     """
     slope_rad, class_id = slope_and_class(features, channels, class_count)
     told = np.empty_like(labels)

@@ -141,7 +141,6 @@ def train(
     ------
     DatasetError, ModelError
         The dataset has nothing to train on or to weigh by, ``out`` is something else, or the state is cut short or of another training.
-
     """
     rules, other = config or FitConfig(), variant or Variant()
     data = open_dataset(dataset, label=rules.label)
@@ -215,9 +214,7 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
 
     Raises
     ------
-    DatasetError
-        There is nothing to train on, or the fold is empty.
-
+    DatasetError : there is nothing to train on, or the fold is empty.
     """
     train = data["train"]
     outputs = (train.energy.energy,) if variant.energy_only else train.label_columns

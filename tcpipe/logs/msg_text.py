@@ -67,15 +67,12 @@ def parse_msg(text: str, type_name: str) -> dict[str, FieldTypes]:
 
     Parameters
     ----------
-    text
-        The definition.
-    type_name
-        Name of the first message in it, ``package/msg/Name``.
+    text : the definition.
+    type_name : name of the first message in it, ``package/msg/Name``.
 
     Raises
     ------
-    MsgTextError
-        A line cannot be read.
+    MsgTextError : a line cannot be read.
     """
     pieces = _SECTION.split(text.replace("\r\n", "\n") + "\n")
     names = [type_name, *map(normalized_type_name, pieces[1::2])]

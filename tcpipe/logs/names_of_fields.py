@@ -63,10 +63,8 @@ def proposed_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterato
 
     Parameters
     ----------
-    topics
-        The log's topics; what a definition in the log does not tell cannot be proposed.
-    settled
-        Roles that are played, or that the recipe speaks of.
+    topics : the log's topics; what a definition in the log does not tell cannot be proposed.
+    settled : roles that are played, or that the recipe speaks of.
     """
     held = [of for of in topics if of.message_count != 0 and of.problem is None and not of.name.startswith(OVERLAY)]
     types = {topic.type_name for topic in held}

@@ -71,19 +71,14 @@ def walk(message: Record, data: NDArray[np.uint8], starts: Int64Array, ends: Int
 
     Parameters
     ----------
-    message
-        The definition.
-    data
-        Bytes that hold all messages. In CDR the byte behind each message's header lies at a multiple of 8.
-    starts, ends
-        Where each message begins and ends, shape (N,), rising.
-    dialect
-        How they are serialised.
+    message : the definition.
+    data : bytes that hold all messages. In CDR the byte behind each message's header lies at a multiple of 8.
+    starts, ends : where each message begins and ends, shape (N,), rising.
+    dialect : how they are serialised.
 
     Raises
     ------
-    RaggedError
-        The messages are so unlike that they are cheaper to read one by one.
+    RaggedError : the messages are so unlike that they are cheaper to read one by one.
     """
     fits = np.ones(len(starts), np.bool_)
     while fits.any():

@@ -67,10 +67,8 @@ def dialect_of(payload: bytes, encoding: str) -> Dialect:
 
     Parameters
     ----------
-    payload
-        The serialised message, or its beginning.
-    encoding
-        ``cdr`` or ``ros1``.
+    payload : the serialised message, or its beginning.
+    encoding : ``cdr`` or ``ros1``.
     """
     if encoding == "ros1":
         return ROS1
@@ -149,19 +147,14 @@ def layout_of(message: Record, payload: bytes, *, encoding: str) -> Layout:
 
     Parameters
     ----------
-    message
-        The definition.
-    payload
-        The serialised example.
-    encoding
-        ``cdr`` or ``ros1``.
+    message : the definition.
+    payload : the serialised example.
+    encoding : ``cdr`` or ``ros1``.
 
     Raises
     ------
-    LayoutError
-        The payload does not fit the definition.
-    RaggedError
-        The payload is too irregular to be worth a layout.
+    LayoutError : the payload does not fit the definition.
+    RaggedError : the payload is too irregular to be worth a layout.
     """
     walk = _Walk(payload, encoding)
     root = walk.record(message)

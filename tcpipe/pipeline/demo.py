@@ -54,11 +54,8 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
 
     Raises
     ------
-    UsageError
-        When the directory holds something else.
-    DatasetError
-        When a step fails (which would be a bug).
-
+    UsageError : when the directory holds something else.
+    DatasetError : when a step fails (which would be a bug).
     """
     site_path, store_path, dataset_path = directory / "site", directory / "store", directory / "dataset"
     clear(directory)

@@ -64,7 +64,6 @@ def diff(a: str | Path, b: str | Path) -> Difference:
     ----------
     a, b
         Their directories or URLs, the older one first.
-
     """
     first, second = here(a), here(b)
     cards = read_card(first), read_card(second)

@@ -193,7 +193,6 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
     ------
     DatasetError, StoreError
         There is no such dataset, sample or store, the dataset is of another data model, or the store no longer holds the sample's run.
-
     """
     opened = open_store(store)
     directory, fetched = here_by_range(dataset, by_range=is_shard)

@@ -115,7 +115,6 @@ def export(
     LogError
         The log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log
         or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
-
     """
     _refuse_what_is_ours(out)
     clear(out)

@@ -129,7 +129,6 @@ def ingest(
     ------
     LogError, StoreError, RecipeError, UsageError
         When nothing can be begun; what goes wrong with one log or path stands in its result.
-
     """
     watch = started()
     ruling = recipe_of(recipe)

@@ -124,7 +124,6 @@ def inspect(
     ------
     LogError, MapError, DatasetError, StoreError
         When it is none of these, or cannot be read.
-
     """
     ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):

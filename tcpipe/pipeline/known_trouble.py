@@ -89,7 +89,6 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
         There is no store.
     UsageError
         A name is none of a run or log with known trouble, or of several logs; nothing was accepted then.
-
     """
     opened = open_store(store)
     known = known_trouble(opened, [run.facts for run in opened.runs()])

@@ -53,11 +53,8 @@ def export_layers(source: Path | str, out: Path) -> ExportedLayers:
 
     Raises
     ------
-    UsageError
-        ``source`` is none of these, ``out`` is there and something else, or the extra ``gis`` is not installed.
-    DatasetError, StoreError
-        It cannot be read.
-
+    UsageError : ``source`` is none of these, ``out`` is there and something else, or the extra ``gis`` is not installed.
+    DatasetError, StoreError : it cannot be read.
     """
     stored = is_store(source) or inside_store(source) is not None
     if stored:

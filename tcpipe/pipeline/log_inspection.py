@@ -87,8 +87,7 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
 
     Parameters
     ----------
-    full
-        Read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
+    full : read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
     """
     known = profiles_of(recipe)
     cast = roles_by(recipe.read_of(log.topics), log.topics.values(), robot, known=known)

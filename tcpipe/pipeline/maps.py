@@ -95,7 +95,6 @@ def add_map(
     ------
     MapError, StoreError
         When a raster cannot be placed, the classes are not the store's, or the store cannot be written: the store is as it was.
-
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, "classes": classes}
     layers, categorical = layers or {}, categorical or {}

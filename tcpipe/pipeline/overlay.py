@@ -80,7 +80,6 @@ def overlay(path: Path | str, out: Path) -> Overlay:
         The path is no run, or one under several recipes, or ``out`` is there and no overlay: a recording is never replaced.
     StoreError
         A file of the run is not as it was written, or its streams, which know the recorder's clock, were made otherwise or are gone.
-
     """
     found = run_at(path)
     if found is None:

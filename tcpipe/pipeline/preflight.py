@@ -169,7 +169,6 @@ def preflight(
     ------
     LogError, RecipeError
         It is no log, or cannot be read at all.
-
     """
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)

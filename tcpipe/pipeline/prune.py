@@ -90,7 +90,6 @@ def prune(
     ------
     StoreError, UsageError, RecipeError
         There is no store, or something cannot be removed; what went before is gone.
-
     """
     ruling = recipe_of(recipe)
     opened = open_store(store)

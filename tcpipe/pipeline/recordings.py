@@ -71,11 +71,8 @@ def each_drive_once(runs: Sequence[RunDirectory], sha256_by_run: Mapping[str, st
 
     Parameters
     ----------
-    runs
-        Runs to choose from, all of one recipe.
-    sha256_by_run
-        Hash of each run's log.
-
+    runs : runs to choose from, all of one recipe.
+    sha256_by_run : hash of each run's log.
     """
     runs = sorted(runs, key=lambda run: (run.run_id, run.recipe_id))
     spans, kept = _spans(runs), dict[int, RunDirectory]()

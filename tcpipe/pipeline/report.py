@@ -56,7 +56,6 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
         When the path is none of these.
     StoreError
         Something cannot be read; of a store all other pages are written.
-
     """
     inside = is_store(path) or inside_store(path) is not None
     if not inside and (is_url(path) or (Path(path) / CARD).is_file()):

@@ -18,8 +18,7 @@ def alike(sensors: Mapping[str, Mapping[str, Sensor | KnownSensor]]) -> list[tup
 
     Parameters
     ----------
-    sensors
-        By run and role, what its run.json says of the sensor.
+    sensors : by run and role, what its run.json says of the sensor.
     """
     groups: list[tuple[list[str], Seen]] = []
     seen = {run_id: _seen(of) for run_id, of in sensors.items()}

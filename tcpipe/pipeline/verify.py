@@ -57,7 +57,6 @@ def verify(path: Path | str) -> Verified:
     ------
     UsageError
         When the path is none of these.
-
     """
     stored = _stored(str(path)) if is_url(path) else None
     if is_url(path) and stored is None:

@@ -47,14 +47,10 @@ def could_be_better(
 
     Parameters
     ----------
-    steps
-        Every step that may be possible; those with a cost are known.
-    class_id
-        Of each cell, shape (rows, cols).
-    found
-        The best path over known steps, None if there is none.
-    start, goal
-        Flat indices of cells.
+    steps : every step that may be possible; those with a cost are known.
+    class_id : of each cell, shape (rows, cols).
+    found : the best path over known steps, None if there is none.
+    start, goal : flat indices of cells.
     """
     known = np.isfinite(steps.cost)
     sure = Steps(steps.begin[known], steps.end[known], steps.cost[known], steps.length_m[known], steps.rise_m[known])

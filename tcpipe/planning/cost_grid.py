@@ -35,13 +35,7 @@ BARRED = NO_COST | Reason.OBSTACLE
 
 
 def grid_over(source: MapReader, step_m: float) -> MapGrid:
-    """Return the grid of cells: from the map's north-west corner, as many as fit whole.
-
-    Raises
-    ------
-    MapError
-        The map is smaller than a cell.
-    """
+    """Return the grid of cells: from the map's north-west corner, as many as fit whole. `MapError`: the map is smaller than a cell."""
     grid = source.grid
     cells = [int(size * grid.pitch_m / step_m + 1e-6) for size in (grid.rows, grid.cols)]
     if min(cells) < 1:
@@ -112,10 +106,8 @@ def blocks(
 
     Parameters
     ----------
-    source, model, grid
-        The map, whose patches are sampled from it, and the cells.
-    wanted
-        Which cells, shape (rows, cols); None: all.
+    source, model, grid : the map, whose patches are sampled from it, and the cells.
+    wanted : which cells, shape (rows, cols); None: all.
     """
     level = level_for(source, model.patch_m / model.patch_px)
     side_m = level.tile_px * level.grid.pitch_m

@@ -176,7 +176,6 @@ def make_cost_map(
         The map cannot give what the model wants, is smaller than a cell, or cannot be read.
     UsageError, StoreError
         ``out`` is something else, or cannot be written; the origin is far from the map.
-
     """
     check_model(model, source)
     if is_url(out):

@@ -146,8 +146,7 @@ def predict_patches(
 
     Raises
     ------
-    ModelError
-        It gives something else than power and velocity.
+    ModelError : it gives something else than power and velocity.
     """
     form = _form(model)
     pixels = {layer: patches.pixels[layer] for layer in form.layers}

@@ -72,9 +72,7 @@ def evaluate_drives(
 
     Raises
     ------
-    ModelError, MapError, UsageError
-        As `drives.drive_cost`; ``out`` is a file.
-
+    ModelError, MapError, UsageError : as `drives.drive_cost`; ``out`` is a file.
     """
     if is_url(out):
         with published(str(out), JSON) as made:

@@ -118,22 +118,15 @@ def drive_cost(model: CostModel, source: MapReader, run: RunDirectory, data: Dat
 
     Parameters
     ----------
-    model, source
-        Who predicts, and the map.
-    run
-        The drive, ingested.
-    data
-        The dataset that the model was trained on: what of the drive it has seen.
-    log
-        What the user calls it.
+    model, source : who predicts, and the map.
+    run : the drive, ingested.
+    data : the dataset that the model was trained on: what of the drive it has seen.
+    log : what the user calls it.
 
     Raises
     ------
-    ModelError, MapError
-        The model is of another robot or dataset, or the map cannot give what it wants.
-    UsageError
-        The drive has no segments.
-
+    ModelError, MapError : the model is of another robot or dataset, or the map cannot give what it wants.
+    UsageError : the drive has no segments.
     """
     check_model(model, source)
     segments = run.segments()

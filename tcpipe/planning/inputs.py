@@ -14,11 +14,8 @@ def chosen_map(store: str | Path, name: str | None) -> MapFile:
 
     Raises
     ------
-    StoreError, MapError
-        There is no store, no such map, or it cannot be read.
-    UsageError
-        There are several, and none is named.
-
+    StoreError, MapError : there is no store, no such map, or it cannot be read.
+    UsageError : there are several, and none is named.
     """
     opened = open_store(store)
     maps = opened.maps()

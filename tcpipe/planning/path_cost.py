@@ -85,7 +85,6 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
         The map cannot give what the model wants, or cannot be read.
     PathError
         The path is shorter than a piece, or nowhere on the map.
-
     """
     check_model(model, source)
     pieces = pieces_of(source, lonlat_deg, chord_m=model.chord_m, where=where)

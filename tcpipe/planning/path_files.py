@@ -112,7 +112,6 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
         The path, the model or the map cannot be used.
     UsageError, StoreError
         ``out`` ends in no known format, or cannot be written.
-
     """
     if out is not None:
         check_ending(out)

@@ -108,7 +108,6 @@ def plan_path(
     ------
     PathError
         Start or goal is off the map, cannot be stood on, or there is no way between them.
-
     """
     ends_xy_m = projection_of(survey.source).forward(np.stack([start_deg, goal_deg]))
     search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_unseen, step)

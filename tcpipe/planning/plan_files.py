@@ -114,11 +114,8 @@ def plan(
 
     Raises
     ------
-    PathError, ModelError, MapError
-        An end, the model, the map or the cost map cannot be used, or there is no way.
-    UsageError, StoreError
-        An output has a wrong name, or cannot be written.
-
+    PathError, ModelError, MapError : an end, the model, the map or the cost map cannot be used, or there is no way.
+    UsageError, StoreError : an output has a wrong name, or cannot be written.
     """
     _check_names(out, picture)
     clear_beside(out)

@@ -68,12 +68,9 @@ def reasons_of(patches: Patches, on_map: NDArray[np.bool_], model: CostModel, so
 
     Parameters
     ----------
-    patches
-        N sampled patches.
-    on_map
-        Whether each lies wholly on the map, shape (N,).
-    model, source
-        Who is to judge them, and the map that they are from.
+    patches : N sampled patches.
+    on_map : whether each lies wholly on the map, shape (N,).
+    model, source : who is to judge them, and the map that they are from.
     """
     bits = np.zeros(on_map.size, np.uint16)
     bits[patches.valid_fraction < 1.0] |= np.uint16(Reason.NODATA)

@@ -67,12 +67,9 @@ def steps_of(costs: CostGrid, objective: str, open_: NDArray[np.bool_], metres: 
 
     Parameters
     ----------
-    costs, objective
-        What a metre costs.
-    open_
-        Where a course may be driven, shape (16, rows, cols): cells a step only touches at a corner must be open, too.
-    metres
-        Ground metres a map metre along each course, shape (16,).
+    costs, objective : what a metre costs.
+    open_ : where a course may be driven, shape (16, rows, cols): cells a step only touches at a corner must be open, too.
+    metres : ground metres a map metre along each course, shape (16,).
     """
     rows, cols = costs.grid.rows, costs.grid.cols
     per_metre = costs.per_metre(objective)

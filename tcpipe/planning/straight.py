@@ -29,14 +29,10 @@ def straightened(
 
     Parameters
     ----------
-    costs, objective
-        What a metre costs.
-    open_
-        Where a course may be driven, shape (16, rows, cols).
-    metres
-        Ground metres a map metre along each course, shape (16,).
-    points_px
-        The path's points [cells], centres are integers, shape (P, 2).
+    costs, objective : what a metre costs.
+    open_ : where a course may be driven, shape (16, rows, cols).
+    metres : ground metres a map metre along each course, shape (16,).
+    points_px : the path's points [cells], centres are integers, shape (P, 2).
     """
     per_metre = costs.per_metre(objective).astype(np.float32, copy=False)
     angles, scale = np.radians(ANGLES_DEG), metres * costs.grid.pitch_m

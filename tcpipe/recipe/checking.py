@@ -31,15 +31,12 @@ def settle(made: Any, section: str) -> None:
 
     Parameters
     ----------
-    made
-        A frozen dataclass.
-    section
-        What its keys are called before the dot; "" where they have none.
+    made : a frozen dataclass.
+    section : what its keys are called before the dot; "" where they have none.
 
     Raises
     ------
-    RecipeError
-        One line for every wrong value.
+    RecipeError : one line for every wrong value.
     """
     problems: list[str] = []
     for name, kind in kinds_of(type(made)).items():
@@ -53,8 +50,7 @@ def from_values(cls: type[T], values: Mapping[str, Any], *, where: str) -> T:
 
     Raises
     ------
-    RecipeError
-        One line for every wrong or unknown key, beginning with ``where``.
+    RecipeError : one line for every wrong or unknown key, beginning with ``where``.
     """
     problems: list[str] = []
     made: T = _dataclass(cls, values, "", problems)

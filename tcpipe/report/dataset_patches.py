@@ -110,9 +110,7 @@ def all_patches(directory: Path, card: DatasetCard) -> Iterator[tuple[str, bytes
 
     Raises
     ------
-    DatasetError
-        They cannot be read.
-
+    DatasetError : they cannot be read.
     """
     samples = read_samples(directory, ("split", "terrain_name", "slope_rad"))
     every = _patches(directory, card, samples)

@@ -86,7 +86,6 @@ def assign_splits(
         excludes now.
     tagged
         With the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
-
     """
     n = len(ranks)
     sides = np.zeros(n, np.uint8) if regions is None else sides_of(corners_xy_m, regions, buffer_m=buffer_m)

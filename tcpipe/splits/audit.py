@@ -46,19 +46,14 @@ def audit_leakage(
 
     Parameters
     ----------
-    split, run
-        Split of each sample, and the number of its run, shape (N,).
-    start_ns
-        Start of each sample's segment [ns], shape (N,).
-    corners_xy_m
-        Corners of the footprints [m], shape (N, 4, 2).
-    chord_m
-        Segment length: samples follow one another if their centres are at most 1.5 chords apart [m].
+    split, run : split of each sample, and the number of its run, shape (N,).
+    start_ns : start of each sample's segment [ns], shape (N,).
+    corners_xy_m : corners of the footprints [m], shape (N, 4, 2).
+    chord_m : segment length: samples follow one another if their centres are at most 1.5 chords apart [m].
 
     Returns
     -------
     One entry for ``test`` and one for ``unseen``.
-
     """
     follows = _consecutive(run, start_ns, corners_xy_m.mean(axis=1), chord_m=chord_m)
     return tuple(_audit(name, split, run, follows, corners_xy_m) for name in ("test", "unseen"))

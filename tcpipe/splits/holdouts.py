@@ -38,9 +38,7 @@ class Groups:
 
         Parameters
         ----------
-        values
-            A small number for each sample, or `UNDECIDED`, shape (N,).
-
+        values : a small number for each sample, or `UNDECIDED`, shape (N,).
         """
         kinds = int(values.max(initial=UNDECIDED)) + 1
         if kinds == 0:
@@ -66,19 +64,14 @@ def draw_samples(ranks: NDArray[np.uint64], arrival: Ints, *, test_fraction: flo
 
     Parameters
     ----------
-    ranks
-        Rank of each sample, shape (N,).
-    arrival
-        When each came: the number of its run in the order of recording, shape (N,).
-    test_fraction
-        Wanted share.
-    kept
-        1 for samples that test whatever their rank, 0 for those that do not, `UNDECIDED` for the others, shape (N,).
+    ranks : rank of each sample, shape (N,).
+    arrival : when each came: the number of its run in the order of recording, shape (N,).
+    test_fraction : wanted share.
+    kept : 1 for samples that test whatever their rank, 0 for those that do not, `UNDECIDED` for the others, shape (N,).
 
     Returns
     -------
     Whether each sample tests, shape (N,).
-
     """
     exact = Fraction(str(test_fraction))  # 0.2 * 35 is 7.000000000000001 in binary
     kept = np.full(len(ranks), UNDECIDED) if kept is None else kept
@@ -107,21 +100,15 @@ def draw_groups(
 
     Parameters
     ----------
-    groups
-        The samples' groups.
-    arrival
-        When each sample came: the number of its run in the order of recording, shape (N,).
-    test_fraction
-        Wanted share of the samples.
-    seed
-        The recipe's ``split.seed``.
-    kept
-        1 for groups that test, 0 for those that train, `UNDECIDED` for the others, shape (G,).
+    groups : the samples' groups.
+    arrival : when each sample came: the number of its run in the order of recording, shape (N,).
+    test_fraction : wanted share of the samples.
+    seed : the recipe's ``split.seed``.
+    kept : 1 for groups that test, 0 for those that train, `UNDECIDED` for the others, shape (G,).
 
     Returns
     -------
     Whether each group tests, shape (G,).
-
     """
     count = len(groups.names)
     kept = np.full(count, UNDECIDED) if kept is None else kept
@@ -150,17 +137,13 @@ def draw_folds(groups: Groups, arrival: Ints, *, folds: int, seed: int, kept: In
 
     Parameters
     ----------
-    groups, arrival, seed
-        As `draw_groups`.
-    folds
-        How many.
-    kept
-        Fold of groups that have one, `UNDECIDED` for the others, shape (G,).
+    groups, arrival, seed : as `draw_groups`.
+    folds : how many.
+    kept : fold of groups that have one, `UNDECIDED` for the others, shape (G,).
 
     Returns
     -------
     Fold of each group from 0 on, shape (G,).
-
     """
     fold = np.full(len(groups.names), UNDECIDED) if kept is None else kept.copy()
     order = ranked_order(groups.names, seed=seed, purpose="fold")

@@ -69,9 +69,7 @@ def nearest_m(ours: Floats, theirs: Floats) -> Floats:
 
     Parameters
     ----------
-    ours, theirs
-        Corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
-
+    ours, theirs : corners of squares of one size, shape (N, 4, 2) and (M, 4, 2).
     """
     if len(ours) == 0 or len(theirs) == 0:
         return np.empty(0)

@@ -16,17 +16,13 @@ def hash_ranks(names: Sequence[str], *, seed: int, purpose: str) -> Ranks:
 
     Parameters
     ----------
-    names
-        What is ranked: sample ids, run ids or block keys.
-    seed
-        The recipe's ``split.seed``.
-    purpose
-        Salt: ranks for two purposes are independent, so that the row order says nothing of the holdout.
+    names : what is ranked: sample ids, run ids or block keys.
+    seed : the recipe's ``split.seed``.
+    purpose : salt: ranks for two purposes are independent, so that the row order says nothing of the holdout.
 
     Returns
     -------
     Ranks, shape (N,): the first 8 bytes, big-endian, of blake2b over ``seed:name`` with ``purpose`` as person string.
-
     """
     person = purpose.encode()[:16]
     digests = b"".join(blake2b(f"{seed}:{name}".encode(), digest_size=8, person=person).digest() for name in names)

@@ -60,17 +60,13 @@ def project_regions(regions: Regions, project: Project, *, window_deg: tuple[flo
 
     Parameters
     ----------
-    regions
-        In WGS84 lon/lat [deg].
-    project
-        Takes lon and lat [deg], shape (N, 2), and returns x and y [m], shape (N, 2).
-    window_deg
-        West, south, east, north of what matters: regions are cut to it, since a projection is sound only near its zone.
+    regions : in WGS84 lon/lat [deg].
+    project : takes lon and lat [deg], shape (N, 2), and returns x and y [m], shape (N, 2).
+    window_deg : West, south, east, north of what matters: regions are cut to it, since a projection is sound only near its zone.
 
     Returns
     -------
     The regions in the plane of ``project`` [m], their edges followed as straight in lon/lat (RFC 7946).
-
     """
 
     def carry(geometry: BaseGeometry) -> BaseGeometry:
@@ -86,17 +82,13 @@ def sides_of(corners_xy_m: Floats, regions: Regions, *, buffer_m: float) -> NDAr
 
     Parameters
     ----------
-    corners_xy_m
-        Corners of the footprints in order around each square [m], shape (N, 4, 2).
-    regions
-        In the same plane [m].
-    buffer_m
-        A footprint nearer than this to any border goes to `Side.BUFFER` [m].
+    corners_xy_m : corners of the footprints in order around each square [m], shape (N, 4, 2).
+    regions : in the same plane [m].
+    buffer_m : a footprint nearer than this to any border goes to `Side.BUFFER` [m].
 
     Returns
     -------
     Sides, shape (N,).
-
     """
     usable, borders = (
         shapely.difference(regions.train_test, regions.exclude),

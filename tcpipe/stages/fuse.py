@@ -36,8 +36,7 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
 
     Raises
     ------
-    FusionError
-        Nothing tells motion, or the estimate breaks down.
+    FusionError : nothing tells motion, or the estimate breaks down.
     """
     # 1. A pose made elsewhere is what the fixes are.
     #    Streams become measurements: one frame, one set of units, usable variances; sensors that cannot be right are left out.

@@ -27,8 +27,7 @@ def placed_pose(
 
     Raises
     ------
-    RecipeError
-        `read.pose_crs` is no projected CRS.
+    RecipeError : `read.pose_crs` is no projected CRS.
     """
     if POSE not in streams:
         return dict(streams), config.gnss_crs, ()

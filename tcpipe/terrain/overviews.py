@@ -51,12 +51,9 @@ def coarser_levels(layer: Layer, values: Pixels, factors: Sequence[int]) -> Iter
 
     Parameters
     ----------
-    layer
-        What it is.
-    values
-        Pixels of the map, shape (R, C): floats with NaN, or bytes with 0, as no data.
-    factors
-        Powers of two, rising, as `overview_factors` gives them.
+    layer : what it is.
+    values : pixels of the map, shape (R, C): floats with NaN, or bytes with 0, as no data.
+    factors : powers of two, rising, as `overview_factors` gives them.
     """
     if layer.kind == "categorical":
         for factor in factors[1:]:

@@ -41,10 +41,8 @@ def patch_frames(start_xy_m: FloatArray, end_xy_m: FloatArray, chord_m: FloatArr
 
     Parameters
     ----------
-    start_xy_m, end_xy_m
-        End points in the map's CRS [m], shape (N, 2).
-    chord_m
-        The segments' lengths on the ground [m], shape (N,).
+    start_xy_m, end_xy_m : end points in the map's CRS [m], shape (N, 2).
+    chord_m : the segments' lengths on the ground [m], shape (N,).
     """
     along = (end_xy_m - start_xy_m) / chord_m[:, None]
     left = np.stack([-along[:, 1], along[:, 0]], axis=1)

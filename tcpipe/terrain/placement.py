@@ -90,8 +90,7 @@ def choose_crs(height: Footing, wanted: CRS | None) -> CRS:
 
     Raises
     ------
-    MapError
-        The wanted CRS is not metric over the raster, or the raster is too large for any.
+    MapError : the wanted CRS is not metric over the raster, or the raster is too large for any.
     """
     if wanted is None and is_metric(height.crs, np.vstack([height.outline(), height.centre()])):
         return height.crs

@@ -73,16 +73,11 @@ def sample_patches(
 
     Parameters
     ----------
-    source
-        The map.
-    frames
-        Where the patches lie, in the map's CRS.
-    chord_m
-        Length of each segment on the ground [m], shape (N,).
-    patch_m, patch_px
-        Side of a patch on the ground [m], and in pixels.
-    pool
-        Tiles of the level `level_for` the patches' pitch, to go on with from call to call; None holds them for this call alone.
+    source : the map.
+    frames : where the patches lie, in the map's CRS.
+    chord_m : length of each segment on the ground [m], shape (N,).
+    patch_m, patch_px : side of a patch on the ground [m], and in pixels.
+    pool : tiles of the level `level_for` the patches' pitch, to go on with from call to call; None holds them for this call alone.
     """
     level = level_for(source, patch_m / patch_px)
     pixels = map_px_from_patch(frames, level.grid, patch_m=patch_m, patch_px=patch_px)

@@ -196,8 +196,7 @@ class TopicTable:
 
         Parameters
         ----------
-        share
-            With less than 1, about so much of them, the earlier ones; the rest stays, for what comes later but belongs before it.
+        share : with less than 1, about so much of them, the earlier ones; the rest stays, for what comes later but belongs before it.
         """
         self._flush()
         self._decode_ragged()

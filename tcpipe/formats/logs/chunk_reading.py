@@ -305,14 +305,10 @@ def spans(entries: Entries, sizes: Int64Array, sound: NDArray[np.bool_], wanted:
 
     Parameters
     ----------
-    entries
-        The messages of those chunks whose index is sound.
-    sizes
-        The chunks' decompressed sizes, shape (M,) [byte].
-    sound
-        Which chunks have a sound index, shape (M,).
-    wanted
-        The channels to read.
+    entries : the messages of those chunks whose index is sound.
+    sizes : the chunks' decompressed sizes, shape (M,) [byte].
+    sound : which chunks have a sound index, shape (M,).
+    wanted : the channels to read.
     """
     entries = entries.at(np.isin(entries.channel, wanted))
     wanted_bytes = np.bincount(entries.chunk, entries.end - entries.offset, len(sizes))
@@ -354,12 +350,9 @@ def excerpt(
 
     Parameters
     ----------
-    span, entries
-        The span, and its messages.
-    load
-        Returns all records of a chunk by its number.
-    copy
-        Copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
+    span, entries : the span, and its messages.
+    load : returns all records of a chunk by its number.
+    copy : copies pieces (start, stop, place) of a chunk into a buffer. Both raise `DamageError` where the chunk is lost.
     """
     kept = layout(entries) if span.compact else None
     data = np.empty(kept.size if kept else 0, np.uint8).data

@@ -268,8 +268,7 @@ def load_only(window: mmap.mmap, starts: Int64Array, ends: Int64Array) -> None:
 
     Raises
     ------
-    DamageError
-        The disk does not give them, or the file has become shorter. Whoever looked at them would be ended by a signal (SIGBUS).
+    DamageError : the disk does not give them, or the file has become shorter. Whoever looked at them would be ended by a signal (SIGBUS).
     """
     window.madvise(mmap.MADV_RANDOM)
     if not len(starts):
@@ -340,10 +339,8 @@ class Bounds:
 
     Parameters
     ----------
-    path
-        The file.
-    size
-        Its size [byte].
+    path : the file.
+    size : its size [byte].
     """
 
     def __init__(self, path: Path, size: int) -> None:
@@ -393,19 +390,14 @@ def decompressed(codec: str, data: memoryview, size: int, *, checked: bool = Fal
 
     Parameters
     ----------
-    codec
-        ``lz4`` (frames), ``zstd`` or ``bz2``.
-    data
-        The compressed bytes.
-    size
-        How many bytes they hold.
-    checked
-        A checksum of the result is compared afterwards.
+    codec : ``lz4`` (frames), ``zstd`` or ``bz2``.
+    data : the compressed bytes.
+    size : how many bytes they hold.
+    checked : a checksum of the result is compared afterwards.
 
     Raises
     ------
-    DamageError
-        The bytes do not decompress, or not to ``size``.
+    DamageError : the bytes do not decompress, or not to ``size``.
     """
     if size > MAX_CHUNK_BYTES:
         raise DamageError(f"it claims to hold {size} bytes, more than {MAX_CHUNK_BYTES}")

@@ -210,10 +210,8 @@ def index_messages(
 
     Parameters
     ----------
-    data
-        Bytes that hold them.
-    records, ends, channels
-        Of each index, shape (R,), where it begins, before which byte it must end, and of which channel it should be.
+    data : bytes that hold them.
+    records, ends, channels : of each index, shape (R,), where it begins, before which byte it must end, and of which channel it should be.
 
     Returns
     -------

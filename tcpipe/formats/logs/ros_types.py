@@ -101,8 +101,7 @@ class MessageType:
 
         Raises
         ------
-        DefinitionError
-            rosbags makes no type of the definition.
+        DefinitionError : rosbags makes no type of the definition.
         """
         store = _typestore(self.definitions)
         name = self.wire.name
@@ -149,8 +148,7 @@ class TypeLibrary:
 
         Raises
         ------
-        DefinitionError
-            No definition is known, or it cannot be parsed, is recursive, or uses a type no reader supports.
+        DefinitionError : no definition is known, or it cannot be parsed, is recursive, or uses a type no reader supports.
         """
         key = (type_name, definition, schema_encoding, ros1)
         if key not in self._types:

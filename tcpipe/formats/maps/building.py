@@ -96,10 +96,8 @@ def build_map(
 
     Raises
     ------
-    MapError
-        A raster cannot be placed or read, or holds nothing here; the class table is not the store's: one line each.
-    StoreError
-        The map cannot be written.
+    MapError : a raster cannot be placed or read, or holds nothing here; the class table is not the store's: one line each.
+    StoreError : the map cannot be written.
     """
     given = {"height": height, "ortho": ortho, "terrain": terrain, **more.files}
     paths = {role: [files] if isinstance(files, Path) else list(files) for role, files in given.items() if files}

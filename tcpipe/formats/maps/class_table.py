@@ -35,8 +35,7 @@ def read_class_scheme(path: Path) -> ClassScheme:
 
     Raises
     ------
-    MapError
-        The file cannot be read, or breaks its contract: one problem a wrong line, all at once.
+    MapError : the file cannot be read, or breaks its contract: one problem a wrong line, all at once.
     """
     try:
         size = path.stat().st_size

@@ -150,8 +150,7 @@ class RasterTiles:
 
         Raises
         ------
-        MapError
-            The window's pixels are damaged, or the file is gone.
+        MapError : the window's pixels are damaged, or the file is gone.
         """
         window = Window(col0, row0, col1 - col0, row1 - row0)
         dataset = self._dataset(tile)
@@ -209,8 +208,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
 
     Raises
     ------
-    MapError
-        It is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
+    MapError : it is no raster of a kind that is read, names files elsewhere, has no place on the earth, or its bands cannot play the role.
     """
     use = use or USES[role]
     with rasterio.Env(**_CONFIG):
@@ -247,8 +245,7 @@ def raster_files(path: Path) -> tuple[Path, ...]:
 
     Raises
     ------
-    MapError
-        It is no raster of a kind that is read.
+    MapError : it is no raster of a kind that is read.
     """
     with rasterio.Env(**_CONFIG):
         return _checked(path).files
@@ -580,13 +577,7 @@ def write_cog(
 
 
 def read_bands(path: Path, bands: Sequence[int]) -> NDArray[Any]:
-    """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols).
-
-    Raises
-    ------
-    MapError
-        It cannot be read.
-    """
+    """Return bands, counted from 1, of a GeoTIFF that `write_cog` wrote, shape (B, rows, cols). `MapError`: it cannot be read."""
     try:
         with rasterio.Env(**_CONFIG), _open_as(_checked(path)) as dataset:
             return np.asarray(dataset.read(list(bands)))

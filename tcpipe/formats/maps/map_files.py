@@ -111,13 +111,7 @@ class MapFile:
         )
 
     def read(self, layer: str, row0: int, row1: int, col0: int, col1: int) -> NDArray[Any]:
-        """Return a window of a layer as stored: NaN or, of bytes, 0 where there is no data.
-
-        Raises
-        ------
-        MapError
-            A tile of the window is damaged.
-        """
+        """Return a window of a layer as stored: NaN or, of bytes, 0 where there is no data. `MapError`: a tile of the window is damaged."""
         with self._told(layer, row0, row1, col0, col1):
             return self._levels[self._factor][layer].window(row0, row1, col0, col1)
 

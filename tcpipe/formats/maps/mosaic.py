@@ -78,8 +78,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
 
     Raises
     ------
-    MapError
-        One of them cannot play the role, or they are not of one kind and one grid.
+    MapError : one of them cannot play the role, or they are not of one kind and one grid.
     """
     if len(paths) > MAX_FILES:
         raise MapError(

@@ -31,16 +31,11 @@ def write_nav2_map(
 
     Parameters
     ----------
-    path
-        Where the description goes; the picture takes the same name.
-    cost
-        From 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first.
-    grid
-        Where the cells lie; the frame's axes are those of its CRS.
-    origin_m
-        x and y in that CRS where the frame's own are zero.
-    meaning
-        One line that says what a cost is.
+    path : where the description goes; the picture takes the same name.
+    cost : from 0 to `HIGHEST`, or `LETHAL`, shape (rows, cols), north first.
+    grid : where the cells lie; the frame's axes are those of its CRS.
+    origin_m : x and y in that CRS where the frame's own are zero.
+    meaning : one line that says what a cost is.
     """
     grey = np.where(cost == LETHAL, 0.0, np.rint(255.0 * (1.0 - _OCCUPIED * cost / 100.0))).astype(np.uint8)
     picture = path.with_suffix(".pgm")

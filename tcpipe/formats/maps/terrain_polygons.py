@@ -101,12 +101,9 @@ def place_polygons(
 
     Parameters
     ----------
-    paths
-        The GeoJSON files; the features of a later one lie on top.
-    scheme
-        The class table, and the values that stand for its ids.
-    crs, bounds_m
-        The map's CRS, and x min, y min, x max, y max in it.
+    paths : the GeoJSON files; the features of a later one lie on top.
+    scheme : the class table, and the values that stand for its ids.
+    crs, bounds_m : the map's CRS, and x min, y min, x max, y max in it.
 
     Raises
     ------

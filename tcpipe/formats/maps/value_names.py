@@ -18,10 +18,8 @@ def value_names(vrt: str, band: int) -> dict[int, str]:
 
     Parameters
     ----------
-    vrt
-        The document.
-    band
-        Which band, from 1.
+    vrt : the document.
+    band : which band, from 1.
     """
     root = fromstring(vrt)  # noqa: S314  GDAL wrote it
     described = root.find(f"./VRTRasterBand[@band='{band}']")

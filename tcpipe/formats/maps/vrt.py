@@ -83,18 +83,13 @@ def checked_vrt(path: Path, source: Callable[[Path, int], str | None], *, nestin
 
     Parameters
     ----------
-    path
-        The VRT.
-    source
-        Checks one file that it names, and returns its document if that is a VRT too (``nesting`` is handed on), None if not.
-    nesting
-        How many VRTs this one lies in.
+    path : the VRT.
+    source : checks one file that it names, and returns its document if that is a VRT too (``nesting`` is handed on), None if not.
+    nesting : how many VRTs this one lies in.
 
     Raises
     ------
-    MapError
-        It is damaged, beyond the bounds, names a file elsewhere, or does more than lay rasters side by side.
-
+    MapError : it is damaged, beyond the bounds, names a file elsewhere, or does more than lay rasters side by side.
     """
     if nesting > _MAX_NESTING:
         raise MapError(f"{path}: VRTs in VRTs, more than {_MAX_NESTING} deep{_mended(path)}")

@@ -73,8 +73,7 @@ def added_columns(
 
     Raises
     ------
-    DatasetError
-        Two columns would have one name.
+    DatasetError : two columns would have one name.
     """
     table, warnings = _tags(segments.column("run_id"), runs)
     told = list[Covariate]()

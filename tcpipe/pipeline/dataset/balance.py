@@ -86,19 +86,12 @@ def measure_balance(
 
     Parameters
     ----------
-    table
-        `BALANCE_COLUMNS` of the samples, in the dataset's order, which is random.
-    xy_m
-        Centres of their footprints in the first map's plane [m], shape (N, 2).
-    sources
-        The maps, the first ruling where they overlap.
-    velocity_column
-        The velocity that is the label.
-    chord_m
-        Segment length [m].
-    regions, buffer_m
-        Of the split, in WGS84 lon/lat [deg] and [m]: what they exclude, and what lies in the buffer, is not worth driving.
-
+    table : `BALANCE_COLUMNS` of the samples, in the dataset's order, which is random.
+    xy_m : centres of their footprints in the first map's plane [m], shape (N, 2).
+    sources : the maps, the first ruling where they overlap.
+    velocity_column : the velocity that is the label.
+    chord_m : segment length [m].
+    regions, buffer_m : of the split, in WGS84 lon/lat [deg] and [m]: what they exclude, and what lies in the buffer, is not worth driving.
     """
     samples = _samples(table, xy_m, velocity_column)
     left = {name: residuals(values, samples.terrain, samples.slope) for name, values in samples.labels.items()}

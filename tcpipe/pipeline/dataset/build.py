@@ -203,7 +203,6 @@ def build_dataset(
     ------
     DatasetError, RegionError, MapError, StoreError, RecipeError
         Nothing is written then.
-
     """
     watch, ruling = started(), _ruling(recipe, holdout=holdout, seed=seed)
     place = str(out).rstrip("/") if is_url(out) else local_output(out)

@@ -175,9 +175,7 @@ def gather_content(
 
     Raises
     ------
-    DatasetError, MapError
-        Nothing comes of it: no segment, none on the map, none inside the region.
-
+    DatasetError, MapError : nothing comes of it: no segment, none on the map, none inside the region.
     """
     pool = pool_segments(inputs.runs, directory, again=inputs.again)
     logger.info("sampling %d segments of %d runs", pool.segments.num_rows, len(inputs.runs))

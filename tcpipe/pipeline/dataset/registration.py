@@ -35,18 +35,13 @@ def register_runs(
 
     Parameters
     ----------
-    runs
-        The runs whose tracks are compared: rows that are certain enough to be sampled.
-    source
-        The map.
-    recipe
-        ``read.gnss_crs`` and ``sample.max_position_std_m`` rule.
+    runs : the runs whose tracks are compared: rows that are certain enough to be sampled.
+    source : the map.
+    recipe : ``read.gnss_crs`` and ``sample.max_position_std_m`` rule.
 
     Raises
     ------
-    MapError
-        The map's heights are in feet.
-
+    MapError : the map's heights are in feet.
     """
     projection = projection_to(source, recipe.read.gnss_crs)
     found, warnings = list[MapRegistration](), list[str]()

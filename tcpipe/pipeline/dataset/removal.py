@@ -52,17 +52,11 @@ def removed_by_ground(
 
     Parameters
     ----------
-    runs
-        The runs of the dataset, with their tracks.
-    segments
-        All segments that could become samples.
-    used
-        Rows of those that are train, test or unseen.
-    sources
-        The maps, the first ruling where they overlap; without a terrain layer there are no classes.
-    recipe
-        ``read.gnss_crs`` rules.
-
+    runs : the runs of the dataset, with their tracks.
+    segments : all segments that could become samples.
+    used : rows of those that are train, test or unseen.
+    sources : the maps, the first ruling where they overlap; without a terrain layer there are no classes.
+    recipe : ``read.gnss_crs`` rules.
     """
     grounds = [
         (source, projection_to(source, recipe.read.gnss_crs)) for source in sources if "terrain" in source.layers

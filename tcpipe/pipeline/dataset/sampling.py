@@ -205,20 +205,14 @@ def sample_all_segments(
 
     Parameters
     ----------
-    segments
-        M segments, of any runs.
-    ranks
-        Their ranks in the dataset's order, uniform over 64 bits, shape (M,).
-    maps, config, gnss_crs
-        What is sampled, in order of priority, how, and the CRS of the segments' positions.
-    workers
-        Who samples; they see the maps.
+    segments : M segments, of any runs.
+    ranks : their ranks in the dataset's order, uniform over 64 bits, shape (M,).
+    maps, config, gnss_crs : what is sampled, in order of priority, how, and the CRS of the segments' positions.
+    workers : who samples; they see the maps.
 
     Raises
     ------
-    TcpipeError
-        The map or the segments cannot be used.
-
+    TcpipeError : the map or the segments cannot be used.
     """
     sources = [open_map(*of) for of in maps()]
     check_alike(sources)

@@ -40,9 +40,7 @@ def pool_segments(
 
     Raises
     ------
-    DatasetError
-        None can: the lines say what the runs lack.
-
+    DatasetError : None can: the lines say what the runs lack.
     """
     names = dict.fromkeys(name for run in runs for name in run.manifest.ledger_m)
     ledger_m = {name: math.fsum(run.manifest.ledger_m.get(name, 0.0) for run in runs) for name in names}

@@ -55,26 +55,17 @@ def draw_splits(
 
     Parameters
     ----------
-    segments
-        All segments that were sampled.
-    sampled
-        What became of them.
-    grid
-        The map's grid, for its CRS.
-    regions
-        In WGS84 lon/lat; None: everything is train and test.
-    recipe
-        Its sections ``split`` and ``segment`` rule.
-    earlier
-        ``sample_id``, ``split`` and ``fold`` of a dataset whose samples keep their split.
-    tags
-        With the holdout ``tag``: its value by run.
+    segments : all segments that were sampled.
+    sampled : what became of them.
+    grid : the map's grid, for its CRS.
+    regions : in WGS84 lon/lat; None: everything is train and test.
+    recipe : its sections ``split`` and ``segment`` rule.
+    earlier : ``sample_id``, ``split`` and ``fold`` of a dataset whose samples keep their split.
+    tags : with the holdout ``tag``: its value by run.
 
     Raises
     ------
-    DatasetError
-        No footprint lies inside the region.
-
+    DatasetError : no footprint lies inside the region.
     """
     rules, chord_m = recipe.split, recipe.segment.chord_m
     buffer_m = math.sqrt(2.0) * chord_m if rules.buffer_m is None else rules.buffer_m
