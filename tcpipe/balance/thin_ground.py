@@ -120,13 +120,7 @@ def _patch(ground: MapGround, row: Ints, col: Ints, terrain_class: int, slope: i
     polygon = shapely.transform(shapely.union_all(boxes), lambda cells: corner_m + cells * ground.cell_m)
     east_up, north_up = _sign(slope) * ground.gradient[row, col].sum(axis=0)
     wind = int(np.round(np.degrees(np.arctan2(north_up, east_up)) / 45.0)) % 8
-    return Patch(
-        terrain_class,
-        slope,
-        len(row) * ground.cell_m**2,
-        None if slope == LEVEL else _WINDS[wind],
-        polygon,
-    )
+    return Patch(terrain_class, slope, len(row) * ground.cell_m**2, None if slope == LEVEL else _WINDS[wind], polygon)
 
 
 def cell_gradients(height_m: Floats, pixels: int, pitch_m: float) -> Floats:

@@ -164,14 +164,7 @@ def _print_store(found: InspectedStore) -> None:
     say(f"{found.path}: {runs} run{'' if runs == 1 else 's'}, maps: {', '.join(found.maps) or 'none'}")
     say("")
     rows = [
-        [
-            run.run_id,
-            run.recipe_id,
-            run.robot,
-            str(run.segments),
-            f"{run.distance_m:.1f}",
-            str(run.damage),
-        ]
+        [run.run_id, run.recipe_id, run.robot, str(run.segments), f"{run.distance_m:.1f}", str(run.damage)]
         for run in found.runs
     ]
     _print_table(["run", "recipe", "robot", "segments", "metres", "damage"], rows)

@@ -25,15 +25,7 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, jobs_option, json_option, quiet
 @json_option
 @quiet_option
 def reproduce(
-    directory: str,
-    *,
-    quick: bool,
-    seeds: int,
-    jobs: int,
-    hidden: float,
-    baselines: bool,
-    as_json: bool,
-    quiet: bool,
+    directory: str, *, quick: bool, seeds: int, jobs: int, hidden: float, baselines: bool, as_json: bool, quiet: bool
 ) -> None:
     """Simulate the paper's site, drive it, build the dataset, train, evaluate, and say which of the paper's claims hold.
 

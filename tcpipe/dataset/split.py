@@ -70,12 +70,7 @@ class Split:
     """
 
     def __init__(
-        self,
-        name: str,
-        card: DatasetCard,
-        columns: SampleColumns,
-        view: View,
-        energy: Energy = ENERGIES["total"],
+        self, name: str, card: DatasetCard, columns: SampleColumns, view: View, energy: Energy = ENERGIES["total"]
     ) -> None:
         self.name = name
         self.view = view

@@ -109,9 +109,7 @@ def croissant(
     JSON-LD.
     """
     samples_source = {"fileObject": {"@id": samples_file}}
-    records = [
-        _records("samples", "One record a sample, in the order of the patches.", samples, samples_source),
-    ]
+    records = [_records("samples", "One record a sample, in the order of the patches.", samples, samples_source)]
     sets = []
     if shards is not None and layers is not None:
         sets.append(

@@ -89,12 +89,7 @@ class FilterPass:
     """
 
     def __init__(
-        self,
-        timeline: EventTimeline,
-        measurements: Measurements,
-        gate_probability: float,
-        *,
-        lags: Sequence[int],
+        self, timeline: EventTimeline, measurements: Measurements, gate_probability: float, *, lags: Sequence[int]
     ) -> None:
         self.lags = lags
         self.timeline = timeline
@@ -280,12 +275,7 @@ class FilterPass:
         return np.empty((events, 12, 9)), np.empty((events, 2, 3, n)), np.empty((events, 25)), np.empty((wanted, n, n))
 
     def _forward(
-        self,
-        first: int,
-        last: int,
-        memory: _Memory,
-        outputs: NDArray[np.float64],
-        store: _Store | None,
+        self, first: int, last: int, memory: _Memory, outputs: NDArray[np.float64], store: _Store | None
     ) -> None:
         t = self.timeline
         self.repairs += filter_block(

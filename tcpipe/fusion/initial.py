@@ -220,10 +220,7 @@ def _course_fit(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
 
 
 def _fit(
-    fixes: NDArray[np.complex128],
-    drawn: NDArray[np.complex128],
-    stamp_s: NDArray[np.float64],
-    noise_m: float,
+    fixes: NDArray[np.complex128], drawn: NDArray[np.complex128], stamp_s: NDArray[np.float64], noise_m: float
 ) -> _Fit | None:
     """Lay the drawn path over the fixes by the rotation (and scale) that fits best."""
     a, b = fixes - fixes.mean(), drawn - drawn.mean()

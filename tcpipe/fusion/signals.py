@@ -43,10 +43,7 @@ def integral(
 
 
 def interval_means(
-    stamp_s: NDArray[np.float64],
-    values: NDArray[np.float64],
-    start_s: NDArray[np.float64],
-    end_s: NDArray[np.float64],
+    stamp_s: NDArray[np.float64], values: NDArray[np.float64], start_s: NDArray[np.float64], end_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the mean of the piecewise-linear signal over each interval, shape (M, k); its value where the interval is empty."""
     width = (end_s - start_s)[:, None]

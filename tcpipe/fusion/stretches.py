@@ -28,9 +28,7 @@ class Stretch:
     measurements: Measurements
 
 
-def cut_stretches(
-    measurements: Mapping[int, Measurements],
-) -> list[Stretch]:
+def cut_stretches(measurements: Mapping[int, Measurements]) -> list[Stretch]:
     """Return the stretches of measurements given by clock epoch, in order of epoch and time; those without motion are left out."""
     found = []
     for epoch in sorted(measurements):

@@ -31,15 +31,7 @@ from tcpipe.learning.evaluation_facts import (
 )
 from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.leakage import by_blocks, leakage_of
-from tcpipe.learning.metrics import (
-    ALL,
-    Array,
-    Errors,
-    Spread,
-    errors_by_class,
-    label_floor,
-    mean_of_draws,
-)
+from tcpipe.learning.metrics import ALL, Array, Errors, Spread, errors_by_class, label_floor, mean_of_draws
 from tcpipe.learning.models import Model, load_model
 from tcpipe.learning.predicted_samples import predictions_table
 from tcpipe.learning.predictions import Measured, check_fit, measured, predicted_costs, spreads_of

@@ -195,12 +195,7 @@ def _by_class(found: Evaluation) -> list[Section]:
                 for score, called in SCORES.items():
                     ours = [_figure(part.errors[quantity].get(entry), score, quantity) for entry in classes]
                     rows.append((f"{quantity}, {called} [{_unit(score, quantity)}]", "here", *ours))
-        header = (
-            "",
-            "",
-            *(f"{entry} ({part.classes[entry]})" for entry in part.class_order),
-            f"all ({part.samples})",
-        )
+        header = ("", "", *(f"{entry} ({part.classes[entry]})" for entry in part.class_order), f"all ({part.samples})")
         sections.append(
             Section(
                 f"Table {number}: {_CALLED[name]}",

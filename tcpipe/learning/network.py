@@ -29,12 +29,7 @@ _CUT_DEVIATION = 0.87962566103423978
 """Standard deviation of a normal variable of deviation one that is cut at two, by which Keras's ``he_normal`` is widened again."""
 
 _FILED = {"weight": "kernel", "bias": "bias"}
-_FILED_NORM = {
-    "weight": "gamma",
-    "bias": "beta",
-    "running_mean": "moving_mean",
-    "running_var": "moving_variance",
-}
+_FILED_NORM = {"weight": "gamma", "bias": "beta", "running_mean": "moving_mean", "running_var": "moving_variance"}
 """What torch calls a weight, and its name in a file: those that Keras wrote, with whose layout older models are read as they are."""
 
 

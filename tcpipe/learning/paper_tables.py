@@ -45,8 +45,5 @@ ENERGY = {
 }
 """Table IV: RMSE [J] and MAPE [%] of E on test and on unseen."""
 
-TIME = {
-    "ours": ((0.06, 3.37), (0.08, 5.04)),
-    "expected time": ((0.22, 17.45), (0.17, 13.82)),
-}
+TIME = {"ours": ((0.06, 3.37), (0.08, 5.04)), "expected time": ((0.22, 17.45), (0.17, 13.82))}
 """Table V: RMSE [s] and MAPE [%] of T on test and on unseen."""

@@ -76,10 +76,7 @@ MAPPED: dict[str, dict[str, MappedField]] = {
     "wheel_odometry": _ODOMETRY,
     "visual_odometry": _ODOMETRY,
     "power": {"voltage": MappedField("voltage", "V"), "current": MappedField("current", "A")},
-    "command": {
-        **_three("linear", "twist.linear", "m/s", needed="x"),
-        **_three("angular", "twist.angular", "rad/s"),
-    },
+    "command": {**_three("linear", "twist.linear", "m/s", needed="x"), **_three("angular", "twist.angular", "rad/s")},
     "pose": {**_pose("pose.pose", needed="xy"), **_std("pose.covariance", ("x", "y", "z"), 6)},
 }
 """Fields that can be mapped, by role and short name."""

@@ -321,11 +321,7 @@ def _read_velocity_sentences(columns: Columns) -> Readings:
     over_ground, variances = _by_course(told.speed_mps, told.course_rad, np.full(told.row.size, np.nan))
     unknown = np.full((told.row.size, 1), np.nan)
     values = _ground_velocity(np.hstack((over_ground, unknown)), np.hstack((variances, unknown)), told.status)
-    drops = {
-        "broken": told.broken,
-        "no_fix": told.status < 0,
-        "not_finite": ~np.isfinite(over_ground.sum(-1)),
-    }
+    drops = {"broken": told.broken, "no_fix": told.status < 0, "not_finite": ~np.isfinite(over_ground.sum(-1))}
     found = _kept(of_told, values, drops, notes={"course_unknown": int((told.speed_mps < _HELD_COURSE_MPS).sum())})
     own_time_ns = with_date(time_of_day_ns[found.row], found.log_time_ns)
     others = len(texts) - len(told.row)

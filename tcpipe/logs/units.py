@@ -54,12 +54,7 @@ UNITS: Mapping[str, Mapping[str, str]] = {
         "linear_acceleration": "m/s2",
         "linear_acceleration_covariance": "m2/s4",
     },
-    "sensor_msgs/msg/NavSatFix": {
-        "latitude": "deg",
-        "longitude": "deg",
-        "altitude": "m",
-        "position_covariance": "m2",
-    },
+    "sensor_msgs/msg/NavSatFix": {"latitude": "deg", "longitude": "deg", "altitude": "m", "position_covariance": "m2"},
     "sensor_msgs/msg/BatteryState": {
         "voltage": "V",
         "current": "A",
@@ -69,11 +64,7 @@ UNITS: Mapping[str, Mapping[str, str]] = {
         "cell_voltage": "V",
         "cell_temperature": "degC",
     },
-    "sensor_msgs/msg/JointState": {
-        "position": "rad or m",
-        "velocity": "rad/s or m/s",
-        "effort": "N m or N",
-    },
+    "sensor_msgs/msg/JointState": {"position": "rad or m", "velocity": "rad/s or m/s", "effort": "N m or N"},
     "sensor_msgs/msg/MagneticField": {"magnetic_field": "T", "magnetic_field_covariance": "T2"},
     "sensor_msgs/msg/Temperature": {"temperature": "degC", "variance": "degC2"},
     "sensor_msgs/msg/FluidPressure": {"fluid_pressure": "Pa", "variance": "Pa2"},

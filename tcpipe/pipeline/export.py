@@ -221,11 +221,7 @@ def _is_there(entry: IndexEntry | None, made_from: ExportOrigin, out: Path) -> b
 
 
 def _exported(
-    status: Literal["done", "unchanged"],
-    entries: Mapping[str, IndexEntry],
-    wanted: Sequence[str],
-    log: str,
-    out: Path,
+    status: Literal["done", "unchanged"], entries: Mapping[str, IndexEntry], wanted: Sequence[str], log: str, out: Path
 ) -> Exported:
     found = {name: entries[name] for name in wanted}
     files = tuple(ExportedTopic(name, of.type, out / of.file, of.rows) for name, of in found.items() if of.file)

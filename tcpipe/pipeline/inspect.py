@@ -236,12 +236,7 @@ def _store(store: Store) -> InspectedStore:
         path=str(store.root),
         maps=tuple(store.maps()),
         runs=tuple(
-            recast(
-                _ingestion(run),
-                StoredIngestion,
-                warnings=len(run.facts.warnings),
-                damage=len(run.facts.damage),
-            )
+            recast(_ingestion(run), StoredIngestion, warnings=len(run.facts.warnings), damage=len(run.facts.damage))
             for run in runs
         ),
         outdated=outdated,

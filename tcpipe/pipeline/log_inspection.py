@@ -122,12 +122,7 @@ def _indexed(topic: Topic, cast: RoleAssignment) -> InspectedTopic:
         played = "transforms", "places the sensors"
     role, why = played or (None, cast.left_out.get(topic.name) or topic.problem)
     return InspectedTopic(
-        name=topic.name,
-        type=topic.type_name,
-        messages=topic.message_count,
-        rate_hz=_rate_hz(topic),
-        role=role,
-        why=why,
+        name=topic.name, type=topic.type_name, messages=topic.message_count, rate_hz=_rate_hz(topic), role=role, why=why
     )
 
 

@@ -102,10 +102,7 @@ def _wrong_joins(samples: pa.Table, card: DatasetCard) -> Iterator[str]:
     if repeated:
         yield f"{repeated} sample ids occur more than once"
     yield from _rows(pc.not_equal(ids, samples.column("segment_id")), "have another id than their segment")
-    for column, known in (
-        ("run_id", [run.run_id for run in card.runs]),
-        ("map", [entry.name for entry in card.maps]),
-    ):
+    for column, known in (("run_id", [run.run_id for run in card.runs]), ("map", [entry.name for entry in card.maps])):
         strange = pc.invert(pc.is_in(samples.column(column), value_set=pa.array(known, pa.string())))
         yield from _rows(strange, f"have a {column} that the card does not list")
     names = {entry.id: entry.name for entry in card.classes}

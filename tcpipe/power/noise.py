@@ -47,12 +47,7 @@ class EnergyNoise:
 
 
 def energy_noise(
-    rails: list[Rail],
-    start_ns: Stamps,
-    end_ns: Stamps,
-    still_ns: Stamps,
-    *,
-    rate_hz: float | None = None,
+    rails: list[Rail], start_ns: Stamps, end_ns: Stamps, still_ns: Stamps, *, rate_hz: float | None = None
 ) -> EnergyNoise:
     """Return how uncertain each span's energy is from sampling, noise and quantisation.
 

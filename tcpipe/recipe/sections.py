@@ -374,14 +374,7 @@ class Recipe:
     def ingest(self) -> IngestSections:
         """The sections that rule a run's files."""
         return IngestSections(
-            self.read,
-            self.fuse,
-            self.gate,
-            self.segment,
-            self.label,
-            self.robots,
-            self.power_sources,
-            self.tables,
+            self.read, self.fuse, self.gate, self.segment, self.label, self.robots, self.power_sources, self.tables
         )
 
     def read_of(self, topics: Collection[str]) -> ReadConfig:

@@ -17,13 +17,7 @@ from tcpipe.report.balance import balance_sections
 from tcpipe.report.colours import CLASS_COLOURS, DROPPED, FAINT, KEPT, SPLIT_COLOURS, class_colour
 from tcpipe.report.dataset_map import map_plots
 from tcpipe.report.dataset_patches import PER_SHEET, patches_shown
-from tcpipe.report.dataset_samples import (
-    COLUMNS,
-    MOST_SAMPLES,
-    SamplesShown,
-    first_starts_ns,
-    samples_shown,
-)
+from tcpipe.report.dataset_samples import COLUMNS, MOST_SAMPLES, SamplesShown, first_starts_ns, samples_shown
 from tcpipe.report.dataset_verdict import verdict
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.page import Link, Number, Section, render_page

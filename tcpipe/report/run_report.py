@@ -25,15 +25,7 @@ from tcpipe.report.quality import QUALITY_WORDS, quality_sections
 from tcpipe.report.run_map import Pictures, RunMap, run_map
 from tcpipe.report.run_plots import SPEED_ROLES, Line, lines_of, reasons_told, time_plots
 from tcpipe.report.run_sensors import sensor_sections
-from tcpipe.report.run_series import (
-    Series,
-    Timeline,
-    gate_spans,
-    rail_series,
-    speed_series,
-    timeline_of,
-    track_series,
-)
+from tcpipe.report.run_series import Series, Timeline, gate_spans, rail_series, speed_series, timeline_of, track_series
 from tcpipe.report.run_verdict import verdict
 from tcpipe.store import Store
 from tcpipe.tables.bits import Quality, name_of

@@ -54,12 +54,7 @@ def store_verdict(store: StoreFacts, runs: Sequence[StoredRun], losses: Sequence
             Verdict("doubtful", f"No run can be used{failed}."),
             Verdict("do", "'tcpipe ingest LOG' adds runs; 'tcpipe preflight LOG' says beforehand what a log lacks."),
         ]
-    return [
-        *_good(current),
-        *_thin(store, current),
-        *_doubtful(store, runs, current),
-        *_to_do(store, current, losses),
-    ]
+    return [*_good(current), *_thin(store, current), *_doubtful(store, runs, current), *_to_do(store, current, losses)]
 
 
 def _good(runs: Sequence[StoredRun]) -> Iterator[Verdict]:

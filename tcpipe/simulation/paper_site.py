@@ -16,19 +16,7 @@ from tcpipe.simulation.route import AlongRoad, Wander
 from tcpipe.simulation.sensors import Gnss, Power, Sensors
 from tcpipe.simulation.site import Site
 from tcpipe.simulation.surface import Look, Surface
-from tcpipe.simulation.world import (
-    GRASS,
-    MUD,
-    OBSTACLE,
-    PAVED,
-    TREE,
-    UNPAVED,
-    VEGETATION,
-    Band,
-    Ellipse,
-    Hill,
-    World,
-)
+from tcpipe.simulation.world import GRASS, MUD, OBSTACLE, PAVED, TREE, UNPAVED, VEGETATION, Band, Ellipse, Hill, World
 
 _GROUNDS = {"grass": GRASS, "mud": MUD, "unpaved_road": UNPAVED, "paved_road": PAVED}
 

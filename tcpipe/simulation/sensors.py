@@ -13,14 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.geometry.rotation import (
-    inverse,
-    product,
-    quat_from_rotation_vector,
-    quat_from_rpy,
-    rotate,
-    rpy_from_quat,
-)
+from tcpipe.geometry.rotation import inverse, product, quat_from_rotation_vector, quat_from_rpy, rotate, rpy_from_quat
 from tcpipe.simulation.faults import Faults
 from tcpipe.simulation.robot import GRAVITY_MPS2, correlated_noise
 from tcpipe.simulation.site import Float, Site

@@ -8,15 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.splits.holdouts import (
-    UNDECIDED,
-    Holdout,
-    blocks,
-    draw_folds,
-    draw_groups,
-    draw_samples,
-    runs_as_groups,
-)
+from tcpipe.splits.holdouts import UNDECIDED, Holdout, blocks, draw_folds, draw_groups, draw_samples, runs_as_groups
 from tcpipe.splits.regions import Regions, Side, sides_of
 
 Floats = NDArray[np.float64]

@@ -10,15 +10,7 @@ from tcpipe.logs.clocks import ON_SIMULATED_CLOCK, Settled, Timeline
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import TopicReadings
-from tcpipe.tables.findings import (
-    Findings,
-    PowerSign,
-    RobotChoice,
-    RoleFacts,
-    RunFacts,
-    TopicClock,
-    TopicFacts,
-)
+from tcpipe.tables.findings import Findings, PowerSign, RobotChoice, RoleFacts, RunFacts, TopicClock, TopicFacts
 from tcpipe.tables.levels import Sensor
 
 _MANY_DROPPED = 0.01

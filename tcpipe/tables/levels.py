@@ -314,10 +314,7 @@ GATED_TRACK = TableSchema(
     "track",
     "L3",
     "The fused track with the reasons why rows are not used; nothing is deleted.",
-    (
-        *_TRACK_COLUMNS,
-        Column("dropped_by", pa.uint32(), "bits", "why the row is not used, 0 = kept", flags=DropReason),
-    ),
+    (*_TRACK_COLUMNS, Column("dropped_by", pa.uint32(), "bits", "why the row is not used, 0 = kept", flags=DropReason)),
 )
 
 _SEGMENT_COLUMNS = (

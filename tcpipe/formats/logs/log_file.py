@@ -22,13 +22,7 @@ from tcpipe.formats.logs.fetched_file import FetchedFile
 from tcpipe.formats.logs.log_container import WANTED, container_of, open_part
 from tcpipe.formats.logs.log_part import Channel, LogPart, MessageBlock
 from tcpipe.formats.logs.ros_types import DefinitionError, MessageType, TypeLibrary
-from tcpipe.formats.logs.rosbag2 import (
-    METADATA,
-    STORAGE_SUFFIXES,
-    decompressed_blocks,
-    is_one_bag,
-    rosbag2_files,
-)
+from tcpipe.formats.logs.rosbag2 import METADATA, STORAGE_SUFFIXES, decompressed_blocks, is_one_bag, rosbag2_files
 from tcpipe.formats.object_storage import StoredObject, is_url, laid_out
 from tcpipe.logs.topics import Damage, Topic, condensed
 from tcpipe.progress import Meter

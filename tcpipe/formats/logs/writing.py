@@ -57,11 +57,7 @@ class MessageStream:
 
 
 def write_mcap(
-    path: Path,
-    streams: Sequence[MessageStream],
-    *,
-    encoding: Encoding = "cdr",
-    compression: McapCompression = "zstd",
+    path: Path, streams: Sequence[MessageStream], *, encoding: Encoding = "cdr", compression: McapCompression = "zstd"
 ) -> None:
     """Write a log in chunks with CRCs: ROS 2 (cdr), or ROS 1 messages in MCAP (ros1); streams of one topic share its channel."""
     version = 1 if encoding == "ros1" else 2

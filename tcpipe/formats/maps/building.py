@@ -20,14 +20,7 @@ from tcpipe.formats.maps.terrain_polygons import is_drawn, place_polygons
 from tcpipe.formats.seals import write_checksums
 from tcpipe.terrain.classes import PAPER_SCHEME, ClassScheme, named_scheme, own_scheme
 from tcpipe.terrain.grid import MapGrid
-from tcpipe.terrain.layers import (
-    COLOURS,
-    PAPER_LAYERS,
-    Layer,
-    categorical_layer,
-    continuous_layer,
-    paper_layers,
-)
+from tcpipe.terrain.layers import COLOURS, PAPER_LAYERS, Layer, categorical_layer, continuous_layer, paper_layers
 from tcpipe.terrain.placement import Footing, choose_crs, choose_grid, projection_to
 from tcpipe.terrain.projection import parse_crs
 

@@ -19,14 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.measurements import (
-    VISUAL,
-    WHEELS,
-    BodyVelocities,
-    InertialMeasurements,
-    Measurements,
-    Positions,
-)
+from tcpipe.fusion.measurements import VISUAL, WHEELS, BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import in_gap, interval_means, median_of_five, median_period_ns, seconds
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, product, quat_from_rpy, rotate
@@ -125,9 +118,7 @@ def arm_evidence(found: Trajectory, m: Measurements) -> ArmEvidence | None:
     if not told:
         return None
     return ArmEvidence(
-        np.stack([matrix for matrix, _ in told]),
-        np.stack([vector for _, vector in told]),
-        _TURNING_POINT_STD_M[role],
+        np.stack([matrix for matrix, _ in told]), np.stack([vector for _, vector in told]), _TURNING_POINT_STD_M[role]
     )
 
 

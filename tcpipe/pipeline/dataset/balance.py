@@ -13,15 +13,7 @@ from pyproj import CRS
 from shapely.geometry.base import BaseGeometry
 from shapely.geometry.polygon import orient
 
-from tcpipe.balance.cells import (
-    ENOUGH,
-    SLOPE_EDGES_DEG,
-    SLOPE_NAMES,
-    Cell,
-    count_cells,
-    slope_ranges,
-    speed_edges,
-)
+from tcpipe.balance.cells import ENOUGH, SLOPE_EDGES_DEG, SLOPE_NAMES, Cell, count_cells, slope_ranges, speed_edges
 from tcpipe.balance.correlation import correlations, residuals
 from tcpipe.balance.repeats import Floor, repeatability, repeated_pairs
 from tcpipe.balance.thin_ground import (

@@ -51,12 +51,7 @@ from tcpipe.formats.store_mark import SPOOL
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
-from tcpipe.pipeline.dataset.card import (
-    CARD_COLUMNS,
-    VELOCITY_COLUMN,
-    dataset_card,
-    is_whole,
-)
+from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
 from tcpipe.pipeline.dataset.content import gather_content
 from tcpipe.pipeline.dataset.findings import doubt_in_words, findings_in_words
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
@@ -243,14 +238,7 @@ def build_dataset(
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
         with whole as directory, _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers:
             known = _build(
-                directory,
-                inputs,
-                ruling,
-                regions,
-                earlier,
-                file_format=file_format,
-                workers=workers,
-                redact=redact,
+                directory, inputs, ruling, regions, earlier, file_format=file_format, workers=workers, redact=redact
             )
         for entry in workers.waiting.entries():
             workers.waiting.delete(entry.name)

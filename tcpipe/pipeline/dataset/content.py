@@ -182,12 +182,7 @@ def gather_content(
     ranks = _ranks(pool.segments, seed=recipe.split.seed)
     gnss_crs = recipe.read.gnss_crs
     sampled, slot, spool = sample_all_segments(
-        pool.segments,
-        ranks,
-        inputs.maps,
-        recipe.sample,
-        gnss_crs=gnss_crs,
-        workers=workers,
+        pool.segments, ranks, inputs.maps, recipe.sample, gnss_crs=gnss_crs, workers=workers
     )
     sources = tuple(open_map(*of) for of in inputs.maps())
     lost_m = metres_lost(floats(pool.segments, "arc_length_m"), sampled.lost_by)
@@ -199,10 +194,7 @@ def gather_content(
     drawn = draw_splits(pool.segments, sampled, sources[0].grid, regions, recipe, earlier=earlier, tags=tags)
     split = drawn.assigned.split
     arc_m = floats(pool.segments, "arc_length_m")[sampled.kept]
-    unused_m = {
-        Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(),
-        Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum(),
-    }
+    unused_m = {Loss.SPLIT_BUFFER: arc_m[split == "buffer"].sum(), Loss.SPLIT_EXCLUDED: arc_m[split == EXCLUDED].sum()}
     registered = [register_runs(inputs.runs, source, recipe) for source in sources]
     off = [line for _, lines in registered for line in lines]
     in_use = sampled.kept[(split != "buffer") & (split != EXCLUDED)]

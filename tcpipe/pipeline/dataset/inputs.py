@@ -18,13 +18,7 @@ from numpy.typing import NDArray
 from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.dataset_card import RunSource
-from tcpipe.formats.dataset_files import (
-    FileFormat,
-    is_shard,
-    read_card,
-    read_samples,
-    sample_columns,
-)
+from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
 from tcpipe.formats.json_files import digest, plain
 from tcpipe.formats.published import FetchedShards, here_by_range
 from tcpipe.formats.run_documents import LogOrigin, MapDocument

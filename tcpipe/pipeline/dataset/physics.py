@@ -11,14 +11,7 @@ from tcpipe.cost.physics import ALL, Metres
 from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import PhysicsFit
 
-PHYSICS_COLUMNS = (
-    "start_ns",
-    "start_z_m",
-    "end_z_m",
-    "chord_m",
-    "turn_rate_radps",
-    "standing_power_watt",
-)
+PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "turn_rate_radps", "standing_power_watt")
 """Columns of samples.parquet that the fit reads, beside those of the labels."""
 
 

@@ -27,12 +27,7 @@ _COLUMNS = (
 )
 _SLOPES_DEG = (-10.0, -5.0, -2.0, 2.0, 5.0, 10.0)
 _SLOPE_NAMES = ("below -10°", "-10° to -5°", "-5° to -2°", "-2° to 2°", "2° to 5°", "5° to 10°", "above 10°")
-_REASONS = (
-    "in_samples",
-    *(name_of(bit) for bit in DropReason),
-    "curved_or_leftover",
-    "not_sampled",
-)
+_REASONS = ("in_samples", *(name_of(bit) for bit in DropReason), "curved_or_leftover", "not_sampled")
 """Reason of each metre of a track; what is lost at sampling or to the split's buffer is one entry."""
 _LEFT_OVER, _NOT_SAMPLED = len(_REASONS) - 2, len(_REASONS) - 1
 
@@ -96,9 +91,7 @@ class _Spans:
 
 
 def _metres(
-    run: RunDirectory,
-    spans: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]],
-    grounds: Sequence[_Ground],
+    run: RunDirectory, spans: tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_]], grounds: Sequence[_Ground]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return length [m], reason, slope and class (ids as `classes_at`) of every interval of a run's track."""
     track = run.table("track", _COLUMNS)

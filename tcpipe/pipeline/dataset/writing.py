@@ -15,14 +15,7 @@ from tcpipe.errors import TcpipeError
 from tcpipe.execution import run_all, sound
 from tcpipe.formats.arrow_file import table_bytes, table_of
 from tcpipe.formats.dataset_card import Shard
-from tcpipe.formats.dataset_files import (
-    Drawer,
-    FileFormat,
-    ParquetDrawer,
-    Pixels,
-    parquet_drawers,
-    zarr_drawers,
-)
+from tcpipe.formats.dataset_files import Drawer, FileFormat, ParquetDrawer, Pixels, parquet_drawers, zarr_drawers
 from tcpipe.formats.place import DirectoryPlace, Place
 from tcpipe.formats.zarr_arrays import Compression
 from tcpipe.pipeline.dataset.content import Content, SampleTable
