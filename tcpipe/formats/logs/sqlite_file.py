@@ -13,10 +13,11 @@ import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 from urllib.parse import quote
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.errors import LogError
 from tcpipe.formats.atomic import scratch_directory
@@ -39,6 +40,7 @@ from tcpipe.logs.topics import Damage, normalized_type_name
 __all__ = ["MAGIC", "SqlitePart"]
 
 _ROWS = 1024
+_PAGES_AT_ONCE = 4096
 _MAPPED_BYTES = 1 << 26
 _KEPT_ROWS = 1 << 18
 """Where the rows of a file lie is found once, and kept for its reading, if they are no more than these (56 bytes each)."""
@@ -56,6 +58,7 @@ _LONGEST_BYTES, _ROW_BYTES = 1 << 28, 1 << 10
 """SQLite refuses a row that claims to be longer, or longer than its file: a chain of pages may lead back to itself."""
 _TABLES = ("topics", "messages", "message_definitions")
 _NOTHING = "rows that are no messages: a number, a time or the data is missing or of another kind"
+_CUT_ROWS = "messages whose end is lost"
 _BROKEN = (sqlite3.Error, UnicodeDecodeError, MemoryError)
 """What a broken database raises; the second where even the name in its complaint is broken, the third where a row claims to be endless."""
 _Row = tuple[int, int, int, int, bytes]
@@ -78,7 +81,9 @@ class SqlitePart:
             self._database.text_factory = lambda text: text.decode(errors="backslashreplace")
             self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(path.stat().st_size + _ROW_BYTES, _LONGEST_BYTES))
             self._refuse_odd_tables(path)
-            self._table = None if self._scratch else _message_table(path, self._database)
+            self._table = (
+                _message_table(path, self._database, cut=self._cut) if self._cut or not self._scratch else None
+            )
             self.channels = self._channels(path)
         except LogError:
             self.close()
@@ -124,7 +129,7 @@ class SqlitePart:
             except UnusualError:
                 self._table = None
             if lost:
-                self._note("messages go on on pages that are broken", messages_lost=lost)
+                self._note(_CUT_ROWS if self._cut else "messages go on on pages that are broken", messages_lost=lost)
             if self._table:
                 return
         for rows in self._rows(topics, read_until):
@@ -258,7 +263,7 @@ class SqlitePart:
             if whole:
                 yield whole
         if lost:
-            self._note("messages whose end is lost", messages_lost=lost)
+            self._note(_CUT_ROWS, messages_lost=lost)
 
     def _reachable(self, query: str, low: float = _BEFORE_ALL) -> Iterator[list[Any]]:
         """Yield a query's rows by ascending id, their first column; past a broken page, upward to it and downward to it."""
@@ -324,15 +329,18 @@ class SqlitePart:
 
 
 class _MessageTable:
-    """The table of messages of a clean file, read page by page."""
+    """The table of messages of a clean file, read page by page; of a cut one, whose other tables begin at ``others``, what is there."""
 
-    def __init__(self, path: Path, root: int, columns: list[str]) -> None:
+    def __init__(self, path: Path, root: int, columns: list[str], others: list[int] | None) -> None:
         with path.open("rb") as file:
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        self._map.madvise(mmap.MADV_RANDOM)
-        self._data = memoryview(self._map)
-        self._pages = PageReader(self._data, _loading(self._map))
-        self._leaves = self._pages.leaves(root)
+            self._map.madvise(mmap.MADV_RANDOM)
+            self._data = memoryview(self._map)
+            self._pages = PageReader(self._data, _loading(self._map), cut=others is not None)
+            if others is None:
+                self._leaves = self._pages.leaves(root)
+            else:
+                self._leaves = self._pages.leaves_here(_kinds_of_pages(file, self._pages.page_bytes), others)
         self._columns = len(columns)
         self._kept: list[Rows] | None = None
         publish = "send_timestamp" if "send_timestamp" in columns else "timestamp"
@@ -444,11 +452,18 @@ def _loading(window: mmap.mmap) -> Callable[[Int64Array, Int64Array], None]:
     return load
 
 
-def _message_table(path: Path, database: sqlite3.Connection) -> _MessageTable | None:
+def _kinds_of_pages(file: BinaryIO, page_bytes: int) -> NDArray[np.uint8]:
+    """Return the first byte of each whole page."""
+    pieces = iter(lambda: file.read(_PAGES_AT_ONCE * page_bytes), b"")
+    return np.concatenate(
+        [np.frombuffer(of, np.uint8, len(of) // page_bytes * page_bytes)[::page_bytes] for of in pieces]
+    )
+
+
+def _message_table(path: Path, database: sqlite3.Connection, *, cut: bool) -> _MessageTable | None:
     """Return the table of messages for reading by page; None where it is not as ROS 2 makes it."""
-    found = database.execute(
-        "SELECT rootpage, sql FROM sqlite_schema WHERE type = 'table' AND name = 'messages'"
-    ).fetchall()
+    tables = database.execute("SELECT name, rootpage, sql FROM sqlite_schema WHERE type = 'table'").fetchall()
+    found = [(root, sql) for name, root, sql in tables if name == "messages"]
     columns = database.execute("PRAGMA table_xinfo(messages)").fetchall()
     if len(found) != 1 or not columns or "WITHOUT" in str(found[0][1]).upper():
         return None
@@ -458,7 +473,8 @@ def _message_table(path: Path, database: sqlite3.Connection) -> _MessageTable | 
     if not plain or len(names) > MAX_COLUMNS or keys != [("id", "INTEGER")] or (names[0], names[-1]) != ("id", "data"):
         return None
     try:
-        return _MessageTable(path, int(found[0][0]), names)
+        others = [int(root) for name, root, _ in tables if name != "messages" and root]
+        return _MessageTable(path, int(found[0][0]), names, others if cut else None)
     except UnusualError:
         return None
 

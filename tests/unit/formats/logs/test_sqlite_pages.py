@@ -162,3 +162,87 @@ def test_pages_that_point_nowhere_or_to_themselves_end(tmp_path):
         broken[(root - 1) * 512 + 8 : (root - 1) * 512 + 12] = child.to_bytes(4, "big")
         with pytest.raises(UnusualError):
             every_row(memoryview(broken), root)
+
+
+def varint(data, at):
+    """A big-endian number of 7 bits a byte (8 in the ninth), and where it ends: section 1.6 of the format."""
+    value = 0
+    for byte in data[at : at + 8]:
+        value, at = value << 7 | byte & 0x7F, at + 1
+        if byte < 0x80:
+            return value, at
+    return value << 8 | data[at], at + 1
+
+
+def ids_of_whole_rows(data, page_bytes, columns=4):
+    """Row ids of the table of so many columns, of rows that lie whole in a file's whole pages, walked page by page by hand."""
+    pages, least = len(data) // page_bytes, (page_bytes - 12) * 32 // 255 - 23
+    found = []
+    for start in range(page_bytes, pages * page_bytes, page_bytes):
+        cells = int.from_bytes(data[start + 3 : start + 5], "big") if data[start] == 13 else 0
+        for pointer in range(start + 8, start + 8 + 2 * cells, 2):
+            size, at = varint(data, start + int.from_bytes(data[pointer : pointer + 2], "big"))
+            number, at = varint(data, at)
+            head_bytes, column = varint(data, at)
+            kinds = []
+            while column < at + head_bytes:
+                kind, column = varint(data, column)
+                kinds.append(kind)
+            fitting = least + (size - least) % (page_bytes - 4)
+            local = size if size <= page_bytes - 35 else fitting if fitting <= page_bytes - 35 else least
+            left, page = size - local, int.from_bytes(data[at + local : at + local + 4], "big")
+            while left > 0 and page <= pages:
+                left, page = left - page_bytes + 4, int.from_bytes(data[(page - 1) * page_bytes :][:4], "big")
+            if len(kinds) == columns and kinds[-1] % 2 == 0 and left <= 0:
+                found.append(number)
+    return sorted(found)
+
+
+def rows_of_cut(path, data):
+    """The ids that are read of a cut file, and what is said of it."""
+    path.write_bytes(data)
+    with closing(SqlitePart(path, path.name)) as part:
+        blocks = list(part.blocks(frozenset({1, 300})))
+        found = {
+            number: bytes(block.buffer[at : at + length])
+            for block in blocks
+            for number, at, length in zip(
+                block.ordinal.tolist(), block.offsets.tolist(), block.lengths.tolist(), strict=True
+            )
+        }
+        assert sum(len(block.ordinal) for block in blocks) == len(found)
+        return found, [damage.what for damage in part.damage]
+
+
+@pytest.mark.parametrize(("page_bytes", "sizes"), [(512, None), (512, (3, 60, 90)), (4096, (60, 330, 9000))])
+def test_of_a_cut_file_every_row_that_lies_whole_in_it_is_read(tmp_path, page_bytes, sizes):
+    path = tmp_path / "a.db3"
+    with closing(database(path, page_bytes=page_bytes, count=1500, sizes=sizes)) as connection, connection:
+        expected = {number: data for number, _, _, data in rows_by_sqlite(connection)}
+    data = path.read_bytes()
+    assert ids_of_whole_rows(data, page_bytes) == sorted(expected)
+    counts = []
+    for share in (0.03, 0.1, 0.3, 0.45, 0.62, 0.8, 0.97):
+        cut = data[: int(share * len(data))]
+        found, damage = rows_of_cut(path, cut)
+        assert sorted(found) == ids_of_whole_rows(cut, page_bytes)
+        assert all(expected[number] == payload for number, payload in found.items())
+        assert damage[0] == f"the file ends at byte {len(cut)} of {len(data)}"
+        counts.append(len(found))
+    assert 0 < counts[0] < counts[-1] < len(expected)
+    assert counts == sorted(counts)
+
+
+@pytest.mark.parametrize(
+    "change", ["DELETE FROM messages WHERE id % 3 = 0 OR id < 50000", "UPDATE messages SET id = -id"]
+)
+def test_of_a_cut_file_no_row_comes_back_that_was_taken_out(tmp_path, change):
+    path = tmp_path / "a.db3"
+    with closing(database(path, page_bytes=512, count=800)) as connection, connection:
+        connection.execute(change)
+        connection.commit()
+        expected = {number: data for number, _, _, data in rows_by_sqlite(connection)}
+    data = path.read_bytes()
+    found, damage = rows_of_cut(path, data[: int(0.7 * len(data))])
+    assert all(expected[number] == payload for number, payload in found.items())
+    assert any("cannot be read" in line for line in damage)
