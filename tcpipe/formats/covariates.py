@@ -58,10 +58,9 @@ class CovariateTable:
 
         Returns
         -------
-        pyarrow.Table
-            N rows; columns are called as the file, without its ending, and the column. Null where no row reaches, or it has no value.
-        ndarray
-            Shape (N,).
+        pyarrow.Table : N rows; columns are called as the file, without its ending, and the column. Null where no row reaches, or it has no
+            value.
+        ndarray : shape (N,).
         """
         wanted = pl.DataFrame({_STAMP: stamp_ns}).with_row_index(_ROW).sort(_STAMP)
         there = self.rows.with_columns(pl.col(_STAMP).alias(_FOUND))

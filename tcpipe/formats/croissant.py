@@ -90,19 +90,13 @@ def croissant(
 
     Parameters
     ----------
-    name, description, licence, creator
-        As the recipe says; an empty one is left out.
-    files
-        Size [byte] and sha256 (hex) of every file by its path inside the dataset.
-    samples_file
-        Which of them holds the samples.
-    samples
-        Its Arrow schema; the fields' metadata give their meanings.
-    version
-        Of the dataset.
-    shards, layers
-        Pattern of the Parquet files that hold the patches, and of each layer how many values a patch has and of which kind (numpy's
-        letter); None where patches are no Parquet.
+    name, description, licence, creator : as the recipe says; an empty one is left out.
+    files : size [byte] and sha256 (hex) of every file by its path inside the dataset.
+    samples_file : which of them holds the samples.
+    samples : its Arrow schema; the fields' metadata give their meanings.
+    version : of the dataset.
+    shards, layers : pattern of the Parquet files that hold the patches, and of each layer how many values a patch has and of which kind
+        (numpy's letter); None where patches are no Parquet.
 
     Returns
     -------

@@ -46,8 +46,7 @@ def read_regions(path: Path) -> Regions:
 
     Raises
     ------
-    RegionError
-        Not GeoJSON, no polygon, empty or self-crossing geometry, coordinates that are no lon/lat, an unknown ``split``,
+    RegionError : not GeoJSON, no polygon, empty or self-crossing geometry, coordinates that are no lon/lat, an unknown ``split``,
         train_test and unseen over the same ground, no train_test region: all problems at once.
     """
     polygons: dict[str, list[BaseGeometry]] = {kind: [] for kind in KINDS}

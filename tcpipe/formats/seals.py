@@ -65,10 +65,8 @@ def read_sealed(path: Path, *, ours: Callable[[Mapping[str, Json]], bool] = lamb
 
     Parameters
     ----------
-    path
-        The document.
-    ours
-        Tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
+    path : the document.
+    ours : tells by kind and version whether it is of those that this version seals; what is not is returned unproved, for the caller to
         refuse.
 
     Raises

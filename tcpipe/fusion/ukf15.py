@@ -122,8 +122,7 @@ def run_ukf15(
 
     Returns
     -------
-    Trajectory
-        At ``output_ns``; each state uses the measurements up to its stamp.
+    Trajectory : at ``output_ns``; each state uses the measurements up to its stamp.
     """
     sources = sources_of(measurements, initial, end_ns=int(output_ns[-1]))
     gates = [_gate(source, gate_probability) for source in sources]
@@ -221,8 +220,7 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
 
     Returns
     -------
-    list of SensorRows
-        In the order in which measurements of one stamp are fused.
+    list of SensorRows : in the order in which measurements of one stamp are fused.
     """
     sensors = (
         _imu_sources(measurements, initial)

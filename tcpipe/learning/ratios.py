@@ -42,12 +42,10 @@ def ratio_of_errors(ours: Floats, theirs: Floats, groups: NDArray[np.generic], *
 
     Parameters
     ----------
-    ours, theirs
-        Losses, not negative, shape (N,): squared errors with ``power`` 0.5 give the ratio of RMSE, absolute ones with 1 that of MAPE.
-    groups
-        Of each sample, shape (N,): its run, or its block of ground.
-    power, seed
-        Of the ratio; of the draws.
+    ours, theirs : losses, not negative, shape (N,): squared errors with ``power`` 0.5 give the ratio of RMSE, absolute ones with 1 that of
+        MAPE.
+    groups : of each sample, shape (N,): its run, or its block of ground.
+    power, seed : of the ratio; of the draws.
     """
     _, at = np.unique(groups, return_inverse=True)
     sums = np.stack([np.bincount(at, losses) for losses in (ours, theirs)], axis=1)

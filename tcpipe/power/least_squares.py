@@ -24,8 +24,7 @@ def non_negative(made: Floats, seen: Floats) -> Floats:
 
     Returns
     -------
-    ndarray
-        Shape (J,).
+    ndarray : shape (J,).
     """
     size, free, vain = np.zeros(made.shape[1]), np.zeros(made.shape[1], np.bool_), np.zeros(made.shape[1], np.bool_)
     rounding = 10.0 * np.finfo(np.float64).eps * np.linalg.norm(made, axis=0) * np.linalg.norm(seen)

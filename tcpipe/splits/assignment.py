@@ -53,31 +53,19 @@ def assign_splits(
 
     Parameters
     ----------
-    ranks
-        Rank of each sample's id for the draw of test, shape (N,).
-    run, run_names
-        Number of each sample's run in the order of recording, shape (N,), and the runs' ids by number.
-    corners_xy_m
-        Corners of the patch footprints in the map's metric plane [m], shape (N, 4, 2).
-    regions
-        In the same plane; without regions every sample is inside.
-    holdout
-        ``sample`` draws ceil(test_fraction · n) samples, of each run those of lowest rank; the others keep groups whole.
-    test_fraction
-        Share of test among the inside samples, after every drop and buffer.
-    block_m
-        Side of a spatial block [m].
-    buffer_m
-        A footprint nearer than this to a region's border is in no split [m].
-    folds
-        Number of folds; blocks (runs, tags, with the holdout ``run``, ``tag``) stay whole in them.
-    seed
-        Seed of the ranks.
-    kept
-        What an earlier dataset decided, "" and `NO_FOLD` where it knew nothing: none of its samples moves, but for those that a region
+    ranks : rank of each sample's id for the draw of test, shape (N,).
+    run, run_names : number of each sample's run in the order of recording, shape (N,), and the runs' ids by number.
+    corners_xy_m : corners of the patch footprints in the map's metric plane [m], shape (N, 4, 2).
+    regions : in the same plane; without regions every sample is inside.
+    holdout : ``sample`` draws ceil(test_fraction · n) samples, of each run those of lowest rank; the others keep groups whole.
+    test_fraction : share of test among the inside samples, after every drop and buffer.
+    block_m : side of a spatial block [m].
+    buffer_m : a footprint nearer than this to a region's border is in no split [m].
+    folds : number of folds; blocks (runs, tags, with the holdout ``run``, ``tag``) stay whole in them.
+    seed : seed of the ranks.
+    kept : what an earlier dataset decided, "" and `NO_FOLD` where it knew nothing: none of its samples moves, but for those that a region
         excludes now.
-    tagged
-        With the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
+    tagged : with the holdout ``tag``: number of each sample's value of the tag, shape (N,), and the values by number.
     """
     n = len(ranks)
     sides = np.zeros(n, np.uint8) if regions is None else sides_of(corners_xy_m, regions, buffer_m=buffer_m)

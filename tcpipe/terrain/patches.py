@@ -82,8 +82,7 @@ def map_px_from_patch(frames: PatchFrames, grid: MapGrid, *, patch_m: float, pat
 
     Returns
     -------
-    numpy.ndarray
-        Shape (N, 6): x and y of patch pixel (0, 0); dx, dy for one column forward; dx, dy for one row to the right [map px].
+    numpy.ndarray : shape (N, 6): x and y of patch pixel (0, 0); dx, dy for one column forward; dx, dy for one row to the right [map px].
     """
     pitch_m = patch_m / patch_px
     reach_m = (patch_m - pitch_m) / 2.0
@@ -97,8 +96,7 @@ def chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points:
 
     Returns
     -------
-    numpy.ndarray
-        Shape (N, 4): x and y of the first point, dx and dy to the next [map px]; point k lies at (k + ½) / points of the chord.
+    numpy.ndarray : shape (N, 4): x and y of the first point, dx and dy to the next [map px]; point k lies at (k + ½) / points of the chord.
     """
     step_m = chord_m[:, None] / points
     first = frames.centre_xy_m + frames.along_xy * (step_m - chord_m[:, None]) / 2.0

@@ -171,9 +171,8 @@ def source_lattice(  # noqa: PLR0917
 
     Returns
     -------
-    numpy.ndarray
-        Shape (A, B, 2), beginning one step above and left of the block and ending at least one step beyond; not finite where the raster's
-        CRS is not defined.
+    numpy.ndarray : shape (A, B, 2), beginning one step above and left of the block and ending at least one step beyond; not finite where
+        the raster's CRS is not defined.
     """
     step = LATTICE_STEP_PX
     i = row0 - step + step * np.arange(-(-rows // step) + 3)

@@ -63,8 +63,7 @@ def metres_from_plane(crs: CRS, xy: FloatArray) -> FloatArray:
 
     Returns
     -------
-    numpy.ndarray
-        Shape (N, 2, 2): metres east and north on the ellipsoid per CRS unit in x and y; NaN where the CRS is not defined.
+    numpy.ndarray : shape (N, 2, 2): metres east and north on the ellipsoid per CRS unit in x and y; NaN where the CRS is not defined.
     """
     geodetic = CRS(crs.geodetic_crs)
     step = 1e-4 if crs.is_geographic else 10.0

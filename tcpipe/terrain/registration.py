@@ -105,12 +105,10 @@ def register_track(source: MapReader, xy_m: FloatArray, height_m: FloatArray) ->
 
     Parameters
     ----------
-    source
-        The map.
-    xy_m
-        Positions of the track in the map's CRS, in the order driven, shape (N, 2) [m]; what is not finite or not on the map is passed over.
-    height_m
-        Their heights above any surface, shape (N,) [m].
+    source : the map.
+    xy_m : positions of the track in the map's CRS, in the order driven, shape (N, 2) [m]; what is not finite or not on the map is passed
+        over.
+    height_m : their heights above any surface, shape (N,) [m].
 
     Returns
     -------

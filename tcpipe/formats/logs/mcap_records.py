@@ -215,10 +215,8 @@ def index_messages(
 
     Returns
     -------
-    right
-        Which of the indexes are what they should be, shape (R,).
-    record, log_time_ns, offset
-        Of each message of those, shape (N,), the number of its index, its log time and its offset in the chunk.
+    right : which of the indexes are what they should be, shape (R,).
+    record, log_time_ns, offset : of each message of those, shape (N,), the number of its index, its log time and its offset in the chunk.
     """
     whole = np.flatnonzero(records + RECORD_HEAD + 6 <= ends)
     right, size = np.zeros(len(records), np.bool_), np.zeros(len(records), np.int64)

@@ -66,26 +66,17 @@ def build_map(
 
     Parameters
     ----------
-    out_path
-        Where the Zarr directory goes; one that is there is replaced once the new one is complete.
-    name
-        The map's name.
-    height, ortho, terrain
-        Rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid (`mosaic`); terrain also as
-        GeoJSON polygons (`terrain_polygons`).
-    more
-        Other layers, put on the grid of these three.
-    classes
-        Class table (CSV or TOML); None takes ``agreed``, else the paper's seven classes, and where the terrain raster names its values,
-        those names say which class each is.
-    agreed
-        The classes of the store's other maps, which this one must share.
-    crs
-        The map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
-    pitch_m
-        Side of a map pixel [m]; None takes the finest raster's.
-    inputs
-        What the caller wants to know the map by later; kept in its facts.
+    out_path : where the Zarr directory goes; one that is there is replaced once the new one is complete.
+    name : the map's name.
+    height, ortho, terrain : rasters in any CRS on the earth, grid and resolution, each in one file or in tiles of one grid (`mosaic`);
+        terrain also as GeoJSON polygons (`terrain_polygons`).
+    more : other layers, put on the grid of these three.
+    classes : class table (CSV or TOML); None takes ``agreed``, else the paper's seven classes, and where the terrain raster names its
+        values, those names say which class each is.
+    agreed : the classes of the store's other maps, which this one must share.
+    crs : the map's CRS, projected and metric, and the CRS of rasters that carry none; None takes the height raster's, or its UTM zone.
+    pitch_m : side of a map pixel [m]; None takes the finest raster's.
+    inputs : what the caller wants to know the map by later; kept in its facts.
 
     Raises
     ------

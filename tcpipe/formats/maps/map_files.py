@@ -145,9 +145,8 @@ def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True)
 
     Raises
     ------
-    MapError
-        There is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were written
-        or a file is gone: lost tiles would read as ground without data.
+    MapError : there is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were
+        written or a file is gone: lost tiles would read as ground without data.
     """
     try:
         group = open_group(path)

@@ -107,8 +107,8 @@ def place_polygons(
 
     Raises
     ------
-    MapError
-        Not GeoJSON, another CRS, unsound geometry, a class that the table does not have, or nothing on the map: all problems at once.
+    MapError : not GeoJSON, another CRS, unsound geometry, a class that the table does not have, or nothing on the map: all problems at
+        once.
     """
     features, problems = _read_all(paths)
     label = f"{paths[0]}" if len(paths) == 1 else f"{paths[0]} … {paths[-1].name} ({len(paths)} files)"
