@@ -318,8 +318,7 @@ class Store:
     def supersede(self, run_id: str, by: str | None) -> None:
         """Remember that another run takes this one's place, or, without ``by``, that it counts again."""
         number = sum(record.run_id == run_id for record in self.records("superseded", Superseded))
-        fact = Superseded(run_id, by, number)
-        self.remember(f"superseded/{record_name(digest(fact))}", fact)
+        self.note("superseded", Superseded(run_id, by, number))
 
     def run_ids(self) -> list[str]:
         """Return the names of all runs, finished or not."""
@@ -417,6 +416,10 @@ class Store:
     def remember(self, name: str, fact: object) -> bool:
         """Remember a fact under ``<kind>/<name>`` for good; return whether it was new."""
         return put_record(self.place.below("records"), name, fact)
+
+    def note(self, kind: str, fact: object) -> bool:
+        """Remember a fact under a name that follows from it; return whether it was new."""
+        return self.remember(f"{kind}/{record_name(digest(fact))}", fact)
 
     def recall(self, name: str, cls: type[T]) -> T | None:
         """Return what is remembered under ``<kind>/<name>``, None where nothing is."""

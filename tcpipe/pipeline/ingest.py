@@ -16,10 +16,9 @@ from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.json_files import digest
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import recipe_of
-from tcpipe.formats.record_files import Call, record_name
+from tcpipe.formats.record_files import Call
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.store_mark import gone_if_empty
 from tcpipe.pipeline.calls import INGEST, remember_call, room_of, started
@@ -273,8 +272,7 @@ def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestR
     trouble = _trouble(source, result)
     try:
         if result.sha256 and source.files and not known.has_seen(source, result.sha256):
-            sighting = source.sighting(result.sha256)
-            store.remember(f"{source.lineage}/{record_name(digest(sighting))}", sighting)
+            store.note(source.lineage, source.sighting(result.sha256))
         if trouble is not None and trouble.kind == "damaged":
             trouble.told(store)
         elif trouble is not None and not result.transient and not result.known:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from tcpipe.formats.json_files import digest
 from tcpipe.formats.logs.joined import AnyLog
 from tcpipe.formats.record_files import Recording, record_name
 from tcpipe.store import Store
@@ -26,8 +25,7 @@ def known_as(store: Store, log: AnyLog) -> str:
 def remember_outline(store: Store, run_id: str, sha256: str, log: AnyLog) -> None:
     """Remember the outline of a run's log."""
     if log.outline:
-        fact = Recording(log.outline, run_id, sha256)
-        store.remember(f"{_kind(log.outline)}/{record_name(digest(fact))}", fact)
+        store.note(_kind(log.outline), Recording(log.outline, run_id, sha256))
 
 
 def _kind(outline: str) -> str:

@@ -11,9 +11,8 @@ import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
-from tcpipe.formats.json_files import digest
 from tcpipe.formats.parquet import read_table
-from tcpipe.formats.record_files import RunName, Superseded, in_force, record_name
+from tcpipe.formats.record_files import RunName, Superseded, in_force
 from tcpipe.pipeline.log_sources import LogSource, is_there
 from tcpipe.store import Store
 
@@ -61,8 +60,7 @@ def remember_earlier(store: Store) -> None:
                 if (known := store.run_json(run_id)) is not None:
                     origin = known.source
                     log = LogSource(tuple(map(Path, origin.paths)), (), urls=origin.paths)
-                    sighting = log.sighting(origin.sha256)
-                    store.remember(f"{log.lineage}/{record_name(digest(sighting))}", sighting)
+                    store.note(log.lineage, log.sighting(origin.sha256))
                     store.remember(f"runs/{origin.sha256}", RunName(origin.sha256, run_id))
 
 

@@ -95,7 +95,7 @@ def _notes(dataset: Path) -> tuple[str, ...]:
     return ()
 
 
-def _stored(path: str) -> tuple[str, Iterator[Finding]] | None:
+def _stored(path: Path | str) -> tuple[str, Iterator[Finding]] | None:
     if inside := inside_store(path):
         return "run", verify_run(*inside)
     if is_store(path):
@@ -110,10 +110,8 @@ def _what(path: Path) -> tuple[str, Iterator[Finding]]:
     place = path.resolve()
     if place.suffix == ".zarr" and not (place.parent / CARD).is_file():
         return "map", verify_map(path)
-    if inside := inside_store(path):
-        return "run", verify_run(*inside)
-    if is_store(path):
-        return "store", verify_store(Store(path))
+    if stored := _stored(path):
+        return stored
     for card, kind in _SEALED_CARDS.items():
         if (path / card).is_file():
             return kind, _sealed_directory(path, card)

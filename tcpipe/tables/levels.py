@@ -52,116 +52,79 @@ _EPOCH = Column(
 )
 
 
+def _stream(name: str, doc: str, *columns: Column) -> TableSchema:
+    return TableSchema(name, "L1", doc, (_STAMP, _LOG_TIME, _EPOCH, *columns))
+
+
+def _or_null(name: str, unit: str, doc: str, frame: str = "") -> Column:
+    """Return a column of numbers that are not always known."""
+    return Column(name, _F64, unit, doc, frame, nullable=True)
+
+
 def _xyz(prefix: str, suffix: str, unit: str, doc: str, frame: str, *, nullable: bool = False) -> tuple[Column, ...]:
     return tuple(Column(f"{prefix}_{axis}_{suffix}", _F64, unit, f"{doc}, {axis}", frame, nullable) for axis in "xyz")
 
 
-GNSS = TableSchema(
+GNSS = _stream(
     "gnss",
-    "L1",
     "Antenna positions, fixes only.",
-    (
-        _STAMP,
-        _LOG_TIME,
-        _EPOCH,
-        Column("lon_deg", _F64, "deg", "longitude of the antenna", "gnss_crs"),
-        Column("lat_deg", _F64, "deg", "latitude of the antenna", "gnss_crs"),
-        Column("alt_m", _F64, "m", "height of the antenna above the ellipsoid", "gnss_crs"),
-        Column("east_var_m2", _F64, "m2", "variance east; null where the receiver gives none", "enu", nullable=True),
-        Column("north_var_m2", _F64, "m2", "variance north; null where the receiver gives none", "enu", nullable=True),
-        Column("up_var_m2", _F64, "m2", "variance up; null where the receiver gives none", "enu", nullable=True),
-        Column("fix_status", pa.int8(), "1", "NavSatStatus: 0 fix, 1 satellite-based, 2 ground-based augmentation"),
-    ),
+    Column("lon_deg", _F64, "deg", "longitude of the antenna", "gnss_crs"),
+    Column("lat_deg", _F64, "deg", "latitude of the antenna", "gnss_crs"),
+    Column("alt_m", _F64, "m", "height of the antenna above the ellipsoid", "gnss_crs"),
+    _or_null("east_var_m2", "m2", "variance east; null where the receiver gives none", "enu"),
+    _or_null("north_var_m2", "m2", "variance north; null where the receiver gives none", "enu"),
+    _or_null("up_var_m2", "m2", "variance up; null where the receiver gives none", "enu"),
+    Column("fix_status", pa.int8(), "1", "NavSatStatus: 0 fix, 1 satellite-based, 2 ground-based augmentation"),
 )
 
-IMU = TableSchema(
+IMU = _stream(
     "imu",
-    "L1",
     "Inertial measurements in the sensor's frame.",
-    (
-        _STAMP,
-        _LOG_TIME,
-        _EPOCH,
-        *_xyz("angular_velocity", "radps", "rad/s", "angular velocity", "sensor"),
-        *_xyz("linear_acceleration", "mps2", "m/s2", "specific force (gravity included)", "sensor"),
-        *(
-            Column(
-                f"quat_{c}", _F64, "1", f"orientation world_from_sensor, {c}; null where absent", "world", nullable=True
-            )
-            for c in "xyzw"
-        ),
-        *(
-            Column(
-                f"{name}_var", _F64, unit, f"mean variance of the {doc}; null where unknown", "sensor", nullable=True
-            )
-            for name, unit, doc in (
-                ("angular_velocity", "rad2/s2", "angular velocity"),
-                ("linear_acceleration", "m2/s4", "specific force"),
-                ("orientation", "rad2", "orientation"),
-            )
-        ),
+    *_xyz("angular_velocity", "radps", "rad/s", "angular velocity", "sensor"),
+    *_xyz("linear_acceleration", "mps2", "m/s2", "specific force (gravity included)", "sensor"),
+    *(_or_null(f"quat_{c}", "1", f"orientation world_from_sensor, {c}; null where absent", "world") for c in "xyzw"),
+    *(
+        _or_null(f"{name}_var", unit, f"mean variance of the {doc}; null where unknown", "sensor")
+        for name, unit, doc in (
+            ("angular_velocity", "rad2/s2", "angular velocity"),
+            ("linear_acceleration", "m2/s4", "specific force"),
+            ("orientation", "rad2", "orientation"),
+        )
     ),
 )
 
 
 def _odometry(name: str, doc: str) -> TableSchema:
-    return TableSchema(
+    return _stream(
         name,
-        "L1",
         doc,
-        (
-            _STAMP,
-            _LOG_TIME,
-            _EPOCH,
-            *_xyz(
-                "velocity",
-                "mps",
-                "m/s",
-                "body velocity; null where the source does not measure it",
-                "child",
-                nullable=True,
-            ),
-            *_xyz(
-                "angular_velocity",
-                "radps",
-                "rad/s",
-                "body angular velocity; null where not measured",
-                "child",
-                nullable=True,
-            ),
-            *_xyz(
-                "velocity_var",
-                "m2ps2",
-                "m2/s2",
-                "variance of the body velocity; null where unknown",
-                "child",
-                nullable=True,
-            ),
-            Column(
-                "yaw_rate_var", _F64, "rad2/s2", "variance of the yaw rate; null where unknown", "child", nullable=True
-            ),
-            *(
-                Column(
-                    f"{axis}_m",
-                    _F64,
-                    "m",
-                    f"pose {axis} in the source's own odom frame; for increments only",
-                    "odom",
-                    nullable=True,
-                )
-                for axis in "xyz"
-            ),
-            *(
-                Column(
-                    f"quat_{c}",
-                    _F64,
-                    "1",
-                    f"pose orientation odom_from_child, {c}; for increments only",
-                    "odom",
-                    nullable=True,
-                )
-                for c in "xyzw"
-            ),
+        *_xyz(
+            "velocity", "mps", "m/s", "body velocity; null where the source does not measure it", "child", nullable=True
+        ),
+        *_xyz(
+            "angular_velocity",
+            "radps",
+            "rad/s",
+            "body angular velocity; null where not measured",
+            "child",
+            nullable=True,
+        ),
+        *_xyz(
+            "velocity_var",
+            "m2ps2",
+            "m2/s2",
+            "variance of the body velocity; null where unknown",
+            "child",
+            nullable=True,
+        ),
+        _or_null("yaw_rate_var", "rad2/s2", "variance of the yaw rate; null where unknown", "child"),
+        *(
+            _or_null(f"{axis}_m", "m", f"pose {axis} in the source's own odom frame; for increments only", "odom")
+            for axis in "xyz"
+        ),
+        *(
+            _or_null(f"quat_{c}", "1", f"pose orientation odom_from_child, {c}; for increments only", "odom")
+            for c in "xyzw"
         ),
     )
 
@@ -171,72 +134,39 @@ VISUAL_ODOMETRY = _odometry(
     "visual_odometry", "Visual odometry: a body twist, or poses to be used as increments, in its own child frame."
 )
 
-GNSS_VELOCITY = TableSchema(
+GNSS_VELOCITY = _stream(
     "gnss_velocity",
-    "L1",
     "Velocity of the antenna over ground as its receiver tells it (Doppler).",
-    (
-        _STAMP,
-        _LOG_TIME,
-        _EPOCH,
-        *(Column(f"{axis}_velocity_mps", _F64, "m/s", f"velocity {axis}", "enu", axis == "up") for axis in _ENU),
-        *(
-            Column(f"{axis}_var_m2ps2", _F64, "m2/s2", f"its variance {axis}; null: not told", "enu", True)
-            for axis in _ENU
-        ),
-        Column("fix_status", pa.int8(), "1", "NavSatStatus as in gnss; -1 where the message tells none"),
-    ),
+    *(Column(f"{axis}_velocity_mps", _F64, "m/s", f"velocity {axis}", "enu", axis == "up") for axis in _ENU),
+    *(_or_null(f"{axis}_var_m2ps2", "m2/s2", f"its variance {axis}; null: not told", "enu") for axis in _ENU),
+    Column("fix_status", pa.int8(), "1", "NavSatStatus as in gnss; -1 where the message tells none"),
 )
 
-POWER = TableSchema(
+POWER = _stream(
     "power",
-    "L1",
     "Voltage and current of each drive rail; a rail's power is their product, the robot's the sum over rails.",
-    (
-        _STAMP,
-        _LOG_TIME,
-        _EPOCH,
-        Column("rail", pa.string(), "", "name of the rail (profile or topic)"),
-        Column("voltage_volt", _F64, "V", "voltage; null where this row carries only a current", nullable=True),
-        Column(
-            "current_amp",
-            _F64,
-            "A",
-            "current, positive when drawn; null where this row carries only a voltage",
-            nullable=True,
-        ),
-    ),
+    Column("rail", pa.string(), "", "name of the rail (profile or topic)"),
+    _or_null("voltage_volt", "V", "voltage; null where this row carries only a current"),
+    _or_null("current_amp", "A", "current, positive when drawn; null where this row carries only a voltage"),
 )
 
-COMMAND = TableSchema(
+COMMAND = _stream(
     "command",
-    "L1",
     "Commanded body velocity.",
-    (
-        _STAMP,
-        _LOG_TIME,
-        _EPOCH,
-        Column("forward_velocity_mps", _F64, "m/s", "commanded forward velocity", "base_link"),
-        Column("yaw_rate_radps", _F64, "rad/s", "commanded yaw rate", "base_link"),
-    ),
+    Column("forward_velocity_mps", _F64, "m/s", "commanded forward velocity", "base_link"),
+    Column("yaw_rate_radps", _F64, "rad/s", "commanded yaw rate", "base_link"),
 )
 
-POSE = TableSchema(
+POSE = _stream(
     "pose",
-    "L1",
     "Positions made elsewhere (SLAM, post-processing), which stand in for GNSS.",
-    (
-        _STAMP,
-        _LOG_TIME,
-        _EPOCH,
-        *(Column(f"{axis}_m", _F64, "m", f"position, {axis}, as it was made", "pose_crs or its own") for axis in "xyz"),
-        Column("lon_deg", _F64, "deg", "longitude; null where no CRS is told", "gnss_crs", nullable=True),
-        Column("lat_deg", _F64, "deg", "latitude; null where no CRS is told", "gnss_crs", nullable=True),
-        Column("alt_m", _F64, "m", "height, as it was made; null where no CRS is told", "gnss_crs", nullable=True),
-        *(
-            Column(f"{name}_var_m2", _F64, "m2", f"variance along {axis}; null where none is given", "", nullable=True)
-            for name, axis in (("east", "x"), ("north", "y"), ("up", "z"))
-        ),
+    *(Column(f"{axis}_m", _F64, "m", f"position, {axis}, as it was made", "pose_crs or its own") for axis in "xyz"),
+    _or_null("lon_deg", "deg", "longitude; null where no CRS is told", "gnss_crs"),
+    _or_null("lat_deg", "deg", "latitude; null where no CRS is told", "gnss_crs"),
+    _or_null("alt_m", "m", "height, as it was made; null where no CRS is told", "gnss_crs"),
+    *(
+        _or_null(f"{name}_var_m2", "m2", f"variance along {axis}; null where none is given", "")
+        for name, axis in (("east", "x"), ("north", "y"), ("up", "z"))
     ),
 )
 
@@ -252,9 +182,9 @@ _TRACK_COLUMNS = (
         Column(f"{axis}_m", _F64, "m", f"base_link {name} of the datum", "enu")
         for axis, name in zip("xyz", ("east", "north", "up"), strict=True)
     ),
-    Column("lon_deg", _F64, "deg", "longitude of base_link; null in a local frame", "gnss_crs", nullable=True),
-    Column("lat_deg", _F64, "deg", "latitude of base_link; null in a local frame", "gnss_crs", nullable=True),
-    Column("alt_m", _F64, "m", "ellipsoidal height of base_link; null in a local frame", "gnss_crs", nullable=True),
+    _or_null("lon_deg", "deg", "longitude of base_link; null in a local frame", "gnss_crs"),
+    _or_null("lat_deg", "deg", "latitude of base_link; null in a local frame", "gnss_crs"),
+    _or_null("alt_m", "m", "ellipsoidal height of base_link; null in a local frame", "gnss_crs"),
     Column("roll_rad", _F64, "rad", "roll", "enu"),
     Column("pitch_rad", _F64, "rad", "pitch, positive nose down (REP-103)", "enu"),
     Column("yaw_rad", _F64, "rad", "yaw of the body, counter-clockwise from true east, [-pi, pi)", "enu"),
@@ -268,44 +198,21 @@ _TRACK_COLUMNS = (
     Column("yaw_std_rad", _F64, "rad", "standard deviation of yaw", "enu"),
     Column("forward_velocity_std_mps", _F64, "m/s", "standard deviation of the forward velocity", "base_link"),
     *(
-        Column(
+        _or_null(
             f"displacement_std_{name}_m",
-            _F64,
             "m",
             f"standard deviation of the horizontal displacement over the next {name}, along it, the correlation of both ends counted; "
             "null where the track does not go on, and without a smoother",
             "enu",
-            nullable=True,
         )
         for name in ("500ms", "1s", "2s", "4s")
     ),
-    Column(
-        "wheel_velocity_mps",
-        _F64,
-        "m/s",
-        "forward velocity by the wheels, interpolated; null without",
-        "base_link",
-        nullable=True,
-    ),
-    Column(
-        "commanded_velocity_mps",
-        _F64,
-        "m/s",
-        "commanded forward velocity, last value; null without",
-        "base_link",
-        nullable=True,
-    ),
-    Column(
-        "commanded_yaw_rate_radps",
-        _F64,
-        "rad/s",
-        "commanded yaw rate, last value; null without",
-        "base_link",
-        nullable=True,
-    ),
-    Column("voltage_volt", _F64, "V", "mean voltage over the rails, interpolated; null without power", nullable=True),
-    Column("current_amp", _F64, "A", "sum of the rails' currents, interpolated; null without power", nullable=True),
-    Column("power_watt", _F64, "W", "sum over rails of voltage times current; null without power", nullable=True),
+    _or_null("wheel_velocity_mps", "m/s", "forward velocity by the wheels, interpolated; null without", "base_link"),
+    _or_null("commanded_velocity_mps", "m/s", "commanded forward velocity, last value; null without", "base_link"),
+    _or_null("commanded_yaw_rate_radps", "rad/s", "commanded yaw rate, last value; null without", "base_link"),
+    _or_null("voltage_volt", "V", "mean voltage over the rails, interpolated; null without power"),
+    _or_null("current_amp", "A", "sum of the rails' currents, interpolated; null without power"),
+    _or_null("power_watt", "W", "sum over rails of voltage times current; null without power"),
 )
 
 TRACK = TableSchema("track", "L2", "The fused track, 20 Hz, base_link.", _TRACK_COLUMNS)
@@ -325,9 +232,7 @@ _SEGMENT_COLUMNS = (
     Column("start_ns", _I64, "ns", "time at the segment's start, interpolated"),
     Column("end_ns", _I64, "ns", "time at the segment's end, interpolated"),
     *(
-        Column(
-            f"{end}_{name}_deg", _F64, "deg", f"{doc} of the {end}; null in a local frame", "gnss_crs", nullable=True
-        )
+        _or_null(f"{end}_{name}_deg", "deg", f"{doc} of the {end}; null in a local frame", "gnss_crs")
         for end in ("start", "end")
         for name, doc in (("lon", "longitude"), ("lat", "latitude"))
     ),
@@ -349,14 +254,7 @@ _SEGMENT_COLUMNS = (
         "DRMS of the horizontal position (root of the sum of both variances), less certain end",
         "enu",
     ),
-    Column(
-        "commanded_velocity_mps",
-        _F64,
-        "m/s",
-        "mean commanded forward velocity; null without commands",
-        "base_link",
-        nullable=True,
-    ),
+    _or_null("commanded_velocity_mps", "m/s", "mean commanded forward velocity; null without commands", "base_link"),
 )
 
 SEGMENTS = TableSchema("segments", "L4", "Steady, straight pieces of one chord each.", _SEGMENT_COLUMNS)
@@ -364,21 +262,17 @@ SEGMENTS = TableSchema("segments", "L4", "Steady, straight pieces of one chord e
 _LABEL_COLUMNS = (
     Column("duration_s", _F64, "s", "T: time from start to end"),
     Column("velocity_mps", _F64, "m/s", "v: chord / duration"),
-    Column("power_watt", _F64, "W", "w: energy / duration; null without power", nullable=True),
-    Column("energy_joule", _F64, "J", "E: integral of voltage times current; null without power", nullable=True),
+    _or_null("power_watt", "W", "w: energy / duration; null without power"),
+    _or_null("energy_joule", "J", "E: integral of voltage times current; null without power"),
     Column("duration_std_s", _F64, "s", "standard deviation of the duration, as a label of the true metre"),
     Column("velocity_std_mps", _F64, "m/s", "standard deviation of the velocity, likewise"),
-    Column("power_std_watt", _F64, "W", "standard deviation of the power, likewise; null without power", nullable=True),
-    Column(
-        "energy_std_joule", _F64, "J", "standard deviation of the energy, likewise; null without power", nullable=True
-    ),
+    _or_null("power_std_watt", "W", "standard deviation of the power, likewise; null without power"),
+    _or_null("energy_std_joule", "J", "standard deviation of the energy, likewise; null without power"),
     *STANDING_COLUMNS,
-    Column(
+    _or_null(
         "physics_power_watt",
-        _F64,
         "W",
         "power by standing, drivetrain, rolling, grade and turning alone, fitted on the run; null without power or fit",
-        nullable=True,
     ),
     Column("power_samples", pa.int32(), "1", "power samples inside the segment"),
     Column("quality", pa.uint32(), "bits", "what a user may want to know, 0 = clean", flags=Quality),
@@ -423,9 +317,7 @@ SAMPLES = TableSchema(
             nullable=True,
         ),
         Column("terrain_name", pa.string(), "", "its name; null without a terrain layer", nullable=True),
-        Column(
-            "terrain_purity", _F64, "1", "share of the chord on that class; null without a terrain layer", nullable=True
-        ),
+        _or_null("terrain_purity", "1", "share of the chord on that class; null without a terrain layer"),
         Column(
             "slope_rad", _F64, "rad", "slope of a plane fitted to the patch's heights, positive uphill along travel"
         ),
@@ -450,14 +342,8 @@ REJECTIONS = TableSchema(
         Column("stamp_ns", _I64, "ns", "time of the measurement"),
         Column("role", pa.string(), "", "gnss, gnss_velocity, imu, wheel_odometry, visual_odometry"),
         Column("reason", pa.string(), "", "gate: chi-square; invalid: not finite; covariance: unusable"),
-        Column(
-            "normalized_innovation_squared",
-            _F64,
-            "1",
-            "innovation' S^-1 innovation; null where not computed",
-            nullable=True,
-        ),
-        Column("threshold", _F64, "1", "the gate; null where not computed", nullable=True),
+        _or_null("normalized_innovation_squared", "1", "innovation' S^-1 innovation; null where not computed"),
+        _or_null("threshold", "1", "the gate; null where not computed"),
     ),
 )
 

@@ -45,7 +45,7 @@ from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
 from tcpipe.formats.published import has_card, here_by_range, published, settle
 from tcpipe.formats.recipe_toml import recipe_of
-from tcpipe.formats.record_files import Call, DatasetMade, record_name
+from tcpipe.formats.record_files import Call, DatasetMade
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
@@ -261,7 +261,7 @@ def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Input
     where = result.path if is_url(result.path) else str(Path(result.path).absolute())
     made = DatasetMade(where, inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
     with suppress(StoreError):
-        store.remember(f"datasets/{record_name(digest(made))}", made)
+        store.note("datasets", made)
     counts, written = {"runs": len(inputs.runs), "samples": 0, "unchanged": 1}, 0
     if result.status == "done":
         counts, written = counts | {"samples": result.samples, "unchanged": 0}, size

@@ -166,12 +166,8 @@ class _Batches(Sequence[_Batch]):
     """The batches, each made when it is asked for, so that one copy of its segments exists at a time."""
 
     rows: Sequence[NDArray[np.int64]]
-    ranks: NDArray[np.uint64]
-    segments: pa.Table
-    maps: MapPlaces
-    config: SampleConfig
-    gnss_crs: str
-    spool: Spool
+    whole: _Batch
+    """All segments, as if they were one."""
 
     def __len__(self) -> int:
         """Return the number of batches."""
@@ -186,8 +182,8 @@ class _Batches(Sequence[_Batch]):
         if isinstance(index, slice):
             return replace(self, rows=self.rows[index])
         rows = self.rows[index]
-        segments = self.segments.take(pa.array(rows))
-        return _Batch(index, self.ranks[rows], segments, self.maps, self.config, self.gnss_crs, self.spool)
+        segments = self.whole.segments.take(pa.array(rows))
+        return replace(self.whole, number=index, ranks=self.whole.ranks[rows], segments=segments)
 
 
 def sample_all_segments(
@@ -222,7 +218,7 @@ def sample_all_segments(
     if there := len(spool.place.files()):
         logger.info("going on where it was: %d of %d batches are sampled", there, len(rows))
     placed = segments.select(PLACED_SEGMENTS.names())
-    batches = _Batches(rows, ranks, placed, maps, config, gnss_crs, spool)
+    batches = _Batches(rows, _Batch(0, ranks, placed, maps, config, gnss_crs, spool))
     lost_by, slots = np.zeros(segments.num_rows, np.uint32), np.zeros(segments.num_rows, np.int64)
     counts, columns = [0] * len(rows), dict[str, NDArray[Any]]()
     warnings: dict[int, tuple[str, ...]] = {}
