@@ -49,7 +49,6 @@ from tcpipe.errors import UsageError
     "--ortho-bands",
     type=click.Choice(("grey", "rgb")),
     default="grey",
-    show_default=True,
     help="rgb keeps red, green and blue as layers beside the grey.",
 )
 @click.option(

@@ -54,7 +54,7 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
 @recipe_option
 @jobs_option("Runs sampled")
 @cluster_option
-@click.option("--format", "file_format", default="zarr", show_default=True, type=click.Choice(["zarr", "parquet"]))
+@click.option("--format", "file_format", default="zarr", type=click.Choice(["zarr", "parquet"]))
 @click.option(
     "--holdout",
     metavar="HOW",

@@ -30,15 +30,7 @@ if TYPE_CHECKING:
 @model_argument
 @click.argument("out", default="cost-map", type=PUBLISHED, metavar="[OUT]")
 @map_option
-@click.option(
-    "--step",
-    "step_m",
-    default=1.0,
-    show_default=True,
-    type=FloatRange(0.05, 1000.0),
-    metavar="METRES",
-    help="Side of a cell.",
-)
+@click.option("--step", "step_m", default=1.0, type=FloatRange(0.05, 1000.0), metavar="METRES", help="Side of a cell.")
 @click.option(
     "--origin",
     "origin_deg",

@@ -11,7 +11,7 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, quiet_option
 
 @click.command(short_help="See everything work on a simulated site")
 @click.argument("directory", default="tcpipe-demo", type=OUTPUT_DIRECTORY, metavar="[DIR]")
-@click.option("--seed", default=1, show_default=True, type=SEED, help="Same seed, same site.")
+@click.option("--seed", default=1, type=SEED, help="Same seed, same site.")
 @quiet_option
 def demo(directory: str, *, seed: int, quiet: bool) -> None:
     """Simulate a small site and two drives, run the whole pipeline on them, and say what to open.

@@ -20,19 +20,13 @@ from tcpipe.cli.options import (
 @model_argument
 @click.argument("dataset", type=SEALED, metavar="DATASET")
 @click.argument("out", default="evaluation", type=PUBLISHED, metavar="[OUT]")
+@click.option("--draws", default=5, type=click.IntRange(1, 1000), help="Draws of noise for each ablated input set.")
 @click.option(
-    "--draws",
-    default=5,
-    show_default=True,
-    type=click.IntRange(1, 1000),
-    help="Draws of noise for each ablated input set.",
-)
-@click.option(
-    "--baselines/--no-baselines", default=True, show_default=True,
+    "--baselines/--no-baselines", default=True,
     help="Train the height-only networks of Wei and Isler: one of grass, one a class.",
 )  # fmt: skip
 @click.option("--retrain", is_flag=True, help="Train a network for each input set of the ablation, too (six more).")
-@click.option("--seed", default=0, show_default=True, type=SEED, help="Of the noise.")
+@click.option("--seed", default=0, type=SEED, help="Of the noise.")
 @click.option(
     "--drive", "drives", multiple=True, metavar="LOG",
     help="Measure MODEL on a whole drive instead: an ingested log, by its path or its run's name; may be repeated.",

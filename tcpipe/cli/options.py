@@ -138,7 +138,6 @@ store_option = click.option(
     "--store",
     envvar="TCPIPE_STORE",
     default="tcpipe-store",
-    show_default=True,
     type=PUBLISHED,
     metavar="DIR|URL",
     help="Where runs and maps are kept (or TCPIPE_STORE).",
@@ -217,16 +216,12 @@ def tag_option(about: str) -> Option:
 
 def jobs_option(about: str) -> Option:
     """Return ``--jobs``."""
-    return click.option(
-        "--jobs", "-j", default=1, show_default=True, type=click.IntRange(1, 1024), help=f"{about} side by side."
-    )
+    return click.option("--jobs", "-j", default=1, type=click.IntRange(1, 1024), help=f"{about} side by side.")
 
 
 def min_age_option(default: str, about: str) -> Option:
     """Return ``--min-age``."""
-    return click.option(
-        "--min-age", "min_age_s", default=default, show_default=True, metavar="T", callback=duration_value, help=about
-    )
+    return click.option("--min-age", "min_age_s", default=default, metavar="T", callback=duration_value, help=about)
 
 
 dry_run_option = click.option(

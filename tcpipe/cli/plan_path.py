@@ -27,11 +27,7 @@ from tcpipe.cli.options import (
 @click.option("--from", "start", required=True, type=LonLat(), help="Where it begins (WGS84, degrees).")
 @click.option("--to", "goal", required=True, type=LonLat(), help="Where it ends.")
 @click.option(
-    "--objective",
-    default="energy",
-    show_default=True,
-    type=click.Choice(["energy", "time", "distance"]),
-    help="What is to be least.",
+    "--objective", default="energy", type=click.Choice(["energy", "time", "distance"]), help="What is to be least."
 )
 @click.option(
     "--map",
@@ -40,9 +36,7 @@ from tcpipe.cli.options import (
     shell_complete=complete_maps,
     help="Map to plan on (default: the only one in the store).",
 )
-@click.option(
-    "--out", default="plan.geojson", show_default=True, type=OUTPUT_FILE, metavar="FILE", help="The path as GeoJSON."
-)
+@click.option("--out", default="plan.geojson", type=OUTPUT_FILE, metavar="FILE", help="The path as GeoJSON.")
 @click.option(
     "--picture", type=OUTPUT_FILE, metavar="FILE", help="Draw all three objectives side by side on the hill (.png)."
 )
@@ -56,7 +50,6 @@ from tcpipe.cli.options import (
     "--step",
     "step_m",
     default=1.0,
-    show_default=True,
     type=FloatRange(0.05, 1000.0),
     metavar="METRES",
     help="Side of a cell; that of --cost-map rules.",

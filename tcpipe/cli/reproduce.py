@@ -10,16 +10,14 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, jobs_option, json_option, quiet
 @click.command(short_help="The paper's experiment, on a simulated site")
 @click.argument("directory", default="tcpipe-reproduction", type=OUTPUT_DIRECTORY, metavar="[DIR]")
 @click.option("--quick", is_flag=True, help="Minutes: a small site and a narrow network, to see it run.")
-@click.option(
-    "--seeds", default=1, show_default=True, type=click.IntRange(1, 100), help="Trainings; claims compare their means."
-)
+@click.option("--seeds", default=1, type=click.IntRange(1, 100), help="Trainings; claims compare their means.")
 @jobs_option("Logs read")
 @click.option(
-    "--hidden", default=1.0, show_default=True, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
+    "--hidden", default=1.0, type=click.FloatRange(0.0, 10.0), metavar="FACTOR",
     help="Variance of the resistance that nothing shows, over that of the frozen site.",
 )  # fmt: skip
 @click.option(
-    "--baselines/--no-baselines", default=True, show_default=True,
+    "--baselines/--no-baselines", default=True,
     help="Train the height-only networks of Wei and Isler, which take most of the time.",
 )  # fmt: skip
 @json_option

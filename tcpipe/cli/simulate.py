@@ -14,12 +14,11 @@ from tcpipe.cli.options import OUTPUT_DIRECTORY, SEED, complete_scenarios, json_
 @click.option(
     "--scenario",
     default="demo",
-    show_default=True,
     metavar="NAME",
     shell_complete=complete_scenarios,
     help="demo, hills12, paper, paper_quick, manoeuvres, tiny; see docs/reference/simulation.md.",
 )
-@click.option("--seed", default=1, show_default=True, type=SEED, help="Same seed, same site.")
+@click.option("--seed", default=1, type=SEED, help="Same seed, same site.")
 @json_option
 @quiet_option
 def simulate(out: str, *, scenario: str, seed: int, as_json: bool, quiet: bool) -> None:

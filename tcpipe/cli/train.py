@@ -22,35 +22,24 @@ _OF_THE_NETWORK = {"epochs", "patience", "batch", "learning_rate", "fold", "mirr
     "--label and --beside alone (default: a table of fewer than 20000 samples, else, and with the network's own options, the network).",
 )  # fmt: skip
 @click.option(
-    "--loss", default="nrmse", show_default=True, type=click.Choice(["nrmse", "paper_eq4"]),
+    "--loss", default="nrmse", type=click.Choice(["nrmse", "paper_eq4"]),
     help="paper_eq4 is the paper's equation 4 as printed; nrmse makes both errors dimensionless.",
 )  # fmt: skip
-@click.option("--epochs", default=100, show_default=True, type=click.IntRange(1, 100_000), help="At most.")
-@click.option(
-    "--patience",
-    default=12,
-    show_default=True,
-    type=click.IntRange(1, 100_000),
-    help="Epochs without a better held-out loss.",
-)
-@click.option("--batch", default=64, show_default=True, type=click.IntRange(1, 65_536), help="Samples in a batch.")
-@click.option("--learning-rate", default=1e-4, show_default=True, type=FloatRange(0.0, 1.0, min_open=True))
-@click.option(
-    "--fold", default=0, show_default=True, type=click.IntRange(0, 99), help="Fold of train to stop early by."
-)
-@click.option(
-    "--mirror/--no-mirror", default=True, show_default=True, help="Mirror every other patch across its travel."
-)
+@click.option("--epochs", default=100, type=click.IntRange(1, 100_000), help="At most.")
+@click.option("--patience", default=12, type=click.IntRange(1, 100_000), help="Epochs without a better held-out loss.")
+@click.option("--batch", default=64, type=click.IntRange(1, 65_536), help="Samples in a batch.")
+@click.option("--learning-rate", default=1e-4, type=FloatRange(0.0, 1.0, min_open=True))
+@click.option("--fold", default=0, type=click.IntRange(0, 99), help="Fold of train to stop early by.")
+@click.option("--mirror/--no-mirror", default=True, help="Mirror every other patch across its travel.")
 @click.option("--weights", is_flag=True, help="Weigh each label by its inverse variance.")
 @click.option(
     "--width",
     default=64,
-    show_default=True,
     type=click.IntRange(16, 512),
     help="Filters of the first stage, a multiple of 16; 64 is ResNet-18.",
 )
 @click.option(
-    "--label", default="total", show_default=True, type=click.Choice(["total", "above_standing"]),
+    "--label", default="total", type=click.Choice(["total", "above_standing"]),
     help="Energy to train on: all that was measured, or less what the robot draws while it stands.",
 )  # fmt: skip
 @click.option(
@@ -58,7 +47,7 @@ _OF_THE_NETWORK = {"epochs", "patience", "batch", "learning_rate", "fold", "mirr
     is_flag=True,
     help="Tell it the turn and the commanded speed of each metre beside its patch; the paper does not.",
 )
-@click.option("--seed", default=0, show_default=True, type=SEED, help="Of weights, shuffles and mirrors.")
+@click.option("--seed", default=0, type=SEED, help="Of weights, shuffles and mirrors.")
 @click.option("--fresh", is_flag=True, help="Do not go on from where an earlier training was stopped.")
 @json_option
 @quiet_option
