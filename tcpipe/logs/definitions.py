@@ -9,6 +9,32 @@ in NOTICE. Constants and comments are left out: they change no byte.
 
 from __future__ import annotations
 
+# What husarion_ugv_msgs took over from panther_msgs as it was.
+_FAULT_FLAG = """\
+bool overheat
+bool overvoltage
+bool undervoltage
+bool short_circuit
+bool emergency_stop
+bool motor_or_sensor_setup_fault
+bool mosfet_failure
+bool default_config_loaded_at_startup
+"""
+_SCRIPT_FLAG = """\
+bool loop_error
+bool encoder_disconnected
+bool amp_limiter
+"""
+_RUNTIME_ERROR = """\
+bool amps_limit_active
+bool motor_stall
+bool loop_error
+bool safety_stop_active
+bool forward_limit_triggered
+bool reverse_limit_triggered
+bool amps_trigger_activated
+"""
+
 DEFINITIONS: dict[str, str] = {
     "husky_msgs/msg/HuskyStatus": """\
 std_msgs/Header header
@@ -119,30 +145,9 @@ bool driver_state_data_timed_out
 bool can_error
 bool heartbeat_timeout
 """,
-    "husarion_ugv_msgs/msg/FaultFlag": """\
-bool overheat
-bool overvoltage
-bool undervoltage
-bool short_circuit
-bool emergency_stop
-bool motor_or_sensor_setup_fault
-bool mosfet_failure
-bool default_config_loaded_at_startup
-""",
-    "husarion_ugv_msgs/msg/ScriptFlag": """\
-bool loop_error
-bool encoder_disconnected
-bool amp_limiter
-""",
-    "husarion_ugv_msgs/msg/RuntimeError": """\
-bool amps_limit_active
-bool motor_stall
-bool loop_error
-bool safety_stop_active
-bool forward_limit_triggered
-bool reverse_limit_triggered
-bool amps_trigger_activated
-""",
+    "husarion_ugv_msgs/msg/FaultFlag": _FAULT_FLAG,
+    "husarion_ugv_msgs/msg/ScriptFlag": _SCRIPT_FLAG,
+    "husarion_ugv_msgs/msg/RuntimeError": _RUNTIME_ERROR,
     "panther_msgs/msg/DriverState": """\
 std_msgs/Header header
 panther_msgs/MotorControllerState front
@@ -166,30 +171,9 @@ bool driver_state_data_timed_out
 bool can_error
 bool heartbeat_timeout
 """,
-    "panther_msgs/msg/FaultFlag": """\
-bool overheat
-bool overvoltage
-bool undervoltage
-bool short_circuit
-bool emergency_stop
-bool motor_or_sensor_setup_fault
-bool mosfet_failure
-bool default_config_loaded_at_startup
-""",
-    "panther_msgs/msg/ScriptFlag": """\
-bool loop_error
-bool encoder_disconnected
-bool amp_limiter
-""",
-    "panther_msgs/msg/RuntimeError": """\
-bool amps_limit_active
-bool motor_stall
-bool loop_error
-bool safety_stop_active
-bool forward_limit_triggered
-bool reverse_limit_triggered
-bool amps_trigger_activated
-""",
+    "panther_msgs/msg/FaultFlag": _FAULT_FLAG,
+    "panther_msgs/msg/ScriptFlag": _SCRIPT_FLAG,
+    "panther_msgs/msg/RuntimeError": _RUNTIME_ERROR,
     "unitree_go/msg/LowState": """\
 uint8[2] head
 uint8 level_flag
