@@ -22,6 +22,8 @@ from tcpipe.fusion.process import turn_sources
 from tcpipe.fusion.signals import integral, interval_means, median_of_five, seconds
 from tcpipe.geometry.rotation import quat_from_rpy, rotate, rpy_from_quat
 
+Floats = NDArray[np.float64]
+
 _MIN_COURSE_M = 5.0
 _MIN_COURSE_STD = 10.0
 _MIN_SPEED_MPS = 0.2
@@ -62,13 +64,13 @@ def find_initial_state(measurements: Measurements, standing_ns: NDArray[np.int64
     )
 
 
-def _gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[np.int64]) -> tuple[NDArray[np.float64], float]:
+def _gyro_bias(imu: InertialMeasurements | None, standing_ns: NDArray[np.int64]) -> tuple[Floats, float]:
     if imu is None or standing_ns.size == 0:
         return np.zeros(3), _GYRO_BIAS_STD_RADPS
     inside = (imu.stamp_ns >= standing_ns[0, 0]) & (imu.stamp_ns <= standing_ns[0, 1])
     if inside.sum() < 10:
         return np.zeros(3), _GYRO_BIAS_STD_RADPS
-    mean: NDArray[np.float64] = imu.angular_velocity_radps[inside].mean(0)
+    mean: Floats = imu.angular_velocity_radps[inside].mean(0)
     return mean, max(0.002, imu.gyro_std_radps / np.sqrt(inside.sum()))
 
 
@@ -96,7 +98,7 @@ def _tilt(
 class _Path:
     """The path drawn by odometry and gyroscope from the origin with yaw zero: a function of time, held outside the odometry."""
 
-    def __init__(self, measurements: Measurements, start_ns: int, bias: NDArray[np.float64]) -> None:
+    def __init__(self, measurements: Measurements, start_ns: int, bias: Floats) -> None:
         self.start_ns = start_ns
         self._yaw_s, self._yaw_rate = _yaw_rate_samples(measurements, start_ns, bias)
         source = _speed_source(measurements)
@@ -109,14 +111,14 @@ class _Path:
         yaw = self.yaw(self._stamp_s)
         self._velocity = self._speed[:, None] * np.stack((np.cos(yaw), np.sin(yaw)), -1)
 
-    def yaw(self, at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+    def yaw(self, at_s: Floats) -> Floats:
         """Yaw turned since the start [rad]."""
         if self._yaw_s.size == 0:
             return np.zeros(at_s.size)
         turned = integral(self._yaw_s, self._yaw_rate, at_s) - integral(self._yaw_s, self._yaw_rate, np.zeros(1))
         return turned[:, 0]
 
-    def antenna(self, at_s: NDArray[np.float64]) -> NDArray[np.complex128]:
+    def antenna(self, at_s: Floats) -> NDArray[np.complex128]:
         """Antenna east + i north [m] as drawn."""
         antenna = np.asarray(complex(*self._lever) * np.exp(1j * self.yaw(at_s)), np.complex128)
         if self.known:
@@ -132,7 +134,7 @@ class _Path:
         speed = np.abs(self._speed)[:, None]
         return float(np.diff(integral(self._stamp_s, speed, np.array([0.0, max(until_s, 0.0)])), axis=0)[0, 0])
 
-    def start_velocity(self, yaw: float, pitch: float) -> tuple[NDArray[np.float64], float]:
+    def start_velocity(self, yaw: float, pitch: float) -> tuple[Floats, float]:
         """Velocity at the start [m/s] and its standard deviation."""
         if not self.known:
             return np.zeros(3), 1.0
@@ -140,9 +142,7 @@ class _Path:
         return speed * np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), -np.sin(pitch)]), 0.3
 
 
-def _yaw_rate_samples(
-    measurements: Measurements, start_ns: int, bias: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _yaw_rate_samples(measurements: Measurements, start_ns: int, bias: Floats) -> tuple[Floats, Floats]:
     imu = measurements.imu
     if imu is not None and imu.stamp_ns.size:
         return seconds(imu.stamp_ns, start_ns), imu.angular_velocity_radps[:, 2:] - bias[2]
@@ -219,9 +219,7 @@ def _course_fit(gnss: Positions, path: _Path, start_ns: int) -> _Fit | None:
     return best
 
 
-def _fit(
-    fixes: NDArray[np.complex128], drawn: NDArray[np.complex128], stamp_s: NDArray[np.float64], noise_m: float
-) -> _Fit | None:
+def _fit(fixes: NDArray[np.complex128], drawn: NDArray[np.complex128], stamp_s: Floats, noise_m: float) -> _Fit | None:
     """Lay the drawn path over the fixes by the rotation (and scale) that fits best."""
     a, b = fixes - fixes.mean(), drawn - drawn.mean()
     extent2 = float(np.sum(np.abs(b) ** 2))
@@ -233,15 +231,13 @@ def _fit(
     return _Fit(float(np.angle(product)), float(std), residual, float(stamp_s.mean()))
 
 
-def _course(fixes: NDArray[np.complex128], turned: NDArray[np.float64], stamp_s: NDArray[np.float64]) -> _Fit:
+def _course(fixes: NDArray[np.complex128], turned: Floats, stamp_s: Floats) -> _Fit:
     """Without odometry: each step between fixes goes forward, turned back by the yaw turned until then."""
     middle = 0.5 * (turned[1:] + turned[:-1])
     return _Fit(float(np.angle(np.sum(np.diff(fixes) * np.exp(-1j * middle)))), 0.2, 0.0, float(stamp_s.mean()))
 
 
-def _position(
-    gnss: Positions | None, path: _Path, quat: NDArray[np.float64], yaw: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _position(gnss: Positions | None, path: _Path, quat: Floats, yaw: float) -> tuple[Floats, Floats]:
     """base_link at the start and its standard deviation: the median of what the first fixes say, the drawn way taken off."""
     if gnss is None or gnss.stamp_ns.size == 0:
         return np.zeros(3), np.full(3, 1e-3)
@@ -256,6 +252,6 @@ def _position(
         ]
     )
     driven = path.length(float(at_s[-1]))
-    std: NDArray[np.float64] = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
+    std: Floats = 3 * np.sqrt(np.median(gnss.variance_m2[few], axis=0))
     std += np.array([0.1, 0.1, 0.2]) * max(driven, 1.0)
     return position, std

@@ -19,7 +19,11 @@ from tcpipe.fusion.signals import median_period_ns, white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate
 
-Columns = Mapping[str, NDArray[np.float64]]
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+Columns = Mapping[str, Floats]
 """Columns of a stream by name, null as NaN."""
 
 _NO_TRUST = 1e6
@@ -44,15 +48,13 @@ _POSE_AXES = (
 class Prepared:
     """How a stream was prepared: stamps of rows without use, rows of a repeated stamp, variances replaced; and remarks for people."""
 
-    invalid_ns: NDArray[np.int64]
+    invalid_ns: Ints
     repeated: int = 0
     variances_replaced: int = 0
     remarks: tuple[str, ...] = ()
 
 
-def find_datum(
-    lon_deg: NDArray[np.float64], lat_deg: NDArray[np.float64], alt_m: NDArray[np.float64]
-) -> tuple[float, float, float] | None:
+def find_datum(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> tuple[float, float, float] | None:
     """Return longitude [deg], latitude [deg], height [m]: the median of the first ten fixes; None where there is none."""
     usable = np.flatnonzero(_is_fix(lon_deg, lat_deg, alt_m))[:_DATUM_FIXES]
     if usable.size == 0:
@@ -63,16 +65,14 @@ def find_datum(
     return float(lon), float(np.median(lat_deg[usable])), float(np.median(alt_m[usable]))
 
 
-def _is_fix(
-    lon_deg: NDArray[np.float64], lat_deg: NDArray[np.float64], alt_m: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    fix: NDArray[np.bool_] = np.isfinite(lon_deg) & np.isfinite(lat_deg) & np.isfinite(alt_m)
+def _is_fix(lon_deg: Floats, lat_deg: Floats, alt_m: Floats) -> Mask:
+    fix: Mask = np.isfinite(lon_deg) & np.isfinite(lat_deg) & np.isfinite(alt_m)
     fix &= (np.abs(lat_deg) <= 90) & (np.abs(lon_deg) <= 360) & ~((lon_deg == 0) & (lat_deg == 0))
     return fix
 
 
 def positions(
-    stamp_ns: NDArray[np.int64],
+    stamp_ns: Ints,
     columns: Columns,
     *,
     datum_deg_m: tuple[float, float, float],
@@ -92,9 +92,7 @@ def positions(
     return Positions(stamp_ns[usable], fixes, variance, lever_arm_m, unclaimed if unclaimed.any() else None), prepared
 
 
-def ground_velocities(
-    stamp_ns: NDArray[np.int64], columns: Columns, *, default_std_mps: float
-) -> tuple[GroundVelocities, Prepared]:
+def ground_velocities(stamp_ns: Ints, columns: Columns, *, default_std_mps: float) -> tuple[GroundVelocities, Prepared]:
     """Prepare a receiver's velocities (columns of the role gnss_velocity); unknown variances: ``default_std_mps``, twice that for up."""
     velocity = _matrix(columns, [f"{axis}_velocity_mps" for axis in ("east", "north", "up")])
     variance = _matrix(columns, [f"{axis}_var_m2ps2" for axis in ("east", "north", "up")])
@@ -109,7 +107,7 @@ def ground_velocities(
 
 
 def body_velocities(
-    stamp_ns: NDArray[np.int64],
+    stamp_ns: Ints,
     columns: Columns,
     *,
     xyz_m: tuple[float, float, float],
@@ -170,7 +168,7 @@ def body_velocities(
     return made, Prepared(stamp_ns[~measured], repeated, replaced, remarks)
 
 
-def _turned(matrix: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _turned(matrix: Floats, values: Floats) -> Floats:
     """Return ``matrix`` (3, 3) times vectors (N, 3); NaN, what is not measured, makes each axis NaN into which it turns."""
     unknown = np.isnan(values)
     turned = np.where(unknown, 0.0, values) @ matrix.T
@@ -178,7 +176,7 @@ def _turned(matrix: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray
 
 
 def inertial(
-    stamp_ns: NDArray[np.int64],
+    stamp_ns: Ints,
     columns: Columns,
     *,
     xyz_m: tuple[float, float, float],
@@ -194,7 +192,7 @@ def inertial(
     rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
     # NaN compares false.
-    good: NDArray[np.bool_] = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
+    good: Mask = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
     usable, repeated = _usable(stamp_ns, good)
     rate, force = rate[usable], force[usable]
     norm = float(np.median(np.linalg.norm(force, axis=1))) if usable.size else 0.0
@@ -224,9 +222,7 @@ def inertial(
     return made, Prepared(stamp_ns[~good], repeated, 0, remarks)
 
 
-def _lever_acceleration(
-    stamp_ns: NDArray[np.int64], turn_radps: NDArray[np.float64], lever_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _lever_acceleration(stamp_ns: Ints, turn_radps: Floats, lever_m: Floats) -> Floats:
     """Acceleration of the unit against base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
 
     The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time,
@@ -236,11 +232,11 @@ def _lever_acceleration(
         return np.zeros_like(turn_radps)
     smooth = np.pad(turn_radps, ((2, 2), (0, 0)), mode="edge")
     slope = (2 * (smooth[4:] - smooth[:-4]) + smooth[3:-1] - smooth[1:-3]) / (10e-9 * median_period_ns(stamp_ns))
-    acceleration: NDArray[np.float64] = np.cross(slope, lever_m) + np.cross(turn_radps, np.cross(turn_radps, lever_m))
+    acceleration: Floats = np.cross(slope, lever_m) + np.cross(turn_radps, np.cross(turn_radps, lever_m))
     return acceleration
 
 
-def _local_noise(stamp_ns: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _local_noise(stamp_ns: Ints, values: Floats) -> Floats:
     """Estimate the white noise over two seconds around each sample, the largest of the axes, shape (N,)."""
     if values.shape[0] < 3:
         return np.zeros(values.shape[0])
@@ -255,25 +251,23 @@ def _local_noise(stamp_ns: NDArray[np.int64], values: NDArray[np.float64]) -> ND
     return np.asarray(np.sqrt(largest / np.maximum(last - first, 1)))
 
 
-def _matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> NDArray[np.float64]:
+def _matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> Floats:
     return np.stack([columns[name] for name in names], -1)
 
 
-def _usable(stamp_ns: NDArray[np.int64], good: NDArray[np.bool_]) -> tuple[NDArray[np.int64], int]:
+def _usable(stamp_ns: Ints, good: Mask) -> tuple[Ints, int]:
     """Return rows in order of time, one a stamp (the first of equals), and how many repeated one."""
     rows = np.flatnonzero(good)
     _, first = np.unique(stamp_ns[rows], return_index=True)
     return rows[first], int(rows.size - first.size)
 
 
-def _known(variance: NDArray[np.float64]) -> NDArray[np.bool_]:
-    known: NDArray[np.bool_] = np.isfinite(variance) & (variance > 0)
+def _known(variance: Floats) -> Mask:
+    known: Mask = np.isfinite(variance) & (variance > 0)
     return known
 
 
-def _variances(
-    variance: NDArray[np.float64], default: NDArray[np.float64], floor: float
-) -> tuple[NDArray[np.float64], int]:
+def _variances(variance: Floats, default: Floats, floor: float) -> tuple[Floats, int]:
     """Return usable variances (N, k) and how many rows had one replaced."""
     known = _known(variance)
     filled = np.clip(np.where(known, variance, default), floor, _NO_TRUST)

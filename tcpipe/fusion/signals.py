@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
-def seconds(stamp_ns: NDArray[np.int64] | int, zero_ns: int) -> NDArray[np.float64]:
+
+def seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
     """Return the time since ``zero_ns`` [s]; the difference is taken before rounding."""
     return np.asarray(np.asarray(stamp_ns, np.int64) - zero_ns, np.float64) * 1e-9
 
 
-def integral(
-    stamp_s: NDArray[np.float64], values: NDArray[np.float64], at_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def integral(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
     """Return the integral, from the first sample on, of the piecewise-linear signal through the samples.
 
     Parameters
@@ -38,27 +39,23 @@ def integral(
         (values[later] - values[index]) / np.where(later > index, stamp_s[later] - stamp_s[index], 1.0)[:, None],
         0.0,
     )
-    partial: NDArray[np.float64] = total[index] + after * (values[index] + 0.5 * after * slope)
+    partial: Floats = total[index] + after * (values[index] + 0.5 * after * slope)
     return partial
 
 
-def interval_means(
-    stamp_s: NDArray[np.float64], values: NDArray[np.float64], start_s: NDArray[np.float64], end_s: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def interval_means(stamp_s: Floats, values: Floats, start_s: Floats, end_s: Floats) -> Floats:
     """Return the mean of the piecewise-linear signal over each interval, shape (M, k); its value where the interval is empty."""
     width = (end_s - start_s)[:, None]
     mean = (integral(stamp_s, values, end_s) - integral(stamp_s, values, start_s)) / np.where(width > 0, width, 1.0)
     return np.where(width > 0, mean, at(stamp_s, values, end_s))
 
 
-def at(stamp_s: NDArray[np.float64], values: NDArray[np.float64], at_s: NDArray[np.float64]) -> NDArray[np.float64]:
+def at(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
     """Return (N, k) samples interpolated linearly, shape (M, k); held outside."""
     return np.stack([np.interp(at_s, stamp_s, values[:, k]) for k in range(values.shape[1])], -1)
 
 
-def in_gap(
-    stamp_ns: NDArray[np.int64], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], *, longest_ns: int
-) -> NDArray[np.bool_]:
+def in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> NDArray[np.bool_]:
     """Return whether each interval touches a stretch between samples longer than ``longest_ns``, or lies outside the samples.
 
     Half that long outside the first and last sample is still inside.
@@ -74,20 +71,18 @@ def in_gap(
     return touches
 
 
-def hold_last(
-    stamp_ns: NDArray[np.int64], values: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:
     """Return the last value at or before each stamp, shape (M,); NaN before the first."""
     index = np.searchsorted(stamp_ns, at_ns, "right") - 1
     return np.where(index >= 0, values[np.maximum(index, 0)] if values.size else np.nan, np.nan)
 
 
-def median_period_ns(stamp_ns: NDArray[np.int64]) -> int:
+def median_period_ns(stamp_ns: Ints) -> int:
     """Return the median time between samples [ns], at least 1; 1 for fewer than two samples."""
     return max(1, int(np.median(np.diff(stamp_ns)))) if stamp_ns.size > 1 else 1
 
 
-def median_of_five(values: NDArray[np.float64]) -> NDArray[np.float64]:
+def median_of_five(values: Floats) -> Floats:
     """Return the running median of five of a signal (N,), its ends repeated: single outliers vanish."""
     if values.size < 5:
         return values
@@ -95,16 +90,16 @@ def median_of_five(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.median(np.lib.stride_tricks.sliding_window_view(padded, 5), axis=1))
 
 
-def slopes(stamp_ns: NDArray[np.int64], values: NDArray[np.float64], window_s: float) -> NDArray[np.float64]:
+def slopes(stamp_ns: Ints, values: Floats, window_s: float) -> Floats:
     """Return the slope [u/s] at each sample of the line through the samples within half a window, shape (N,); 0 where there is one only."""
     t = seconds(stamp_ns, int(stamp_ns[0]))
     first = np.searchsorted(t, t - 0.5 * window_s, "left")
     last = np.searchsorted(t, t + 0.5 * window_s, "right")
     count = (last - first).astype(np.float64)
 
-    def window(samples: NDArray[np.float64]) -> NDArray[np.float64]:
+    def window(samples: Floats) -> Floats:
         total = np.concatenate(([0.0], np.cumsum(samples)))
-        mean: NDArray[np.float64] = (total[last] - total[first]) / count
+        mean: Floats = (total[last] - total[first]) / count
         return mean
 
     centred = values - values.mean()
@@ -114,7 +109,7 @@ def slopes(stamp_ns: NDArray[np.int64], values: NDArray[np.float64], window_s: f
     return np.where(spread > 1e-9, covariance / np.maximum(spread, 1e-9), 0.0)
 
 
-def white_noise(values: NDArray[np.float64]) -> float:
+def white_noise(values: Floats) -> float:
     """Estimate the standard deviation of white noise on a signal (N, k), the largest of its axes; 0 for fewer than three samples.
 
     The second difference of white noise has sqrt(6) times its standard deviation.

@@ -36,6 +36,9 @@ from tcpipe.fusion.process import (
 )
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
 _MAX_STEP_NS = 50_000_000
 _NONHOLONOMIC_HZ = 10.0
 _MOVING_MPS = 0.05
@@ -63,24 +66,22 @@ class EventTimeline:
     output_rate_radps : angular velocity around each wanted stamp, shape (N, 3), bias not taken off; and whether a gyroscope says so.
     """
 
-    stamp_ns: NDArray[np.int64]
-    dt_s: NDArray[np.float64]
+    stamp_ns: Ints
+    dt_s: Floats
     kind: NDArray[np.int8]
     mode: NDArray[np.int8]
-    shake_m2ps3: NDArray[np.float64]
-    value: NDArray[np.float64]
-    variance: NDArray[np.float64]
-    turn_rate_radps: NDArray[np.float64]
-    force_mps2: NDArray[np.float64]
-    turn_rate_now_radps: NDArray[np.float64]
-    output: NDArray[np.int64]
-    output_rate_radps: NDArray[np.float64]
+    shake_m2ps3: Floats
+    value: Floats
+    variance: Floats
+    turn_rate_radps: Floats
+    force_mps2: Floats
+    turn_rate_now_radps: Floats
+    output: Ints
+    output_rate_radps: Floats
     output_has_gyro: NDArray[np.bool_]
 
 
-def build_timeline(
-    measurements: Measurements, standing_ns: NDArray[np.int64], output_ns: NDArray[np.int64]
-) -> EventTimeline:
+def build_timeline(measurements: Measurements, standing_ns: Ints, output_ns: Ints) -> EventTimeline:
     """Merge measurements, constraints and wanted stamps.
 
     Parameters
@@ -125,14 +126,14 @@ def build_timeline(
     )
 
 
-_Part = tuple[NDArray[np.int64], int, NDArray[np.float64], NDArray[np.float64]]
+_Part = tuple[Ints, int, Floats, Floats]
 
 
-def _plain(stamp_ns: NDArray[np.int64], kind: int) -> _Part:
+def _plain(stamp_ns: Ints, kind: int) -> _Part:
     return stamp_ns, kind, np.zeros((stamp_ns.size, 3)), np.ones((stamp_ns.size, 3))
 
 
-def _constant(stamp_ns: NDArray[np.int64], kind: int, std: tuple[float, float, float]) -> _Part:
+def _constant(stamp_ns: Ints, kind: int, std: tuple[float, float, float]) -> _Part:
     return stamp_ns, kind, np.zeros((stamp_ns.size, 3)), np.tile(np.square(std), (stamp_ns.size, 1))
 
 
@@ -156,11 +157,11 @@ def _measured(measurements: Measurements) -> list[_Part]:
     return parts
 
 
-def _unseen_turn_variance(stamp_ns: NDArray[np.int64], lever_arm_m: tuple[float, float, float]) -> NDArray[np.float64]:
+def _unseen_turn_variance(stamp_ns: Ints, lever_arm_m: tuple[float, float, float]) -> Floats:
     """Variance [m²/s²], shape (3,), of what a sensor off base_link sees of turns that no sensor tells; they last, as the ground does."""
     rate_hz = 1e9 / median_period_ns(stamp_ns)
     x, y, z = np.square(lever_arm_m)
-    lasting: NDArray[np.float64] = np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * max(1.0, rate_hz * _UNSEEN_TURN_S)
+    lasting: Floats = np.array([z, z, x + y]) * UNSEEN_TURN_RADPS**2 * max(1.0, rate_hz * _UNSEEN_TURN_S)
     return lasting
 
 
@@ -176,14 +177,14 @@ def _wheels(wheels: BodyVelocities, nonholonomic_std_mps: float) -> _Part:
     return wheels.stamp_ns, kernel.WHEEL_VELOCITY, value, variance
 
 
-def _white_variance(velocity_mps: NDArray[np.float64]) -> float:
+def _white_variance(velocity_mps: Floats) -> float:
     """Estimate the variance of a moving wheel's white noise by the median of squared second differences, which wild ones do not move."""
     second = np.diff(velocity_mps, n=2)
     moving = (np.abs(velocity_mps) > _MOVING_MPS)[1:-1]
     return float(np.median(second[moving] ** 2) / (6 * _MEDIAN_OF_SQUARES)) if moving.sum() > 1 else 0.0
 
 
-def _constraints(measurements: Measurements, standing_ns: NDArray[np.int64], start: int, end: int) -> list[_Part]:
+def _constraints(measurements: Measurements, standing_ns: Ints, start: int, end: int) -> list[_Part]:
     parts: list[_Part] = []
     if glides(measurements):  # which way the body looks is not known
         return parts
@@ -203,7 +204,7 @@ def _constraints(measurements: Measurements, standing_ns: NDArray[np.int64], sta
     return parts
 
 
-def _standing_rate(imu: InertialMeasurements, grid: NDArray[np.int64]) -> _Part:
+def _standing_rate(imu: InertialMeasurements, grid: Ints) -> _Part:
     """Measure the gyroscope's bias, while the robot stands, by its mean around each stamp."""
     zero = int(imu.stamp_ns[0])
     stamp_s, centre_s = seconds(imu.stamp_ns, zero), seconds(grid, zero)
@@ -214,7 +215,7 @@ def _standing_rate(imu: InertialMeasurements, grid: NDArray[np.int64]) -> _Part:
     return grid, kernel.STANDING_RATE, bias, np.full((grid.size, 3), variance)
 
 
-def _fillers(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _fillers(stamp_ns: Ints) -> Ints:
     """Stamps that split every step longer than the longest allowed."""
     stamp = np.unique(stamp_ns)
     step = np.diff(stamp)
@@ -222,13 +223,13 @@ def _fillers(stamp_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     wide = np.flatnonzero(pieces > 1)
     count = pieces[wide] - 1
     within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + 1
-    filled: NDArray[np.int64] = np.repeat(stamp[wide], count) + within * np.repeat(step[wide] // pieces[wide], count)
+    filled: Ints = np.repeat(stamp[wide], count) + within * np.repeat(step[wide] // pieces[wide], count)
     return filled
 
 
 def _inputs(
-    measurements: Measurements, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64], zero_ns: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int8]]:
+    measurements: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
+) -> tuple[Floats, Floats, NDArray[np.int8]]:
     """Mean angular velocity and specific force over each interval, and the process mode they allow: the best source that covers it."""
     rate, mode = _turn_rates(measurements, before_ns, after_ns, zero_ns)
     force = np.zeros((before_ns.size, 3))
@@ -241,8 +242,8 @@ def _inputs(
 
 
 def _turn_rates(
-    measurements: Measurements, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64], zero_ns: int
-) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    measurements: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
+) -> tuple[Floats, NDArray[np.int8]]:
     """Mean angular velocity over each interval by the best source that covers it, and the process mode that goes with it."""
     imu = measurements.imu
     if imu is None or imu.stamp_ns.size == 0:
@@ -256,13 +257,7 @@ def _turn_rates(
     return rate, mode
 
 
-def _means(
-    imu: InertialMeasurements,
-    values: NDArray[np.float64],
-    before_ns: NDArray[np.int64],
-    after_ns: NDArray[np.int64],
-    zero_ns: int,
-) -> NDArray[np.float64]:
+def _means(imu: InertialMeasurements, values: Floats, before_ns: Ints, after_ns: Ints, zero_ns: int) -> Floats:
     """Mean of an IMU's signal over each interval; these are in order and go piece by piece: a long log takes little room."""
     found = np.empty((before_ns.size, 3))
     for first in range(0, before_ns.size, _PIECE):
@@ -275,17 +270,15 @@ def _means(
     return found
 
 
-def _covered(
-    stamp_ns: NDArray[np.int64], before_ns: NDArray[np.int64], after_ns: NDArray[np.int64]
-) -> NDArray[np.bool_]:
+def _covered(stamp_ns: Ints, before_ns: Ints, after_ns: Ints) -> NDArray[np.bool_]:
     """Whether each interval lies among samples without a gap."""
     longest = max(_MIN_INPUT_GAP_NS, 3 * median_period_ns(stamp_ns))
     return ~in_gap(stamp_ns, before_ns, after_ns, longest_ns=longest)
 
 
 def _odometric_turn_rate(
-    measurements: Measurements, before_ns: NDArray[np.int64], after_ns: NDArray[np.int64], zero_ns: int
-) -> tuple[NDArray[np.float64], NDArray[np.int8]]:
+    measurements: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
+) -> tuple[Floats, NDArray[np.int8]]:
     """Mean angular velocity by the odometries, shape (M, 3), and the process mode; by the course over ground where there are none."""
     rate = np.zeros((before_ns.size, 3))
     mode = np.full(before_ns.size, kernel.FLAT_TURN, np.int8)

@@ -14,21 +14,20 @@ from numpy.typing import NDArray
 
 from tcpipe.geometry.polyline import row_before
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
 _NS = 1e-9
 
 
-def interpolate(
-    stamp_ns: NDArray[np.int64], value: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def interpolate(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     """Return the signal at each time, shape (M,), in the unit of ``value``; ends are held beyond the first and last sample."""
     origin = stamp_ns[0]
-    between: NDArray[np.float64] = np.interp((at_ns - origin) * _NS, (stamp_ns - origin) * _NS, value)
+    between: Floats = np.interp((at_ns - origin) * _NS, (stamp_ns - origin) * _NS, value)
     return between
 
 
-def integral_to(
-    stamp_ns: NDArray[np.int64], value: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def integral_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     """Return the exact integral from the first sample to each time, shape (M,), in the unit of ``value`` times seconds.
 
     Parameters
@@ -40,9 +39,7 @@ def integral_to(
     return product_integral_to(stamp_ns, value, np.ones_like(value), at_ns)
 
 
-def mean_between(
-    stamp_ns: NDArray[np.int64], value: NDArray[np.float64], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def mean_between(stamp_ns: Ints, value: Floats, start_ns: Ints, end_ns: Ints) -> Floats:
     """Return the exact time-mean of the signal over each span, shape (M,); NaN where the signal has a NaN that touches the span.
 
     Parameters as in `integral_to`; every span is longer than nothing.
@@ -52,13 +49,11 @@ def mean_between(
         integral_to(stamp_ns, x, end_ns) - integral_to(stamp_ns, x, start_ns)
         for x in (np.where(known, value, 0.0), 1.0 - known)
     )
-    mean: NDArray[np.float64] = np.where(unknown > _NS, np.nan, total / ((end_ns - start_ns) * _NS))
+    mean: Floats = np.where(unknown > _NS, np.nan, total / ((end_ns - start_ns) * _NS))
     return mean
 
 
-def product_integral_to(
-    stamp_ns: NDArray[np.int64], a: NDArray[np.float64], b: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def product_integral_to(stamp_ns: Ints, a: Floats, b: Floats, at_ns: Ints) -> Floats:
     """Return the exact integral of the product of two piecewise-linear signals on one grid, from its first stamp to each time.
 
     On an interval of length h with end values a0, a1 and b0, b1 it is h (2 a0 b0 + 2 a1 b1 + a0 b1 + a1 b0) / 6.
@@ -76,13 +71,11 @@ def product_integral_to(
     share = part_s / step_s[row]
     a_end = a[row] + share * (a[row + 1] - a[row])
     b_end = b[row] + share * (b[row + 1] - b[row])
-    integral: NDArray[np.float64] = whole[row] + _product(part_s, a[row], a_end, b[row], b_end)
+    integral: Floats = whole[row] + _product(part_s, a[row], a_end, b[row], b_end)
     return integral
 
 
-def held_back_integral_to(
-    stamp_ns: NDArray[np.int64], value: NDArray[np.float64], at_ns: NDArray[np.int64]
-) -> NDArray[np.float64]:
+def held_back_integral_to(stamp_ns: Ints, value: Floats, at_ns: Ints) -> Floats:
     """Return the integral of the step signal whose value on an interval is that of its right end, from the first stamp to each time.
 
     A source that reports the average over the time since its last message means exactly this (right-endpoint rectangle); it is also
@@ -91,16 +84,10 @@ def held_back_integral_to(
     step_s = np.diff(stamp_ns) * _NS
     whole = np.concatenate(([0.0], np.cumsum(step_s * value[1:])))
     row = row_before(stamp_ns, at_ns)
-    integral: NDArray[np.float64] = whole[row] + (at_ns - stamp_ns[row]) * _NS * value[row + 1]
+    integral: Floats = whole[row] + (at_ns - stamp_ns[row]) * _NS * value[row + 1]
     return integral
 
 
-def _product(
-    step_s: NDArray[np.floating[Any]],
-    a0: NDArray[np.float64],
-    a1: NDArray[np.float64],
-    b0: NDArray[np.float64],
-    b1: NDArray[np.float64],
-) -> NDArray[np.float64]:
-    integral: NDArray[np.float64] = step_s * (2.0 * a0 * b0 + 2.0 * a1 * b1 + a0 * b1 + a1 * b0) / 6.0
+def _product(step_s: NDArray[np.floating[Any]], a0: Floats, a1: Floats, b0: Floats, b1: Floats) -> Floats:
+    integral: Floats = step_s * (2.0 * a0 * b0 + 2.0 * a1 * b1 + a0 * b1 + a1 * b0) / 6.0
     return integral

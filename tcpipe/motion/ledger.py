@@ -16,14 +16,17 @@ from tcpipe.geometry.polyline import polyline
 from tcpipe.motion.pieces import piece_spans, spans_where
 from tcpipe.tables.bits import DropReason, name_of
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
-def stretches(dropped_by: NDArray[np.uint32], piece: NDArray[np.int64]) -> NDArray[np.int64]:
+
+def stretches(dropped_by: NDArray[np.uint32], piece: Ints) -> Ints:
     """Return first and last row of every maximal run of kept rows inside one piece, shape (S, 2), two rows at least."""
     kept = spans_where(dropped_by == 0, piece)
     return kept[kept[:, 1] > kept[:, 0]]
 
 
-def interval_reason(dropped_by: NDArray[np.uint32], piece: NDArray[np.int64]) -> NDArray[np.uint32]:
+def interval_reason(dropped_by: NDArray[np.uint32], piece: Ints) -> NDArray[np.uint32]:
     """Return one reason for each interval between rows, shape (N - 1,); 0 inside a stretch.
 
     A hole is a gap. Otherwise the reasons of both ends apply, and of several the first in the order of `DropReason`.
@@ -37,12 +40,7 @@ JUMP_M = 1.0
 """A step that differs by more than this from what its velocity explains is no driving [m]."""
 
 
-def unexplained_m(
-    stamp_ns: NDArray[np.int64],
-    position_m: NDArray[np.float64],
-    velocity_mps: NDArray[np.float64],
-    piece: NDArray[np.int64],
-) -> NDArray[np.float64]:
+def unexplained_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
     """Return how far each interval's step lies horizontally off what the velocity explains, [m], shape (N - 1,); 0 across holes.
 
     Parameters are `interval_length_m`'s.
@@ -53,12 +51,7 @@ def unexplained_m(
     return np.where(piece[:-1] == piece[1:], np.hypot(off[:, 0], off[:, 1]), 0.0)
 
 
-def interval_length_m(
-    stamp_ns: NDArray[np.int64],
-    position_m: NDArray[np.float64],
-    velocity_mps: NDArray[np.float64],
-    piece: NDArray[np.int64],
-) -> NDArray[np.float64]:
+def interval_length_m(stamp_ns: Ints, position_m: Floats, velocity_mps: Floats, piece: Ints) -> Floats:
     """Return the odometer's share of every interval between rows, [m], shape (N - 1,).
 
     Parameters
@@ -68,7 +61,7 @@ def interval_length_m(
     piece : shape (N,), numbers of the uninterrupted pieces.
     """
     step = np.diff(position_m, axis=0)
-    length: NDArray[np.float64] = np.hypot(step[:, 0], step[:, 1])
+    length: Floats = np.hypot(step[:, 0], step[:, 1])
     for first, last in piece_spans(piece):
         rows = slice(first, last + 1)
         length[first:last] = np.diff(polyline(stamp_ns[rows], position_m[rows], velocity_mps[rows]).length_m)
@@ -77,11 +70,11 @@ def interval_length_m(
     return np.where(unexplained_m(stamp_ns, position_m, velocity_mps, piece) > JUMP_M, driven, length)
 
 
-def interval_duration_s(stamp_ns: NDArray[np.int64], epoch: NDArray[np.integer[Any]]) -> NDArray[np.float64]:
+def interval_duration_s(stamp_ns: Ints, epoch: NDArray[np.integer[Any]]) -> Floats:
     """Return the duration of every interval between rows, [s], shape (N - 1,); 0 across a clock epoch, whose step is no time."""
     return np.where(np.diff(epoch) == 0, np.diff(stamp_ns) * 1e-9, 0.0)
 
 
-def by_reason(reason: NDArray[np.uint32], amount: NDArray[np.float64]) -> dict[str, float]:
+def by_reason(reason: NDArray[np.uint32], amount: Floats) -> dict[str, float]:
     """Return the sum of an amount an interval (metres, seconds, joules) by reason's name, every `DropReason` present."""
     return {name_of(bit): float(amount[reason == int(bit)].sum()) for bit in DropReason}

@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+Ints = NDArray[np.int64]
+
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
@@ -33,7 +35,7 @@ class MotionRows:
     yaw_rate_radps: Floats
     wheel_velocity_mps: Floats
     commanded_mps: Floats
-    piece: NDArray[np.int64]
+    piece: Ints
     period_s: float
 
     def count(self, duration_s: float) -> int:
@@ -41,9 +43,7 @@ class MotionRows:
         return round(duration_s / self.period_s)
 
 
-def piece_of_rows(
-    stamp_ns: NDArray[np.int64], epoch: NDArray[np.integer[Any]], *, period_ns: float
-) -> NDArray[np.int64]:
+def piece_of_rows(stamp_ns: Ints, epoch: NDArray[np.integer[Any]], *, period_ns: float) -> Ints:
     """Return for each row the number of its uninterrupted piece, 0 upward, shape (N,).
 
     Parameters
@@ -56,7 +56,7 @@ def piece_of_rows(
     return np.concatenate((np.zeros(min(len(stamp_ns), 1), dtype=np.int64), np.cumsum(broken)))
 
 
-def spans_where(mask: Mask, piece: NDArray[np.int64]) -> NDArray[np.int64]:
+def spans_where(mask: Mask, piece: Ints) -> Ints:
     """Return first and last row of every maximal run of true rows inside one piece, shape (R, 2)."""
     joined = mask[:-1] & mask[1:] & (piece[:-1] == piece[1:])
     edge = np.zeros(min(len(mask), 1), dtype=np.bool_)
@@ -65,7 +65,7 @@ def spans_where(mask: Mask, piece: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.column_stack((first, last)).astype(np.int64)
 
 
-def mask_of(spans: NDArray[np.int64], size: int) -> Mask:
+def mask_of(spans: Ints, size: int) -> Mask:
     """Return the mask that is true on every span of rows (first, last), shape (size,)."""
     edges = np.zeros(size + 1, dtype=np.int64)
     np.add.at(edges, spans[:, 0], 1)
@@ -74,24 +74,24 @@ def mask_of(spans: NDArray[np.int64], size: int) -> Mask:
     return covered
 
 
-def piece_spans(piece: NDArray[np.int64]) -> NDArray[np.int64]:
+def piece_spans(piece: Ints) -> Ints:
     """Return first and last row of every piece, shape (P, 2)."""
     return spans_where(np.ones(len(piece), dtype=np.bool_), piece)
 
 
-def piece_bounds(piece: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def piece_bounds(piece: Ints) -> tuple[Ints, Ints]:
     """Return for each row the first and the last row of its piece, both of shape (N,)."""
     spans = piece_spans(piece)
     return spans[piece, 0], spans[piece, 1]
 
 
-def lasting(mask: Mask, piece: NDArray[np.int64], *, min_rows: int) -> Mask:
+def lasting(mask: Mask, piece: Ints, *, min_rows: int) -> Mask:
     """Return the mask without runs of fewer than ``min_rows`` rows."""
     spans = spans_where(mask, piece)
     return mask_of(spans[spans[:, 1] - spans[:, 0] + 1 >= min_rows], len(mask))
 
 
-def dilated(mask: Mask, piece: NDArray[np.int64], *, before: int, after: int) -> Mask:
+def dilated(mask: Mask, piece: Ints, *, before: int, after: int) -> Mask:
     """Return the mask with every run widened by ``before`` and ``after`` rows, inside its piece."""
     spans = spans_where(mask, piece)
     low, high = piece_bounds(piece)
@@ -100,9 +100,7 @@ def dilated(mask: Mask, piece: NDArray[np.int64], *, before: int, after: int) ->
     return mask_of(spans, len(mask))
 
 
-def window_mean(
-    value: NDArray[np.float64], piece: NDArray[np.int64], *, before: int, after: int
-) -> NDArray[np.float64]:
+def window_mean(value: Floats, piece: Ints, *, before: int, after: int) -> Floats:
     """Return the mean over rows k - before … k + after, clipped to the piece, shape (N,).
 
     ``before=10, after=-1`` is the ten rows ahead of k. NaN where the window is empty.
@@ -115,9 +113,7 @@ def window_mean(
     return mean
 
 
-def slope(
-    value: NDArray[np.float64], piece: NDArray[np.int64], *, half_window: int, period_s: float
-) -> NDArray[np.float64]:
+def slope(value: Floats, piece: Ints, *, half_window: int, period_s: float) -> Floats:
     """Return the least-squares slope over 2 half_window + 1 rows around each, one-sided at a piece's ends, per second, shape (N,).
 
     This is the first derivative of Savitzky and Golay (1964) of order one or two; white noise s in the value gives
@@ -137,7 +133,7 @@ def slope(
     return result
 
 
-def _window(piece: NDArray[np.int64], before: int, after: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _window(piece: Ints, before: int, after: int) -> tuple[Ints, Ints]:
     low, high = piece_bounds(piece)
     row = np.arange(len(piece))
     return np.maximum(row - before, low), np.minimum(row + after, high)

@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from tcpipe.geometry.piecewise_linear import held_back_integral_to, product_integral_to
 from tcpipe.power.rails import Rail
 
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
 Rule = Literal["exact", "averaged", "right_endpoint"]
 
 
-def energy_joule(
-    rails: list[Rail], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], *, rule: Rule
-) -> NDArray[np.float64]:
+def energy_joule(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
     """Return the energy of all rails over each span, [J], shape (M,); NaN where any rail is not known throughout, or there is none.
 
     Parameters
@@ -41,9 +42,7 @@ def energy_joule(
     return total
 
 
-def recorded_energy_joule(
-    rails: list[Rail], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64], *, rule: Rule
-) -> NDArray[np.float64]:
+def recorded_energy_joule(rails: list[Rail], start_ns: Ints, end_ns: Ints, *, rule: Rule) -> Floats:
     """Return the energy that the record holds for each span, [J], shape (M,): where a rail is not known it adds nothing.
 
     Unlike a label's, this is bookkeeping: spans that tile a run add up to the run's energy. Parameters as in `energy_joule`.
@@ -56,9 +55,7 @@ def recorded_energy_joule(
     return total
 
 
-def samples_inside(
-    rails: list[Rail], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def samples_inside(rails: list[Rail], start_ns: Ints, end_ns: Ints) -> tuple[Ints, Floats]:
     """Return how many current samples lie in (start, end], the fewest of any rail, and the plain mean power of the samples there.
 
     Returns
@@ -78,12 +75,12 @@ def samples_inside(
     return count, mean
 
 
-def _count(stamp_ns: NDArray[np.int64], start_ns: NDArray[np.int64], end_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def _count(stamp_ns: Ints, start_ns: Ints, end_ns: Ints) -> Ints:
     after = np.searchsorted(stamp_ns, end_ns, side="right") - np.searchsorted(stamp_ns, start_ns, side="right")
     return after.astype(np.int64)
 
 
-def _energy_to(each: Rail, at_ns: NDArray[np.int64], rule: Rule) -> NDArray[np.float64]:
+def _energy_to(each: Rail, at_ns: Ints, rule: Rule) -> Floats:
     if rule == "exact":
         return product_integral_to(each.stamp_ns, each.voltage_volt, each.current_amp, at_ns)
     return held_back_integral_to(each.stamp_ns, each.voltage_volt * each.current_amp, at_ns)

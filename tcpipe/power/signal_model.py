@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 from tcpipe.power.least_squares import non_negative
 from tcpipe.power.rails import Samples
 
+Mask = NDArray[np.bool_]
+
 Floats = NDArray[np.float64]
 Stamps = NDArray[np.int64]
 
@@ -63,7 +65,7 @@ class SignalModel:
     error_variance: float
     variance: Floats
     tau_s: Floats
-    smooth: NDArray[np.bool_]
+    smooth: Mask
     curvature_variance: float
 
     def covariance(self, lag_s: Floats) -> Floats:
@@ -74,9 +76,7 @@ class SignalModel:
         return total
 
 
-def signal_model(
-    signal: Samples, steady: NDArray[np.bool_], still: NDArray[np.bool_], *, averaged: bool
-) -> SignalModel:
+def signal_model(signal: Samples, steady: Mask, still: Mask, *, averaged: bool) -> SignalModel:
     """Return what the signal is made of where it counts.
 
     Parameters
@@ -114,9 +114,7 @@ def signal_model(
     return SignalModel(period_s, error, variance, tau_s, smooth, float(variance @ made[:, 0]))
 
 
-def local_scale(
-    model: SignalModel, signal: Samples, steady: NDArray[np.bool_], start_ns: Stamps, end_ns: Stamps
-) -> Floats:
+def local_scale(model: SignalModel, signal: Samples, steady: Mask, start_ns: Stamps, end_ns: Stamps) -> Floats:
     """Return how large the processes' variance is near each span against the record's, [1], shape (M,).
 
     Taken over the steady samples from 2 s before to 2 s after the span, with the whole record as a prior of 4 samples.
@@ -152,7 +150,7 @@ def _fitted(made: Floats, seen: Floats, weight: Floats) -> list[float]:
     return fitted
 
 
-def _error_while_still(signal: Samples, still: NDArray[np.bool_]) -> float | None:
+def _error_while_still(signal: Samples, still: Mask) -> float | None:
     """Return the variance of a sample while the robot stands, in the signal's unit squared; None where it hardly does.
 
     From the squared differences of following samples, without those that a motor makes which starts or stops among them: what lies
@@ -179,9 +177,7 @@ def calmest_variance(signal: Samples, period_s: float) -> float:
     return float(np.quantile((sums[count:] - sums[:-count]) / count, 0.05))
 
 
-def _second_differences(
-    signal: Samples, steady: NDArray[np.bool_], period_s: float
-) -> tuple[NDArray[np.int64], Floats, Floats]:
+def _second_differences(signal: Samples, steady: Mask, period_s: float) -> tuple[Stamps, Floats, Floats]:
     """Return spacings, the variance that second differences at each show for one sample, and the weight of each."""
     found = []
     x, t = signal.value, signal.stamp_ns
@@ -199,7 +195,7 @@ def _second_differences(
     return spacing.astype(np.int64), seen, np.divide(weight, seen, out=np.zeros_like(weight), where=seen > 0.0)
 
 
-def _expected(spacing: NDArray[np.int64], period_s: float, tau_s: float, *, smooth: bool, averaged: bool) -> Floats:
+def _expected(spacing: Stamps, period_s: float, tau_s: float, *, smooth: bool, averaged: bool) -> Floats:
     """Return what second differences show of a process of unit variance, as the variance of one sample, shape (S,)."""
     lag_s = np.stack((0 * spacing, spacing, 2 * spacing)).astype(np.float64) * period_s
     each: Floats
