@@ -9,7 +9,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from tcpipe.fusion.checks.audit import alone_in_most, confirmations, consistent, undecided_in_most
-from tcpipe.fusion.checks.sensors import Refusal
+from tcpipe.fusion.checks.sensors import Refusal, fixes_refused
+from tcpipe.fusion.measurements import GNSS
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import fuse_mounted
@@ -43,7 +44,9 @@ def fuse_agreeing(
 
 
 def _without(roles: Sequence[str], inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams) -> Judged:
-    return left_out(inputs, sanity, [Refusal(role, _WHY) for role in roles], streams)
+    odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference(roles)
+    refusals = [fixes_refused(_WHY, odometries) if role == GNSS else Refusal(role, _WHY) for role in roles]
+    return left_out(inputs, sanity, refusals, streams)
 
 
 def _at_fault(

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from tcpipe.fusion.measurements import GNSS, IMU, InitialState
+from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InitialState
 from tcpipe.fusion.stretches import Stretch
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
@@ -100,6 +100,8 @@ def _reopened(facts: FuseFacts) -> list[str]:
     """Return by sensor how often it left the path of the others for seconds, and where most."""
     found = []
     every = [reopening for stretch in facts.stretches for reopening in stretch.reopenings]
+    ways = [role for role in (WHEELS, VISUAL) if role in facts.sensors]
+    doubt = f"; or {ways[0]} errs there: nothing else tells how far the robot goes" if len(ways) == 1 else ""
     for role in sorted({reopening.role for reopening in every}):
         mine = [reopening for reopening in every if reopening.role == role]
         worst = max(mine, key=lambda reopening: reopening.size)
@@ -107,5 +109,6 @@ def _reopened(facts: FuseFacts) -> list[str]:
         found.append(
             f"{role}: {len(mine)} times it contradicted the other sensors for seconds, most by {worst.size:.2f} {unit} from "
             f"{worst.start_ns} to {worst.end_ns} ns (run.json: reopenings): look there at its clock, its mounting and its surroundings"
+            f"{doubt if role == GNSS else ''}"
         )
     return found

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +48,7 @@ def left_out(
     refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
     reasons = {**before.facts.refused, **{refusal.role: refusal.why for refusal in refusals}}
-    warnings = (*before.warnings, *(_warning(refusal, streams.sensors[refusal.role]) for refusal in refusals))
+    warnings = (*before.warnings, *(_warning(refusal, streams.sensors) for refusal in refusals))
     datum = None if GNSS in refused else inputs.datum_deg_m
     inputs = replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused)
     return inputs, Findings(warnings, replace(before.facts, refused=reasons))
@@ -90,10 +90,14 @@ def _felt(streams: Streams) -> float:
     return float(np.median(np.linalg.norm(force, axis=1)))
 
 
-def _warning(refusal: Refusal, sensor: Sensor) -> str:
+def _warning(refusal: Refusal, sensors: Mapping[str, Sensor]) -> str:
+    sensor = sensors[refusal.role]
     what = f"{refusal.role}: {sensor.topic} is not fused: {refusal.why}"
     if refusal.units is not None:
         return f'{what}; if that is so, declare it in the recipe under [read]: imu_units = "{refusal.units}"'
+    if refusal.instead is not None:
+        topic = sensors[refusal.instead].topic
+        return f'{what}; to leave {refusal.instead} out instead, write in the recipe under [read]: ignore_topics = ["{topic}"]'
     if refusal.turned_by is None:
         return f'{what}; to leave it out by name, write in the recipe under [read]: ignore_topics = ["{sensor.topic}"]'
     rpy_rad = rpy_from_matrix(refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))

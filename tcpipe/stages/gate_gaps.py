@@ -66,7 +66,7 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
         at_ns = integers(track.table, "stamp_ns")[int(np.argmax(off_m))]
         warnings.append(
             f"the position jumps {far} times, the furthest by {off_m.max():.1f} m at {at_ns} ns, which no speed explains (a GNSS that "
-            "changed its base, datum or receiver?): nothing is cut across, and the jump is not counted as driven"
+            "changed its base, datum or receiver, or an odometry that errs?): nothing is cut across, and the jump is not counted as driven"
         )
     audit = track.info.findings.facts.audit
     contradicted = np.full(len(moving), bool(audit and audit.undecided))

@@ -7,7 +7,7 @@ the camera, the course of the fixes. Mountings that somebody stated weigh more t
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -52,13 +52,22 @@ class Refusal:
     """A sensor that is not to be fused: why, and what would set it right.
 
     ``units`` is the value of the recipe's ``imu_units``; ``turned_by`` (3, 3) turns what the mounting in use makes of the sensor into
-    base_link. Neither: nothing in the recipe does.
+    base_link. Neither: nothing in the recipe does. ``instead`` is the role that may as well be what errs.
     """
 
     role: str
     why: str
     units: str | None = None
     turned_by: Floats | None = None
+    instead: str | None = None
+
+
+def fixes_refused(why: str, odometries: Collection[str]) -> Refusal:
+    """Return the refusal of fixes that odometries contradict: a single one may as well be what errs, whoever confirms how it turns."""
+    if len(odometries) != 1:
+        return Refusal(GNSS, why)
+    (other,) = odometries
+    return Refusal(GNSS, f"{why}; or {other} errs: nothing else tells how far the robot goes", instead=other)
 
 
 @dataclass(slots=True)
@@ -165,7 +174,9 @@ def _check_path(checks: Checks, gnss: Positions, twists: Mapping[str, Floats], a
     by = " and ".join(against)
     if "unlike" in told.values():
         if confirmed:
-            checks.refusals.append(Refusal(GNSS, f"its path is not that by {by} (another clock, drive or receiver?)"))
+            checks.refusals.append(
+                fixes_refused(f"its path is not that by {by} (another clock, drive or receiver?)", told)
+            )
         return
     exchanged = f"its path is the mirror image of that by {by} (latitude and longitude exchanged?)"
     checks.refusals.append(Refusal(GNSS, exchanged + doubt))

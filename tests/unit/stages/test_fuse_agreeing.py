@@ -72,6 +72,19 @@ def test_one_that_is_alone_in_most_of_the_way_is_left_out(fusing):
     assert sensors == set(ROLES) - {"gnss"}
     assert len(tried) == 2 + len(ROLES)
     assert "/gnss is not fused: in most of the way the others contradict it" in sanity.warnings[0]
+    assert sanity.warnings[0].endswith('[read]: ignore_topics = ["/gnss"]')
+
+
+def test_fixes_against_one_odometry_are_left_out_without_being_blamed(fusing):
+    """An IMU confirms how wheels turn, not how far they go: whoever knows that they err leaves them out instead."""
+    every = frozenset(ROLES) - {"visual_odometry"}
+    fusing({every: contradicted(0, alone=15, sensor="gnss")})
+    sensors, sanity = agreed(inputs(visual=False))
+    assert sensors == {"imu", "wheel_odometry"}
+    assert sanity.facts.refused["gnss"].endswith("; or wheel_odometry errs: nothing else tells how far the robot goes")
+    assert sanity.warnings[0].endswith(
+        'to leave wheel_odometry out instead, write in the recipe under [read]: ignore_topics = ["/wheel_odometry"]'
+    )
 
 
 def test_the_one_without_which_the_others_agree_is_left_out(fusing):

@@ -121,3 +121,7 @@ def test_a_sensor_that_left_the_path_is_told_once_with_its_worst():
     assert [line.split(":")[0] for line in lines] == ["gnss", "wheel_odometry"]
     assert "2 times it contradicted the other sensors for seconds, most by 2.50 m from 30 to 40 ns" in lines[0]
     assert "1 times it contradicted the other sensors for seconds, most by 0.40 m/s from 1 to 2 ns" in lines[1]
+    assert lines[0].endswith("; or wheel_odometry errs there: nothing else tells how far the robot goes")
+    assert lines[1].endswith("surroundings")
+    third = stretch(reopenings=(worst,), sensors=(*ALL, "visual_odometry"))
+    assert warned(FusionInputs(PLACE), third)[0].endswith("surroundings")
