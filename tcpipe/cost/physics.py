@@ -265,9 +265,8 @@ def _covariance(
     length = max(1, min(_BLOCK, len(rows) // _FEWEST_BLOCKS))
     starts = np.arange(0, len(rows), length)
     left = np.add.reduceat(rows * (weight * off / scale)[:, None], starts, axis=0)
-    few = len(starts) / max(
-        len(starts) - rows.shape[1], 1.0
-    )  # of the scatter between blocks, the coefficients took up their share
+    # Of the scatter between blocks, the coefficients took up their share.
+    few = len(starts) / max(len(starts) - rows.shape[1], 1.0)
     bread, meat = (rows * weight[:, None]).T @ rows, left.T @ left * few
     if prior is not None:
         told = np.outer(prior[free], prior[free])

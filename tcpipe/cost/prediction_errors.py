@@ -105,9 +105,8 @@ class Errors:
             return middle, middle
         variance = max(self._variance(spread), alone / spread.size)
         common = float((np.abs(said) * self.bias_std[class_id]).sum())
-        like_one = min(
-            variance / float(spread.sum()) ** 2, 1.0
-        )  # errors of a single metre are no normal ones, sums nearly
+        # Errors of a single metre are no normal ones, sums nearly.
+        like_one = min(variance / float(spread.sum()) ** 2, 1.0)
         ends = (np.array([self.low, self.high]) * like_one + np.array([-_Z, _Z]) * (1.0 - like_one)) / _Z
         width = _Z * float(np.sqrt(variance + common**2))
         return middle + width * float(ends[0]), middle + width * float(ends[1])
@@ -189,9 +188,8 @@ class _Held:
         rows = np.lexsort((start_ns, run))
         rows = rows[usable[rows]]
         pace, of_run = velocity[rows], run[rows]
-        step_m = (
-            pace[:-1] * np.diff(start_ns[rows]) * 1e-9
-        )  # a segment's pace is its chord over its time: neighbours are a chord apart
+        # A segment's pace is its chord over its time: neighbours are a chord apart.
+        step_m = pace[:-1] * np.diff(start_ns[rows]) * 1e-9
         way_m = np.concatenate([[0.0], np.cumsum(np.where(np.diff(of_run) == 0, step_m, 0.0))])
         true, said = (
             {"power": p[rows], "velocity": v[rows], "duration": 1.0 / v[rows], "energy": p[rows] / v[rows]}

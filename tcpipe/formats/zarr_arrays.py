@@ -79,9 +79,8 @@ def add_array(
 def consolidate(group: zarr.Group) -> None:
     """Gather the descriptions of all arrays in the group's own, so that xarray opens it in one read and without a warning."""
     with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", message="Consolidated metadata", category=UserWarning
-        )  # zarr's own reservation
+        # zarr's own reservation
+        warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
         zarr.consolidate_metadata(group.store)
 
 

@@ -40,9 +40,8 @@ class Normed(nn.Module):
         super().__init__()
         around = size // 2 if stride == 1 else 0
         self.convolution = nn.Conv2d(depth, filters, size, stride, around, bias=False)
-        self.norm = nn.BatchNorm2d(
-            filters, eps=1e-5, momentum=0.1
-        )  # the share of what is new; Keras gives that of the old, 0.9
+        # The momentum is the share of what is new; Keras gives that of the old, 0.9.
+        self.norm = nn.BatchNorm2d(filters, eps=1e-5, momentum=0.1)
 
     def forward(self, images: Any) -> Any:
         """Return (N, filters, rows, columns)."""

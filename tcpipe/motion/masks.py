@@ -103,9 +103,8 @@ def command_changed(rows: MotionRows, *, step_mps: float, window_s: float, settl
     before = window_mean(command, part, before=window, after=-1)
     after = window_mean(command, part, before=0, after=window - 1)
     allowed = step_mps + 2.0 * _jitter_of_difference(command, part, window)
-    changing = np.isfinite(rows.commanded_mps) & (
-        np.abs(after - before) > allowed
-    )  # NaN, where a part begins, is no change
+    # NaN, where a part begins, is no change.
+    changing = np.isfinite(rows.commanded_mps) & (np.abs(after - before) > allowed)
     _, high = piece_bounds(rows.piece)
     spans = [
         (first + begin, min(first + end + rows.count(settle_s), high[first]))

@@ -38,6 +38,5 @@ def _passes(error: BaseException) -> bool:
         return error.errno is not None
     if isinstance(error, sqlite3.Error):
         return getattr(error, "sqlite_errorcode", 0) & _PRIMARY_CODE in _PASSING_SQLITE
-    return (
-        type(error).__module__.partition(".")[0] == "obstore"
-    )  # the network, credentials; its home loads it when it is needed
+    # The network, credentials; its home loads it when it is needed.
+    return type(error).__module__.partition(".")[0] == "obstore"

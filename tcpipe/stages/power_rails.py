@@ -23,9 +23,8 @@ def rails_of(streams: Streams, epoch: int) -> list[Rail]:
     table = streams.tables.get("power")
     if table is None:
         return []
-    names = sorted(
-        pc.unique(table["rail"]).to_pylist()
-    )  # of the whole run: a rail that is silent in an epoch is not known there
+    # Of the whole run: a rail that is silent in an epoch is not known there.
+    names = sorted(pc.unique(table["rail"]).to_pylist())
     table = rows_where(table, "epoch", epoch)
     rails = []
     for name in names:

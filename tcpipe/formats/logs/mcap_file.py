@@ -417,9 +417,8 @@ class McapPart:
         self._index_entries(position, channel)
         chunk = contents.chunks[-1]
         index_bytes = after - chunk.end
-        index = (
-            {} if chunk.index is None else chunk.index
-        )  # which the chunk takes over: a copy for each entry would cost their square
+        # Which the chunk takes over: a copy for each entry would cost their square.
+        index = {} if chunk.index is None else chunk.index
         index[channel] = position
         contents.chunks[-1] = replace(chunk, index=index, index_bytes=index_bytes)
 
