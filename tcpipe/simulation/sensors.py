@@ -7,7 +7,9 @@ columns in SI units in the sensor's own frame. Each sensor and each fault draws 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -178,33 +180,19 @@ class Sensors:
 
     def mounted(self, faults: Faults) -> Sensors:
         """Return the sensors where they really sit: at base_link unless the fault that moves them is on."""
-        moved = self
-        if self.gnss is not None and not faults.gnss_lever_arm:
-            moved = replace(moved, gnss=replace(self.gnss, mounting=AT_BASE_LINK))
-        if self.doppler is not None and not faults.gnss_lever_arm:
-            moved = replace(moved, doppler=replace(self.doppler, mounting=AT_BASE_LINK))
-        if self.imu is not None and not faults.imu_mounting:
-            moved = replace(moved, imu=replace(self.imu, mounting=AT_BASE_LINK))
-        return moved
+        in_place = {"gnss": faults.gnss_lever_arm, "doppler": faults.gnss_lever_arm, "imu": faults.imu_mounting}
+        carried = {name: of for name, kept in in_place.items() if not kept and (of := getattr(self, name)) is not None}
+        return replace(self, **{name: replace(of, mounting=AT_BASE_LINK) for name, of in carried.items()})
 
 
 def record(truth: Truth, site: Site, sensors: Sensors, faults: Faults, noise: Noise) -> dict[str, Reading]:
     """Return what all sensors said of a drive, by sensor (gnss, imu, wheels, visual, power, command, doppler); ``sensors`` as mounted."""
-    readings: dict[str, Reading] = {}
-    if sensors.gnss is not None:
-        readings["gnss"] = read_gnss(truth, site, sensors.gnss, faults, noise)
-    if sensors.imu is not None:
-        readings["imu"] = read_imu(truth, sensors.imu, faults, noise)
-    if sensors.wheels is not None:
-        readings["wheels"] = read_wheels(truth, sensors.wheels, faults, noise)
-    if sensors.visual is not None:
-        readings["visual"] = read_visual(truth, sensors.visual, faults, noise)
-    if sensors.power is not None:
-        readings["power"] = read_power(truth, sensors.power, faults, noise)
-    if sensors.command is not None:
-        readings["command"] = read_command(truth, sensors.command, faults, noise)
-    if sensors.doppler is not None:
-        readings["doppler"] = read_doppler(truth, sensors.doppler, faults, noise)
+    readers: dict[str, Callable[..., Reading]] = {
+        "gnss": partial(read_gnss, site=site), "imu": read_imu, "wheels": read_wheels, "visual": read_visual,
+        "power": read_power, "command": read_command, "doppler": read_doppler,
+    }  # fmt: skip
+    carried = {name: of for name in readers if (of := getattr(sensors, name)) is not None}
+    readings = {name: readers[name](truth, of, faults, noise) for name, of in carried.items()}
     readings = {name: _offset(name, reading, sensors, faults) for name, reading in readings.items()}
     if faults.clock_step:
         middle_ns = (int(truth.stamp_ns[0]) + int(truth.stamp_ns[-1])) // 2
@@ -223,7 +211,7 @@ class Noise:
         return np.random.default_rng([*self._key, zlib.crc32(name.encode())])
 
 
-def read_gnss(truth: Truth, site: Site, sensor: Gnss, faults: Faults, noise: Noise) -> Reading:
+def read_gnss(truth: Truth, sensor: Gnss, faults: Faults, noise: Noise, *, site: Site) -> Reading:
     """Return fixes: lon_deg, lat_deg, alt_m, covariance (N, 9), known, status (-1: no fix)."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("gnss.phase"))
     at = truth.at(stamp)
@@ -352,10 +340,7 @@ def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> R
         hit = rng.random(stamp.size) < sensor.outlier_share
         wrong = wrong + hit[:, None] * sensor.outlier_mps * rng.standard_normal(linear.shape)
     linear = linear + wrong
-    keep = np.ones(stamp.size, dtype=bool)
-    if faults.visual_dropouts:
-        begin = _middle_ns(truth, noise("visual.dropouts"), sensor.dropout_s)
-        keep = (stamp < begin) | (stamp >= begin + round(sensor.dropout_s * 1e9))
+    keep = _but_for(stamp, truth, noise("visual.dropouts"), sensor.dropout_s) if faults.visual_dropouts else None
     position, orientation = _camera_pose(at, sensor, faults, wrong, noise)
     values: dict[str, Any] = {"linear_mps": linear, "angular_radps": angular}
     values |= {"position_m": position, "orientation_xyzw": orientation}
@@ -380,10 +365,7 @@ def read_power(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Rea
             noisy = values[name] + std * noise(f"power.{name}").standard_normal(stamp.size)
             values[name] = np.round(noisy / step) * step
     values["electronics_amp"] = sensor.electronics_watt / values["voltage_volt"]
-    keep = np.ones(stamp.size, dtype=bool)
-    if faults.power_gap:
-        begin = _middle_ns(truth, noise("power.gap"), sensor.gap_s)
-        keep = (stamp < begin) | (stamp >= begin + round(sensor.gap_s * 1e9))
+    keep = _but_for(stamp, truth, noise("power.gap"), sensor.gap_s) if faults.power_gap else None
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="power", keep=keep)
 
 
@@ -465,6 +447,12 @@ def _middle_ns(truth: Truth, rng: np.random.Generator, length_s: float) -> int:
     """Return when something of that length begins, somewhere in the middle half of the drive."""
     span = int(truth.stamp_ns[-1] - truth.stamp_ns[0])
     return int(truth.stamp_ns[0] + rng.uniform(0.25, 0.75) * max(span - length_s * 1e9, 0.0))
+
+
+def _but_for(stamp: NDArray[np.int64], truth: Truth, rng: np.random.Generator, length_s: float) -> NDArray[np.bool_]:
+    """Return which messages are left when some stretch of that length is missing."""
+    begin = _middle_ns(truth, rng, length_s)
+    return (stamp < begin) | (stamp >= begin + round(length_s * 1e9))
 
 
 def _dead_reckoning(velocity: Float, yaw_rate: Float, dt_s: float) -> tuple[Float, Float, Float]:
