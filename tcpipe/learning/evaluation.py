@@ -79,8 +79,7 @@ def evaluate(
 
     Raises
     ------
-    ModelError, DatasetError
-        The model is none or does not fit the dataset, or there is nothing to evaluate on.
+    ModelError, DatasetError : the model is none or does not fit the dataset, or there is nothing to evaluate on.
     """
     ours = load_model(model)
     data = open_dataset(dataset, label=ours.label_energy)

@@ -133,23 +133,16 @@ def reproduce(
 
     Parameters
     ----------
-    directory
-        Where everything goes: new, empty, or an earlier reproduction of the same size, which is gone on from.
-    quick
-        A small one, to see it run.
-    seeds
-        Trainings; figures are compared by their means.
-    jobs
-        Logs read side by side.
-    hidden
-        Variance of the resistance that nothing shows, over that of the frozen site.
-    baselines
-        Train the networks of Wei and Isler; without them what is claimed of them is not measured.
+    directory : where everything goes: new, empty, or an earlier reproduction of the same size, which is gone on from.
+    quick : a small one, to see it run.
+    seeds : trainings; figures are compared by their means.
+    jobs : logs read side by side.
+    hidden : variance of the resistance that nothing shows, over that of the frozen site.
+    baselines : train the networks of Wei and Isler; without them what is claimed of them is not measured.
 
     Raises
     ------
-    UsageError
-        ``directory`` holds something else.
+    UsageError : ``directory`` holds something else.
     """
     place, plan = Path(directory), QUICK if quick else FULL
     plan = replace(plan, evaluating=replace(plan.evaluating, baselines=baselines))

@@ -122,25 +122,19 @@ def train(
 
     Parameters
     ----------
-    dataset
-        What ``tcpipe build-dataset`` wrote.
-    out
-        The folder: new, or a model and nothing else, which is replaced unless it is whole and was trained on the same with the same
+    dataset : what ``tcpipe build-dataset`` wrote.
+    out : the folder: new, or a model and nothing else, which is replaced unless it is whole and was trained on the same with the same
         options; or a URL in a bucket, where nothing is replaced. While training runs its state is kept beside a folder, in
         ``<out>.checkpoint``, and gone on from.
-    config
-        How.
-    variant
-        On what, where it is not the paper's network.
-    fresh
-        Leave an earlier state aside.
-    disposable
-        Leave aside a state that is cut short or of another training, and say so: whoever asks for this network can make it again.
+    config : how.
+    variant : on what, where it is not the paper's network.
+    fresh : leave an earlier state aside.
+    disposable : leave aside a state that is cut short or of another training, and say so: whoever asks for this network can make it again.
 
     Raises
     ------
-    DatasetError, ModelError
-        The dataset has nothing to train on or to weigh by, ``out`` is something else, or the state is cut short or of another training.
+    DatasetError, ModelError : the dataset has nothing to train on or to weigh by, ``out`` is something else, or the state is cut short or
+        of another training.
     """
     rules, other = config or FitConfig(), variant or Variant()
     data = open_dataset(dataset, label=rules.label)

@@ -62,8 +62,7 @@ def diff(a: str | Path, b: str | Path) -> Difference:
 
     Parameters
     ----------
-    a, b
-        Their directories or URLs, the older one first.
+    a, b : their directories or URLs, the older one first.
     """
     first, second = here(a), here(b)
     cards = read_card(first), read_card(second)

@@ -182,17 +182,14 @@ def explain(sample_id: str, *, dataset: str | Path = "dataset", store: str | Pat
 
     Parameters
     ----------
-    sample_id
-        Its id.
-    dataset
-        The dataset's directory.
-    store
-        The store it was built from.
+    sample_id : its id.
+    dataset : the dataset's directory.
+    store : the store it was built from.
 
     Raises
     ------
-    DatasetError, StoreError
-        There is no such dataset, sample or store, the dataset is of another data model, or the store no longer holds the sample's run.
+    DatasetError, StoreError : there is no such dataset, sample or store, the dataset is of another data model, or the store no longer holds
+        the sample's run.
     """
     opened = open_store(store)
     directory, fetched = here_by_range(dataset, by_range=is_shard)

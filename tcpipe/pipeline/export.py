@@ -99,21 +99,15 @@ def export(
 
     Parameters
     ----------
-    log_path
-        A log of any container, or the URL of one.
-    out
-        A directory; it is made where it does not exist.
-    topics
-        Names of topics; none given means all. One text may name several, divided by commas.
-    message_definitions
-        A directory of .msg or .idl files for types that the log does not define.
-    threads
-        How many threads read and decompress.
+    log_path : a log of any container, or the URL of one.
+    out : a directory; it is made where it does not exist.
+    topics : names of topics; none given means all. One text may name several, divided by commas.
+    message_definitions : a directory of .msg or .idl files for types that the log does not define.
+    threads : how many threads read and decompress.
 
     Raises
     ------
-    LogError
-        The log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log
+    LogError : the log cannot be read, none of the topics can, one is not in it (all missing topics at once), a file belongs to another log
         or is none of an export, or ``out`` is a dataset, run, map, model, cost map or store.
     """
     _refuse_what_is_ours(out)

@@ -115,15 +115,12 @@ def inspect(
 
     Parameters
     ----------
-    full
-        Read every message of a log: damage, gaps, stamps and clocks, instead of its index alone.
-    message_definitions
-        A directory of .msg or .idl files for types that a log does not define.
+    full : read every message of a log: damage, gaps, stamps and clocks, instead of its index alone.
+    message_definitions : a directory of .msg or .idl files for types that a log does not define.
 
     Raises
     ------
-    LogError, MapError, DatasetError, StoreError
-        When it is none of these, or cannot be read.
+    LogError, MapError, DatasetError, StoreError : when it is none of these, or cannot be read.
     """
     ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):

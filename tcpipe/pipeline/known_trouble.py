@@ -78,17 +78,13 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
 
     Parameters
     ----------
-    names
-        Runs by their id, logs by path, URL or, where that is enough, file name.
-    store
-        The store that knows of the trouble.
+    names : runs by their id, logs by path, URL or, where that is enough, file name.
+    store : the store that knows of the trouble.
 
     Raises
     ------
-    StoreError
-        There is no store.
-    UsageError
-        A name is none of a run or log with known trouble, or of several logs; nothing was accepted then.
+    StoreError : there is no store.
+    UsageError : a name is none of a run or log with known trouble, or of several logs; nothing was accepted then.
     """
     opened = open_store(store)
     known = known_trouble(opened, [run.facts for run in opened.runs()])

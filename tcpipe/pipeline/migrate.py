@@ -70,15 +70,12 @@ def migrate(path: Path | str, to: Path | str | None = None) -> Migrated:
 
     Parameters
     ----------
-    path
-        The store, map (``.zarr``) or dataset; a store also by its URL.
-    to
-        Where a store is brought to, a directory or URL; what is there of it already is not copied again. None: where it is.
+    path : the store, map (``.zarr``) or dataset; a store also by its URL.
+    to : where a store is brought to, a directory or URL; what is there of it already is not copied again. None: where it is.
 
     Raises
     ------
-    UsageError
-        The path is none of these, or no store and to be brought elsewhere.
+    UsageError : the path is none of these, or no store and to be brought elsewhere.
     """
     source = open_place(path)
     if source.size(MARK) is not None or is_outdated(source):

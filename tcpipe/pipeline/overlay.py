@@ -69,17 +69,14 @@ def overlay(path: Path | str, out: Path) -> Overlay:
 
     Parameters
     ----------
-    path
-        A run of a store, here or in a bucket; where it was ingested under several recipes, one of them.
-    out
-        The file.
+    path : a run of a store, here or in a bucket; where it was ingested under several recipes, one of them.
+    out : the file.
 
     Raises
     ------
-    UsageError
-        The path is no run, or one under several recipes, or ``out`` is there and no overlay: a recording is never replaced.
-    StoreError
-        A file of the run is not as it was written, or its streams, which know the recorder's clock, were made otherwise or are gone.
+    UsageError : the path is no run, or one under several recipes, or ``out`` is there and no overlay: a recording is never replaced.
+    StoreError : a file of the run is not as it was written, or its streams, which know the recorder's clock, were made otherwise or are
+        gone.
     """
     found = run_at(path)
     if found is None:

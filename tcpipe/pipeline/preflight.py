@@ -160,15 +160,12 @@ def preflight(
 
     Parameters
     ----------
-    log
-        A minute or more, of any container, or the URL of one; all of it is read.
-    recipe, robot, message_definitions
-        As `tcpipe.pipeline.ingest.ingest` takes them.
+    log : a minute or more, of any container, or the URL of one; all of it is read.
+    recipe, robot, message_definitions : as `tcpipe.pipeline.ingest.ingest` takes them.
 
     Raises
     ------
-    LogError, RecipeError
-        It is no log, or cannot be read at all.
+    LogError, RecipeError : it is no log, or cannot be read at all.
     """
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)

@@ -77,19 +77,14 @@ def prune(
 
     Parameters
     ----------
-    recipe
-        The recipe that rules: of a run that was ingested with it, what earlier calls made with others is old.
-    keep
-        Runs and recipes, by id, of which nothing goes.
-    min_age_s
-        What killed calls left is removed when it is so old; what waits for a dataset, when nothing was put there for so long.
-    dry_run
-        Say what would go, and remove nothing.
+    recipe : the recipe that rules: of a run that was ingested with it, what earlier calls made with others is old.
+    keep : runs and recipes, by id, of which nothing goes.
+    min_age_s : what killed calls left is removed when it is so old; what waits for a dataset, when nothing was put there for so long.
+    dry_run : say what would go, and remove nothing.
 
     Raises
     ------
-    StoreError, UsageError, RecipeError
-        There is no store, or something cannot be removed; what went before is gone.
+    StoreError, UsageError, RecipeError : there is no store, or something cannot be removed; what went before is gone.
     """
     ruling = recipe_of(recipe)
     opened = open_store(store)

@@ -43,19 +43,14 @@ def report(path: Path | str, *, runs: bool = True, patches: bool = False) -> lis
 
     Parameters
     ----------
-    path
-        What the page is of.
-    runs
-        Of a store: write the page of every run too.
-    patches
-        Of a dataset: write pictures of all patches into a folder beside the page, which shows them.
+    path : what the page is of.
+    runs : of a store: write the page of every run too.
+    patches : of a dataset: write pictures of all patches into a folder beside the page, which shows them.
 
     Raises
     ------
-    UsageError
-        When the path is none of these.
-    StoreError
-        Something cannot be read; of a store all other pages are written.
+    UsageError : when the path is none of these.
+    StoreError : something cannot be read; of a store all other pages are written.
     """
     inside = is_store(path) or inside_store(path) is not None
     if not inside and (is_url(path) or (Path(path) / CARD).is_file()):

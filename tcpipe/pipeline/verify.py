@@ -55,8 +55,7 @@ def verify(path: Path | str) -> Verified:
 
     Raises
     ------
-    UsageError
-        When the path is none of these.
+    UsageError : when the path is none of these.
     """
     stored = _stored(str(path)) if is_url(path) else None
     if is_url(path) and stored is None:

@@ -156,26 +156,19 @@ def make_cost_map(
 
     Parameters
     ----------
-    model, source
-        Who predicts, and the map.
-    out
-        Its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where
-        nothing is replaced, and an interrupted call begins anew.
-    step_m
-        Side of a cell in the map's plane [m].
-    origin_deg
-        Longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own without.
-    step
-        Is told how many blocks of how many are done.
-    cluster
-        Whose workers ask the model instead of this process; the bytes are the same.
+    model, source : who predicts, and the map.
+    out : its directory: new, empty, or a cost map, which is replaced unless it is made from the same; or a URL in a bucket, where nothing
+        is replaced, and an interrupted call begins anew.
+    step_m : side of a cell in the map's plane [m].
+    origin_deg : longitude and latitude where the frame of the Nav2 maps has x = y = 0, its axes those of the map's CRS; the CRS's own
+        without.
+    step : is told how many blocks of how many are done.
+    cluster : whose workers ask the model instead of this process; the bytes are the same.
 
     Raises
     ------
-    ModelError, MapError
-        The map cannot give what the model wants, is smaller than a cell, or cannot be read.
-    UsageError, StoreError
-        ``out`` is something else, or cannot be written; the origin is far from the map.
+    ModelError, MapError : the map cannot give what the model wants, is smaller than a cell, or cannot be read.
+    UsageError, StoreError : ``out`` is something else, or cannot be written; the origin is far from the map.
     """
     check_model(model, source)
     if is_url(out):

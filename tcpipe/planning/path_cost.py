@@ -72,19 +72,14 @@ def cost_of_path(model: CostModel, source: MapReader, lonlat_deg: Floats, *, whe
 
     Parameters
     ----------
-    model, source
-        Who predicts, and the map.
-    lonlat_deg
-        The path's points, WGS 84, shape (P, 2).
-    where
-        What the path is called in errors.
+    model, source : who predicts, and the map.
+    lonlat_deg : the path's points, WGS 84, shape (P, 2).
+    where : what the path is called in errors.
 
     Raises
     ------
-    ModelError, MapError
-        The map cannot give what the model wants, or cannot be read.
-    PathError
-        The path is shorter than a piece, or nowhere on the map.
+    ModelError, MapError : the map cannot give what the model wants, or cannot be read.
+    PathError : the path is shorter than a piece, or nowhere on the map.
     """
     check_model(model, source)
     pieces = pieces_of(source, lonlat_deg, chord_m=model.chord_m, where=where)

@@ -108,10 +108,8 @@ def predict_path(model: CostModel, source: MapFile, path: Path, out: Path | None
 
     Raises
     ------
-    PathError, ModelError, MapError
-        The path, the model or the map cannot be used.
-    UsageError, StoreError
-        ``out`` ends in no known format, or cannot be written.
+    PathError, ModelError, MapError : the path, the model or the map cannot be used.
+    UsageError, StoreError : ``out`` ends in no known format, or cannot be written.
     """
     if out is not None:
         check_ending(out)

@@ -93,21 +93,15 @@ def plan_path(
 
     Parameters
     ----------
-    survey
-        The map and the model, and what is known so far; it learns what it lacks.
-    start_deg, goal_deg
-        Longitude and latitude, WGS 84 [deg], shape (2,).
-    objective
-        What is to be least.
-    allow_unseen
-        Whether ground unlike any that the model was trained on may be crossed.
-    step
-        Is told how many blocks of how many are looked at, or predicted, in each round.
+    survey : the map and the model, and what is known so far; it learns what it lacks.
+    start_deg, goal_deg : longitude and latitude, WGS 84 [deg], shape (2,).
+    objective : what is to be least.
+    allow_unseen : whether ground unlike any that the model was trained on may be crossed.
+    step : is told how many blocks of how many are looked at, or predicted, in each round.
 
     Raises
     ------
-    PathError
-        Start or goal is off the map, cannot be stood on, or there is no way between them.
+    PathError : start or goal is off the map, cannot be stood on, or there is no way between them.
     """
     ends_xy_m = projection_of(survey.source).forward(np.stack([start_deg, goal_deg]))
     search = _Search(survey, ends_xy_m, np.stack([start_deg, goal_deg]), allow_unseen, step)
