@@ -8,8 +8,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from tcpipe.formats.logs.log_file import open_log
+from tcpipe.formats.logs.shipped_definitions import shipped_definitions
 from tcpipe.formats.robot_files import profiles_of, shipped_profiles
-from tcpipe.logs.definitions import DEFINITIONS
 from tcpipe.power.readings import PowerReadings, read_power
 from tcpipe.power.sources import power_lists
 from tcpipe.recipe import Recipe
@@ -47,7 +47,7 @@ def made(types, kind, of, value, empty):
 def log_of(path: Path, name: str, rows: list[dict]) -> Path:
     types = get_typestore(Stores.ROS2_HUMBLE)
     found = {}
-    for of, text in DEFINITIONS.items():
+    for of, text in shipped_definitions().items():
         found.update(get_types_from_msg(text, of))
     types.register(found)
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:

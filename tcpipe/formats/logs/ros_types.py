@@ -23,7 +23,7 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import LogError
-from tcpipe.logs.definitions import DEFINITIONS
+from tcpipe.formats.logs.shipped_definitions import shipped_definitions
 from tcpipe.logs.msg_text import BASE_TYPES, FieldType, MsgTextError, parse_msg
 from tcpipe.logs.topics import normalized_type_name
 from tcpipe.logs.wire_types import (
@@ -321,7 +321,7 @@ def _bundled_by_rosbags(*, ros1: bool) -> _Definitions:
 
 @functools.cache
 def _bundled_by_tcpipe() -> _Definitions:
-    return _definitions_of(DEFINITIONS.items())
+    return _definitions_of(shipped_definitions().items())
 
 
 def _definitions_of(texts: Iterable[tuple[str, str]]) -> _Definitions:

@@ -26,7 +26,7 @@ from rosbags.typesys.store import Typestore
 
 from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import atomic_directory, atomic_file
-from tcpipe.logs.definitions import DEFINITIONS
+from tcpipe.formats.logs.shipped_definitions import shipped_definitions
 
 Encoding = Literal["ros1", "cdr"]
 McapCompression = Literal["zstd", "lz4", "none"]
@@ -53,7 +53,7 @@ class MessageStream:
     publish_time_ns: NDArray[np.int64] | None = None
     latched: bool = False
     definition: str = ""
-    """Text of a type that neither rosbags nor `DEFINITIONS` knows."""
+    """Text of a type that neither rosbags nor `shipped_definitions` knows."""
 
 
 def write_mcap(
@@ -249,6 +249,6 @@ def _store_of(stream: MessageStream, encoding: Encoding) -> Typestore:
 @functools.cache
 def _typestore(encoding: Encoding) -> Typestore:
     store = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
-    for name, text in {**_MISSING_IN_ROSBAGS, **DEFINITIONS}.items():
+    for name, text in {**_MISSING_IN_ROSBAGS, **shipped_definitions()}.items():
         store.register(get_types_from_msg(text, name))
     return store

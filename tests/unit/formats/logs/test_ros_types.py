@@ -120,9 +120,9 @@ def test_a_definition_that_unfolds_without_bound_is_refused():
 
 
 def test_definitions_bundled_for_robots_are_found():
-    from tcpipe.logs.definitions import DEFINITIONS
+    from tcpipe.formats.logs.shipped_definitions import shipped_definitions
 
-    assert "husky_msgs/msg/HuskyStatus" in DEFINITIONS
-    for name in DEFINITIONS:
+    assert "husky_msgs/msg/HuskyStatus" in shipped_definitions()
+    for name in shipped_definitions():
         for ros1 in (False, True):
             assert resolve("", name=name, ros1=ros1).wire.fields
