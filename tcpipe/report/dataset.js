@@ -1,5 +1,6 @@
 "use strict";
 // The dataset's page: samples on the map and in the plot, one of them in words with its patch, and the gallery.
+const unpacked = page.unpack(page.data.samples.packed);
 page.start(async () => {
   const told = page.data;
   const { at, make, fillSelect, pairs, ramp } = page;
@@ -7,7 +8,7 @@ page.start(async () => {
   const below = [at("chosen"), at("stepping")];
   at("chosen").closest("section").append(...below);
 
-  const c = await page.unpack(told.samples.packed);
+  const c = await unpacked;
   const n = c.x.length;
   const source = page.model("samples").data_source;
   const kinds = {

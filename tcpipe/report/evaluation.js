@@ -1,10 +1,11 @@
 "use strict";
 // An evaluation's page: samples measured against predicted and over slope, one of them in words, and the worst with their patches.
+const unpacked = page.unpack(page.data.samples);
 page.start(async () => {
   const told = page.data;
   const { at, make, fillSelect, pairs } = page;
   at("chosen").closest("section").append(at("chosen"), at("stepping"));
-  const c = await page.unpack(told.samples);
+  const c = await unpacked;
   const kinds = Object.fromEntries(told.quantities.map((one) => [one.key, one]));
   const classes = new Map(told.classes.map((one) => [one.id, one]));
   const source = page.model("samples").data_source;

@@ -45,11 +45,22 @@ const page = (() => {
     }
     return list;
   }
+  function bytesOf(base64) {
+    const text = atob(base64), found = new Uint8Array(text.length);
+    for (let i = 0; i < text.length; i++) found[i] = text.charCodeAt(i);
+    return found;
+  }
+  // Where a sheet's picture is: once as a blob, for its text would stand in the style of every patch.
+  function addressOf(layer) {
+    const inside = layer.uri.match(/^data:(.*);base64,/);
+    if (inside) layer.uri = URL.createObjectURL(new Blob([bytesOf(layer.uri.slice(inside[0].length))], { type: inside[1] }));
+    return layer.uri;
+  }
   // Patch number i of sheets as a square, by one of their layers.
   function patch(sheets, layer, i, side) {
     const shown = make("span", "", { className: "patch", role: "img", ariaLabel: `${layer.name} patch` });
     const scale = side / sheets.px;
-    shown.style.cssText = `width:${side}px;height:${side}px;background-image:url(${layer.uri});background-size:${sheets.across * side}px auto;`
+    shown.style.cssText = `width:${side}px;height:${side}px;background-image:url(${addressOf(layer)});background-size:${sheets.across * side}px auto;`
       + `background-position:${-(i % sheets.across) * sheets.px * scale}px ${-Math.floor(i / sheets.across) * sheets.px * scale}px`;
     return shown;
   }
@@ -114,8 +125,8 @@ const page = (() => {
   }
   // Columns as `tcpipe.report.packed` wrote them.
   async function unpack({ columns, data }) {
-    const raw = Uint8Array.from(atob(data), (c) => c.charCodeAt(0));
-    const buffer = await new Response(new Blob([raw]).stream().pipeThrough(new DecompressionStream("deflate"))).arrayBuffer();
+    const stream = new Blob([bytesOf(data)]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const buffer = await new Response(stream).arrayBuffer();
     const whole = { u8: Uint8Array, u16: Uint16Array, u32: Uint32Array };
     return Object.fromEntries(columns.map(({ name, kind, at: first, bytes, low, step }) => {
       const part = buffer.slice(first, first + bytes);

@@ -1,11 +1,12 @@
 "use strict";
 // A run's page: its map and its plots over time under one cursor, and what is chosen, in words.
+const packed = [page.data.spans, page.data.segments, ...Object.values(page.data.series).map((one) => one.packed)];
+const unpacked = Promise.all(packed.map(page.unpack));
 page.start(async () => {
   const { at, make, fillSelect, pairs, model, ramp } = page;
   const told = page.data;
-  const series = {};
-  for (const [name, { packed, gap_s }] of Object.entries(told.series)) series[name] = { ...(await page.unpack(packed)), gap_s };
-  const [spans, s] = [await page.unpack(told.spans), await page.unpack(told.segments)];
+  const [spans, s, ...found] = await unpacked;
+  const series = Object.fromEntries(Object.entries(told.series).map(([name, { gap_s }], i) => [name, { ...found[i], gap_s }]));
   const [track, n] = [series.track, s.start.length];
   const panels = page.plots.filter((view) => view.model.name !== "map" && view.model.x_range === model("gates").x_range);
   const range = model("gates").x_range;
