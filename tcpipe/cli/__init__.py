@@ -95,31 +95,9 @@ def cli() -> None:
 
 
 for command in (
-    demo,
-    init,
-    inspect,
-    preflight,
-    ingest,
-    status,
-    accept,
-    prune,
-    add_map,
-    build_dataset,
-    train,
-    evaluate,
-    reproduce,
-    predict_path,
-    cost_map,
-    plan_path,
-    report,
-    overlay,
-    export,
-    explain,
-    verify,
-    migrate,
-    diff,
-    schemas,
-    simulate,
+    *(demo, init, inspect, preflight, ingest, status, accept, prune),
+    *(add_map, build_dataset, train, evaluate, reproduce, predict_path, cost_map, plan_path),
+    *(report, overlay, export, explain, verify, migrate, diff, schemas, simulate),
 ):
     cli.add_command(_debug_option(hidden=True)(command))
 

@@ -13,21 +13,8 @@ from tcpipe.logs.topics import normalized_type_name
 
 BASE_TYPES = frozenset(
     [
-        "bool",
-        "byte",
-        "char",
-        "string",
-        "wstring",
-        "float32",
-        "float64",
-        "int8",
-        "int16",
-        "int32",
-        "int64",
-        "uint8",
-        "uint16",
-        "uint32",
-        "uint64",
+        *("bool", "byte", "char", "string", "wstring", "float32", "float64"),
+        *("int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
     ]
 )
 _KNOWN_AS = {
