@@ -135,28 +135,18 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
     named = {PurePosixPath(name).name: name for name in manifest.checksums}
     if gone := [name for name in ("segments.parquet", "track.parquet", "rejections.parquet") if name not in named]:
         raise StoreError(f"{place}: its manifest lists no {gone[0]}; ingest the log again")
-    return RunFacts(
-        run_id=manifest.run_id,
-        recipe_id=manifest.recipe_id,
+    return recast(
+        manifest,
+        RunFacts,
         state=state,
-        data_model_version=manifest.data_model_version,
-        tcpipe_version=manifest.tcpipe_version,
-        ingest_key=manifest.ingest_key,
-        robot=manifest.robot,
-        robot_requested=manifest.robot_requested,
-        message_definitions=manifest.message_definitions,
-        tags=manifest.tags,
         segments=manifest.counts.segments,
         driven_m=math.fsum(manifest.ledger_m.values()),
         kept_m=manifest.ledger_m.get("kept", 0.0),
-        warnings=manifest.warnings,
-        damage=manifest.damage,
         energy_budget=None if label is None else label.energy_budget,
         segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",
         sizes={name: of.size_bytes for name, of in manifest.checksums.items()},
-        ledger_m=manifest.ledger_m,
         standing_watt=None if label is None else label.physics.standing_watt,
         physics={} if label is None or label.physics.fit is None else _terms(label.physics.fit),
     )

@@ -13,6 +13,7 @@ from typing import Literal, TypeVar
 from tcpipe import __version__
 from tcpipe.errors import TcpipeError, plain_line
 from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.json_files import recast
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import Manifest
 from tcpipe.pipeline.known_trouble import failure_name
@@ -105,21 +106,9 @@ class LogLine(IngestResult):
 
 def result_of(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
     """Return what became of a log whose run is in the store."""
-    return IngestResult(
-        log=source.name,
-        status="damaged" if made.damage and status == "done" else status,
-        run_id=made.run_id,
-        recipe_id=made.recipe_id,
-        robot=made.robot,
-        segments=made.segments,
-        distance_m=made.driven_m,
-        kept_m=made.kept_m,
-        energy_budget=made.energy_budget,
-        warnings=made.warnings,
-        damage=made.damage,
-        same_as=same_as,
-        sha256=sha256,
-    )
+    told = "damaged" if made.damage and status == "done" else status
+    about = {"log": source.name, "status": told, "distance_m": made.driven_m, "same_as": same_as, "sha256": sha256}
+    return recast(made, IngestResult, **about)
 
 
 def too_young(task: IngestTask) -> IngestResult | None:

@@ -168,16 +168,11 @@ def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True)
         raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
     if proved:
         _prove(path, fetched)
-    return MapFile(
-        name=kept.name,
-        grid=kept.grid,
+    return recast(
+        kept,
+        MapFile,
         classes=ClassTable(kept.class_table),
         layers=layers,
-        tile_px=kept.tile_px,
-        height_reference_m=kept.height_reference_m,
-        facts=kept.facts,
-        id_by_value=kept.id_by_value,
-        factors=kept.factors,
         _levels={
             factor: {
                 layer: open_sharded(path / f"{_level_path(factor)}{layer}", sparse=True, fetched=fetched)

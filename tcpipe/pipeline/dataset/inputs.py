@@ -19,7 +19,7 @@ from tcpipe import __version__
 from tcpipe.errors import DatasetError, MapError, StoreError
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.dataset_files import FileFormat, is_shard, read_card, read_samples, sample_columns
-from tcpipe.formats.json_files import digest, plain
+from tcpipe.formats.json_files import digest, plain, recast
 from tcpipe.formats.published import FetchedShards, here_by_range
 from tcpipe.formats.run_documents import LogOrigin, MapDocument
 from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, read_checksums
@@ -182,19 +182,8 @@ def choose_maps(store: Store, names: Sequence[str]) -> tuple[str, ...]:
 
 def run_source(run: RunDirectory, log: LogOrigin) -> RunSource:
     """Return what the card says of a run: its log, by name and sha256, its recipe, robot, tags, metres, warnings and error budget."""
-    told = run.facts
-    return RunSource(
-        run_id=run.run_id,
-        recipe_id=run.recipe_id,
-        robot=told.robot,
-        tags=told.tags,
-        logs=tuple(Path(path).name for path in log.paths),
-        sha256=log.sha256,
-        segments_sha256=told.segments_sha256,
-        driven_m=told.driven_m,
-        warnings=tuple(told.warnings),
-        energy_budget=told.energy_budget,
-    )
+    named = {"run_id": run.run_id, "recipe_id": run.recipe_id, "sha256": log.sha256}
+    return recast(run.facts, RunSource, logs=tuple(Path(path).name for path in log.paths), **named)
 
 
 def _table_digest(table: pa.Table) -> str:

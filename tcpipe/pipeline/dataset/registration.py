@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import MapError
 from tcpipe.formats.dataset_card import MapRegistration
+from tcpipe.formats.json_files import recast
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.recipe import Recipe
@@ -96,16 +97,12 @@ def _unlike(found: Registration, expected_m: float, name: str) -> str | None:
 
 def _told(run_id: str, found: Registration, expected_m: float) -> MapRegistration:
     """Return what the card says: no shift where the ground cannot tell one."""
-    told = bool(np.isfinite(found.shift_std_m))
-    return MapRegistration(
+    untold = {} if np.isfinite(found.shift_std_m) else dict.fromkeys(("shift_xy_m", "shift_std_m", "shifted_misfit_m"))
+    return recast(
+        found,
+        MapRegistration,
+        **untold,
         run_id=run_id,
-        points=found.points,
-        shift_xy_m=found.shift_xy_m if told else None,
-        shift_std_m=found.shift_std_m if told else None,
-        significant=found.significant,
-        height_offset_m=found.height_offset_m,
-        misfit_m=found.misfit_m,
-        shifted_misfit_m=found.shifted_misfit_m if told else None,
         height_scale=found.scale.value if found.scale.is_known else None,
         height_scale_std=found.scale.std if found.scale.is_known else None,
         expected_misfit_m=expected_m,
