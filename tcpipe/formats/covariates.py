@@ -97,8 +97,10 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
     DatasetError : it cannot be read, tells no time, or two of its rows are of one time and differ.
     """
     try:
-        lazy = pl.scan_parquet(path) if path.suffix.lower() == ".parquet" else _scan_csv(path)
-        table = lazy.collect()
+        if path.suffix.lower() == ".parquet":
+            table = pl.scan_parquet(path).collect()
+        else:
+            table = pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE).collect()
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
         raise DatasetError(
             f"{path}: not a readable table ({str(error).splitlines()[0]}); wanted CSV or Parquet"
@@ -129,10 +131,6 @@ def read_covariates(path: Path, *, time_column: str | None = None, time_unit: Ti
 def _in_utc(stamp_ns: int) -> str:
     """Return a stamp as ISO 8601 to the second."""
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def _scan_csv(path: Path) -> pl.LazyFrame:
-    return pl.scan_csv(path, infer_schema_length=None, null_values=_NO_VALUE)
 
 
 def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:

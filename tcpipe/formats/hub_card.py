@@ -33,7 +33,8 @@ def hub_card(card: DatasetCard, samples: pa.Schema, *, samples_file: str, pictur
     samples : schema of its table of samples.
     samples_file, picture : where that table and an overview lie in the dataset.
     """
-    return f"---\n{_yaml(_head(card, samples, samples_file))}---\n\n{_body(card, picture)}"
+    text = "\n".join(_lines(card, picture))
+    return f"---\n{_yaml(_head(card, samples, samples_file))}---\n\n{text}\n"
 
 
 def _head(card: DatasetCard, samples: pa.Schema, samples_file: str) -> dict[str, Json]:
@@ -97,10 +98,6 @@ def _text(value: str) -> str:
     """Return text as Markdown shows it, and nothing else: no HTML, no markup."""
     escaped = plain_line(value).replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
     return "".join(f"\\{c}" if c in "\\`*_[]|#{}" else c for c in escaped)
-
-
-def _body(card: DatasetCard, picture: str) -> str:
-    return "\n".join(_lines(card, picture)) + "\n"
 
 
 def _lines(card: DatasetCard, picture: str) -> Iterator[str]:

@@ -146,16 +146,13 @@ def returned(jumps: Sequence[Jump]) -> WrongFixes | None:
     while len(rest) > 1:
         first, second = rest[0], rest[1]
         there, back = np.linalg.norm(first.off_m), np.linalg.norm(second.off_m)
-        if np.linalg.norm(first.off_m + second.off_m) < _SHARED * max(there, back) and _soon(first, second):
+        soon = second.stamp_ns - first.stamp_ns < _RETURNS_NS
+        if soon and np.linalg.norm(first.off_m + second.off_m) < _SHARED * max(there, back):
             spans.append((first.stamp_ns - _LEADS_NS[0], second.stamp_ns))
             size_m = max(size_m, float(there), float(back))
             rest.pop(0)
         rest.pop(0)
     return WrongFixes((), _merged(tuple(spans)), size_m) if spans else None
-
-
-def _soon(first: Jump, second: Jump) -> bool:
-    return second.stamp_ns - first.stamp_ns < _RETURNS_NS
 
 
 def find_wrong_fixes(tried: Try, whole: Span, known: Spans) -> WrongFixes | None:

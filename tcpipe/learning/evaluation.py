@@ -29,7 +29,6 @@ from tcpipe.learning.evaluation_facts import (
     Plotted,
     SplitErrors,
 )
-from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.leakage import by_blocks, leakage_of
 from tcpipe.learning.metrics import ALL, Array, Errors, Spread, errors_by_class, label_floor, mean_of_draws
 from tcpipe.learning.models import Model, load_model
@@ -84,7 +83,7 @@ def evaluate(
     ours = load_model(model)
     data = open_dataset(dataset, label=ours.label_energy)
     check_fit(ours.card, data, str(model))
-    fitting, fitted = _how_it_was_trained(ours)
+    fitting, fitted = ours.card.training.config, ours.card.training.samples["fitted"]
     names = {entry.id: entry.name for entry in ours.classes.classes}
     sets = {name: found for name in SPLITS if len((found := measured(data[name], names)).split)}
     if not sets:
@@ -126,11 +125,6 @@ def evaluate(
         plots={name: _plotted(part, said[name], config.plotted) for name, part in sets.items()},
     )
     return evaluation, predictions_table(sets, said, spreads)
-
-
-def _how_it_was_trained(model: Model) -> tuple[FitConfig, int]:
-    """Return options and number of fitted samples, by which networks beside the model are trained."""
-    return model.card.training.config, model.card.training.samples["fitted"]
 
 
 def _repeatability(card: DatasetCard, energy: Energy) -> dict[str, Floor | None]:

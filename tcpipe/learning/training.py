@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -263,14 +262,11 @@ def what_was_seen(split: Split) -> Seen:
         if "height" in layers:
             found_m = relief_m(np.asarray(layers["height"], np.uint16))
             reliefs_m += [float(found_m.min()), float(found_m.max())]
-    ranges = {name: _range(split.column(name)) for name in ("slope_rad", "cross_slope_rad")}
+    slopes = {name: split.column(name) for name in ("slope_rad", "cross_slope_rad")}
+    ranges = {name: (float(np.min(of)), float(np.max(of))) for name, of in slopes.items()}
     if reliefs_m:
         ranges["relief_m"] = (min(reliefs_m), max(reliefs_m))
     return Seen(_class_counts(split), tuple(sorted(pixel_classes)), ranges)
-
-
-def _range(values: Any) -> tuple[float, float]:
-    return float(np.min(values)), float(np.max(values))
 
 
 def _class_counts(split: Split) -> dict[int, int]:
