@@ -16,7 +16,7 @@ from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.index_files import RunFacts, uncollected
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.places import local_output
-from tcpipe.formats.recipe_toml import find_recipe, ingest_key, load_recipe
+from tcpipe.formats.recipe_toml import ingest_key, recipe_of
 from tcpipe.formats.record_files import Call
 from tcpipe.motion.remedies import StoreLoss, losses_of
 from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time, latest_calls
@@ -125,9 +125,7 @@ def status(
         There is no store, or nothing is known of its sources.
 
     """
-    ruling = (
-        recipe if isinstance(recipe, Recipe) else load_recipe(find_recipe(Path(recipe) if recipe else None, Path.cwd()))
-    )
+    ruling = recipe_of(recipe)
     opened = Store(store if is_url(store) else local_output(store)) if create else open_store(store)
     calls = latest_calls(opened)
     given = [str(log) for log in logs] or list(dict.fromkeys(log for call in calls for log in call.logs))
