@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import islice
 
 from tcpipe.logs.mapped import MAPPED
 from tcpipe.logs.msg_text import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
@@ -46,6 +47,8 @@ CALLED: Mapping[str, Mapping[str, str]] = {
 _PROPOSED = ("gnss", "imu")
 """Roles whose fields are called so that nothing else is taken for them."""
 _DEEPEST = 4
+_LONGEST_BYTES, _MOST_NAMES = 1 << 16, 1000
+"""No receiver's message is longer or has more numbers; one that is made to hurt does not cost minutes."""
 
 
 def fields_called(role: str, names: Sequence[str]) -> dict[str, str]:
@@ -81,9 +84,11 @@ def proposed_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterato
 
 
 def _numbers(topic: Topic) -> list[str]:
-    """Return the dotted names of a message's numbers; none where its definition cannot be read."""
+    """Return the dotted names of a message's first numbers; none where its definition cannot be read or is far too long."""
+    if len(topic.definition) > _LONGEST_BYTES:
+        return []
     try:
-        return list(_below(parse_msg(topic.definition, topic.type_name), topic.type_name))
+        return list(islice(_below(parse_msg(topic.definition, topic.type_name), topic.type_name), _MOST_NAMES))
     except MsgTextError:
         return []
 

@@ -1,7 +1,7 @@
 """What a message type of somebody's own could play is told by its definition, and by nothing that is of another role."""
 
 from tcpipe.formats.robot_files import shipped_profiles
-from tcpipe.logs.names_of_fields import fields_called, proposed_roles
+from tcpipe.logs.names_of_fields import _numbers, fields_called, proposed_roles
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import ReadConfig
 from tcpipe.stages.read_roles import roles_by
@@ -62,6 +62,18 @@ def test_nothing_is_proposed_for_what_is_played_or_cannot_be_read_or_lacks_a_fie
         topic("/tcpipe/track", RTK),
     ]
     assert not list(proposed_roles(others, settled=()))
+
+
+def test_a_definition_that_is_made_to_hurt_is_not_searched() -> None:
+    rule = "=" * 80
+    deep = "".join(f"L1 f{n}\n" for n in range(60))
+    for level in range(1, 5):
+        inner = "int8" if level == 4 else f"L{level + 1}"
+        deep += f"{rule}\nMSG: driver/L{level}\n" + "".join(f"{inner} f{n}\n" for n in range(60))
+    assert len(deep) < 1 << 16
+    assert len(_numbers(topic("/deep", deep))) == 1000, "of hundreds of millions"
+    assert len(_numbers(topic("/wide", "int8 a\n" * 9_000))) == 1000
+    assert _numbers(topic("/long", RTK + "int8 a\n" * 10_000)) == []
 
 
 def test_a_log_without_motion_asks_with_the_proposal_and_one_with_motion_warns_with_it() -> None:
