@@ -252,7 +252,7 @@ def _as_named(path: Path) -> Path:
 def _place_in(path: Path, entry: Path) -> str:
     if path == entry:
         return path.name or path.resolve().name
-    return os.fspath(path).removeprefix(os.fspath(entry)).lstrip("/") if str(entry) != "." else os.fspath(path)
+    return str(path).removeprefix(f"{entry}/").lstrip("/")
 
 
 def _files(paths: Sequence[Path]) -> tuple[tuple[int, int], ...]:
