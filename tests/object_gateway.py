@@ -1,7 +1,9 @@
 """A real object store for tests: Ceph's gateway, started by the program that TCPIPE_TEST_OBJECT_STORAGE names, once a session."""
 
+import contextlib
 import os
 import re
+import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,6 +12,9 @@ import obstore
 import pytest
 from obstore.store import from_url
 
+# Where a monitor of Ceph comes up at all it does so in seconds; where it does not, its client asks for five minutes.
+ATTEMPTS, SECONDS_EACH = 3, 90
+
 
 @pytest.fixture(scope="session")
 def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
@@ -17,14 +22,50 @@ def gateway(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]
     program = os.environ.get("TCPIPE_TEST_OBJECT_STORAGE")
     if not program:
         pytest.skip("TCPIPE_TEST_OBJECT_STORAGE names no object store (make test-object-storage)")
-    directory = tmp_path_factory.mktemp("gateway") / "s3"
-    subprocess.run([program, "start", directory], check=True, stdout=subprocess.DEVNULL)
+    failures = []
+    for _ in range(ATTEMPTS):
+        directory = tmp_path_factory.mktemp("gateway") / "s3"
+        failure = failure_to_start(program, directory)
+        if failure is None:
+            break
+        failures.append(failure)
+    else:
+        pytest.skip(f"{program} did not start an object store in {ATTEMPTS} attempts: {'; '.join(failures)}")
     try:
         environment = dict(re.findall(r"export (\w+)=(.*)", (directory / "env").read_text()))
         make_bucket("tests", environment)
         yield environment
     finally:
         subprocess.run([program, "stop", directory], check=False)
+
+
+def failure_to_start(program: str, directory: Path, seconds: float = SECONDS_EACH) -> str | None:
+    """Start an object store below a directory; None once it answers, else why it does not, with all that was started ended."""
+    said = directory.parent / "start.err"
+    with said.open("w") as errors:
+        starting = subprocess.Popen(
+            [program, "start", directory], stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True
+        )
+    try:
+        if starting.wait(seconds) == 0:
+            return None
+        reason = f"exit status {starting.returncode}"
+    except subprocess.TimeoutExpired:
+        reason = f"no answer in {seconds:g} s"
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(starting.pid, signal.SIGKILL)
+    starting.wait()
+    logs = [said, *sorted(directory.glob("*.out"))]
+    return " | ".join(
+        [
+            reason,
+            *(
+                f"{path.name}: {path.read_text(errors='replace')[-300:].strip()}"
+                for path in logs
+                if path.stat().st_size
+            ),
+        ]
+    )
 
 
 def make_bucket(name: str, environment: dict[str, str]) -> None:

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from object_gateway import gateway, in_environment  # noqa: F401  a fixture
+from object_gateway import in_environment
 from storage_server import OVERWRITING, READ_ONLY, object_store
 from stored_files import manifest, table
 from synthetic_store import add_run, lanes, segments

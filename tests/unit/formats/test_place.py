@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from object_gateway import gateway, in_environment  # noqa: F401  a fixture
+from object_gateway import in_environment
 from storage_server import FORBIDDEN, READ_ONLY, SKEWED, object_store
 
 from tcpipe.errors import StoreError
