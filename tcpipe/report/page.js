@@ -2,26 +2,35 @@
 // The frame's script: it draws the page's figures, and draws them again when the colour scheme turns. `page` is what other scripts need.
 const page = (() => {
   const read = (id) => JSON.parse(document.getElementById(id).textContent);
-  const documents = read("page-figures");
+  const figures = read("page-figures");
   const plots = [];
-  async function draw(figures) {
-    const roots = figures.roots.map((root) => root.id);
-    const item = { docid: "page", root_ids: roots, roots: Object.fromEntries(roots.map((id) => [id, id])) };
-    for (const manager of await Bokeh.embed.embed_items({ page: figures }, [item])) {
-      plots.push(...[...manager].filter((view) => "request_paint" in view));
-    }
+  let views = [];
+  async function draw({ first, later }) {
+    Bokeh.set_log_level("warn");
+    const ids = [...first.roots, ...later].map((root) => root.id);
+    const item = { docid: "page", root_ids: ids, roots: Object.fromEntries(ids.map((id) => [id, id])) };
+    [views] = await Bokeh.embed.embed_items({ page: first }, [item]);
+    plots.push(...[...views].filter((view) => "request_paint" in view));
   }
-  // The first document is what scripts ask for; the others follow when the page answers.
-  if (documents.length) Bokeh.set_log_level("warn");
-  const first = documents.length ? draw(documents[0]) : Promise.resolve();
+  const turn = () => new Promise((next) => setTimeout(next, 0));
+  async function join(root) {
+    await turn();
+    Bokeh.documents[0].apply_json_patch({ events: [{ kind: "RootAdded", model: root }] });
+    const drawn = () => [...views].find((view) => view.model.id === root.id);
+    while (!drawn()) await turn();
+    plots.push(drawn());
+    return drawn();
+  }
+  // What scripts ask for is drawn first; the others follow when the page answers.
+  const first = figures ? draw(figures) : Promise.resolve();
   let work = async () => {};
   document.addEventListener("DOMContentLoaded", async () => {
     await first;
-    await work();
+    const joined = await work();
     document.documentElement.dataset.ready = "yes";
-    for (const figures of documents.slice(1)) {
-      await new Promise((next) => setTimeout(next, 0));
-      await draw(figures);
+    for (const root of figures?.later ?? []) {
+      const view = await join(root);
+      joined?.(view);
     }
     document.documentElement.dataset.whole = "yes";
   });
@@ -30,7 +39,7 @@ const page = (() => {
   matchMedia("print").addEventListener("change", repaint);
 
   // What the pages' own scripts share.
-  const model = (name) => documents.length ? Bokeh.documents[0].get_model_by_name(name) : null;
+  const model = (name) => figures ? Bokeh.documents[0].get_model_by_name(name) : null;
   const at = (id) => document.getElementById(id);
   const make = (tag, text = "", more = {}) => Object.assign(document.createElement(tag), { textContent: text }, more);
   function fillSelect(select, names, text = (name) => name) {
@@ -143,7 +152,7 @@ const page = (() => {
   return {
     at, make, fillSelect, pairs, patches, legend, ramp, ends, scale, clock, explain, chooseGround, gallery, unpack,
     data: read("page-data"),
-    // What a page's own script does when the figures that it asks for are drawn.
+    // What a page's own script does when the figures that it asks for are drawn; what it returns is called with the view of each that follows.
     start: (of) => { work = of; },
     plots,
     model,

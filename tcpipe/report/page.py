@@ -125,7 +125,7 @@ def render_page(
     environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     environment.filters["cell"] = _cell
     every = [plot for section in sections for plot in section.plots]
-    drawn, ids = plots.documents(every)
+    drawn, ids = plots.figures(every)
     names = iter(ids)
     page = environment.from_string(_file("page.html.j2")).render(
         title=title,

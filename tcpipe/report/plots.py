@@ -41,7 +41,7 @@ class Plot:
     alt: str
     legend: Mapping[str, str] = field(default_factory=dict)
     waits: bool = False
-    """Whether no script of the page asks for it: it is drawn when all that a reader can work with is there."""
+    """Whether it is drawn when the page answers already; the page's script is told of each (``page.js``)."""
 
 
 def new_plot(
@@ -90,7 +90,7 @@ def new_plot(
     ends
         Of the horizontal axis; it follows what is drawn without.
     waits
-        No script of the page asks for it, and it is drawn last.
+        It is drawn when the page answers already.
 
     """
     own = DataRange1d() if ends is None else Range1d(start=ends[0], end=ends[1])
@@ -206,33 +206,21 @@ def script() -> str:
     return (Path(bokeh.__file__).parent / "server/static/js/bokeh.min.js").read_text(encoding="utf-8")
 
 
-def documents(plots: Sequence[Plot]) -> tuple[list[Json], list[str]]:
-    """Return the JSON of plots and the id of each; the same plots have the same ids, whatever was drawn before in this process.
+def figures(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
+    """Return what a page draws, and the id of each plot; the same plots have the same ids, whatever was drawn before in this process.
 
-    All plots that scripts ask for are one document, the first. Those that wait follow, each with the plots that share something with it.
+    ``first`` is a Bokeh document of all plots that do not wait. ``later`` are the roots that join it, in the order of the page; what
+    they share with plots before them, as an axis, is named there and told once.
     """
-    shared = [[plot for plot in plots if not plot.waits]] if any(not plot.waits for plot in plots) else []
-    for plot in plots:
-        if plot.waits:
-            beside = next((of for of in shared if of[0].waits and _share(of[-1], plot)), None)
-            if beside is None:
-                shared.append([plot])
-            else:
-                beside.append(plot)
-    ids: dict[str, str] = {}
-    told = [_document(of, ids) for of in shared]
-    return told, [ids[plot.figure.id] for plot in plots]
-
-
-def _share(one: Plot, other: Plot) -> bool:
-    return not one.figure.references().isdisjoint(other.figure.references())
-
-
-def _document(plots: Sequence[Plot], ids: dict[str, str]) -> Json:
-    whole = Document()
-    for plot in plots:
+    if not plots:
+        return None, []
+    whole, ids = Document(), dict[str, str]()
+    ordered = sorted(plots, key=lambda plot: plot.waits)
+    for plot in ordered:
         whole.add_root(plot.figure)
-    return _told(cast("Json", whole.to_json(deferred=False)), ids)
+    told = cast("dict[str, Json]", _told(cast("Json", whole.to_json(deferred=False)), ids))
+    roots, soon = cast("list[Json]", told["roots"]), sum(not plot.waits for plot in plots)
+    return {"first": {**told, "roots": roots[:soon]}, "later": roots[soon:]}, [ids[plot.figure.id] for plot in plots]
 
 
 def _told(value: Json, ids: dict[str, str]) -> Json:

@@ -8,7 +8,7 @@ page.start(async () => {
   const [spans, s, ...found] = await unpacked;
   const series = Object.fromEntries(Object.entries(told.series).map(([name, { gap_s }], i) => [name, { ...found[i], gap_s }]));
   const [track, n] = [series.track, s.start.length];
-  const panels = page.plots.filter((view) => view.model.name !== "map" && view.model.x_range === model("gates").x_range);
+  const panels = [];
   const range = model("gates").x_range;
   const names = { w: ["power w", "power", "W", 1], v: ["velocity v", "velocity", "m/s", 3], T: ["time T", "duration", "s", 3], E: ["energy E", "energy", "J", 1],
     slope: ["slope by the track", "slope", "°", 1], turn: ["turn", "turn", "°", 1], residual: ["w beyond physics", "residual", "W", 1] };
@@ -73,10 +73,11 @@ page.start(async () => {
     for (const left of open.values()) close(left);
     return [bars, shade];
   }
-  function redraw() {
+  function redraw(views = panels) {
     const pixels = Math.max(200, model("gates").inner_width || 800);
-    const heights = new Map();
+    const heights = new Map(), shown = new Set(views.map((view) => view.model.name));
     told.lines.forEach((line, k) => {
+      if (!shown.has(line.plot)) return;
       const data = seen(series[line.series], series[line.series][line.column], pixels);
       model(`line ${k}`).data_source.data = data;
       heights.set(line.plot, [...(heights.get(line.plot) ?? []), data.y.filter(finite)]);
@@ -88,11 +89,11 @@ page.start(async () => {
       model(plot).y_range.setv({ start: low - room, end: high + room });
     }
     const [bars, shade] = gates(pixels);
-    model("gates bars").data_source.data = bars;
-    for (const view of panels) model(`shade ${view.model.name}`).data_source.data = shade;
+    if (shown.has("gates")) model("gates bars").data_source.data = bars;
+    for (const view of views) model(`shade ${view.model.name}`).data_source.data = shade;
   }
   let waiting = 0;
-  const soon = () => { clearTimeout(waiting); waiting = setTimeout(redraw, 60); };
+  const soon = () => { clearTimeout(waiting); waiting = setTimeout(() => redraw(), 60); };
   range.properties.start.change.connect(soon);
   range.properties.end.change.connect(soon);
 
@@ -106,7 +107,7 @@ page.start(async () => {
     const span = range.end - range.start, middle = (range.start + range.end) / 2;
     zoom(middle - (span * share) / 2 + shift * span, middle + (span * share) / 2 + shift * span);
   };
-  at("peaks").onchange = redraw;
+  at("peaks").onchange = () => redraw();
   at("whole").onclick = () => zoom(first, last);
   at("in").onclick = () => about(0.5, 0);
   at("out").onclick = () => about(2, 0);
@@ -131,7 +132,7 @@ page.start(async () => {
   }
   const paint = () => { model("segments").data_source.data = { x0: s.x0, y0: s.y0, x1: s.x1, y1: s.y1, colour: coloured(at("colour").value) }; };
   function label() {
-    if (!n) return;
+    if (!model("labels")) return;
     const [, name, unit] = names[at("label").value];
     const y = Float64Array.from(s[name]), std = s[`${name}_std`];
     const off = (sign) => y.map((value, i) => value + sign * (std && finite(std[i]) ? std[i] : 0));
@@ -236,7 +237,12 @@ page.start(async () => {
       if (t !== null && pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 6) choose(t);
     }, true);
   }
-  for (const view of panels) {
+  function join(view) {
+    if (view.model.x_range !== range) return;
+    panels.push(view);
+    redraw([view]);
+    if (view.model.name === "label plot") label();
+    model(`cursor ${view.model.name}`).location = chosen;
     listen(view, (place) => place && place[0]);
     at(view.model.id).addEventListener("dblclick", () => zoom(first, last));
     if (matchMedia("(pointer: fine)").matches) view.model.toolbar.tools.find((tool) => tool.type === "BoxZoomTool").active = true;
@@ -256,8 +262,8 @@ page.start(async () => {
   const below = [at("chosen"), at("stepping")];
   at("chosen").closest("section").append(...below);
   paint();
-  label();
-  redraw();
   if (n) pick(0);
   else choose(first);
+  page.plots.forEach(join);
+  return join;
 });

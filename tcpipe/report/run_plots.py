@@ -137,6 +137,7 @@ def _panel(
         height_px=130,
         tools="xbox_zoom",
         beside=first,
+        waits=True,
     )
     plot.figure.yaxis.ticker.desired_num_ticks = 4
     return plot

@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 
 from tcpipe.report.page import Link, Number, Section, Shaded, Verdict, render_page
-from tcpipe.report.plots import documents, histogram, new_plot, waterfall
+from tcpipe.report.plots import figures, histogram, new_plot, waterfall
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e$$x$$ \\(y\\) \"'&"
 """Ends a script, colours a terminal, turns its text round, reads as two formulas, leaves an attribute."""
@@ -88,21 +88,25 @@ def test_warnings_of_one_cause_are_one_line_with_the_others_folded_below_it():
     assert re.findall("<li>([^<]*)", shown) == ["no power", "no power", *late]
 
 
-def test_what_scripts_ask_for_is_drawn_first_and_what_shares_an_axis_together():
+def test_what_waits_joins_what_is_drawn_first_and_names_the_axis_that_it_shares():
     def plot(name, **more):
         made = new_plot(name, alt=name, axes=("x", "y"), **more)
         made.figure.line([0.0, 1.0], [0.0, 1.0])
         return made
 
-    late = plot("late", waits=True)
-    every = [late, plot("asked"), plot("alone", waits=True), plot("beside", waits=True, beside=late), plot("too")]
-    told, ids = documents(every)
-    names = [[root["attributes"]["name"] for root in of["roots"]] for of in told]
-    assert names == [["asked", "too"], ["late", "beside"], ["alone"]]
-    placed = {root["attributes"]["name"]: root["id"] for of in told for root in of["roots"]}
+    asked = plot("asked")
+    every = [plot("beside", waits=True, beside=asked), asked, plot("alone", waits=True), plot("too")]
+    told, ids = figures(every)
+    first, later = told["first"]["roots"], told["later"]
+    assert [[root["attributes"]["name"] for root in of] for of in (first, later)] == [
+        ["asked", "too"],
+        ["beside", "alone"],
+    ]
+    placed = {root["attributes"]["name"]: root["id"] for root in first + later}
     assert [placed[of.figure.name] for of in every] == ids
-    assert len(set(ids)) == 5
-    assert documents([]) == ([], [])
+    assert len(set(ids)) == 4
+    assert later[0]["attributes"]["x_range"] == {"id": first[0]["attributes"]["x_range"]["id"]}
+    assert figures([]) == (None, [])
 
 
 def test_the_same_page_is_the_same_bytes_whatever_was_drawn_before():
