@@ -32,6 +32,9 @@ Floats = NDArray[np.float64]
 FEWEST = 20  # segments to fit on, and of a class to have coefficients of its own
 _LEAST_SLOPE = 0.02  # standard deviation of the rises: on flatter ground weight and rolling cannot be told apart
 _LEAST_SPEED = 0.1  # of the median: with less variation standing and rolling cannot be told apart
+_LEAST_TURNS = (
+    5.0  # metres that vary as all turns do: a class whose own vary by less says nothing of what turning on it takes
+)
 _SURE = 0.005  # standard deviation of what halts tell of standing, of itself: looser, it takes over what rolling does
 _SUREST_WATT = 0.1  # and no less than this
 _FEWEST_DOWNHILL = 10  # segments that drive the robot: fewer tell no recovery
@@ -192,7 +195,12 @@ def _terms(metres: Metres, *, standing_watt: float | None, turning: bool) -> lis
     terms += [("drivetrain", ALL)] if hilly else []
     terms += [("rolling", name) for name in classes]
     terms += [("grade", ALL)] if hilly else []
-    return terms + ([("turning", name) for name in classes] if turning else [])
+    if not turning:
+        return terms
+    groups = {name: metres.turn_rate_radps[metres.terrain == name] for name in own}
+    groups |= {ALL: metres.turn_rate_radps[~np.isin(metres.terrain, own)]} if ALL in classes else {}
+    least = _LEAST_TURNS * float(np.var(metres.turn_rate_radps))
+    return terms + [("turning", name) for name, rates in groups.items() if rates.size * np.var(rates) >= least]
 
 
 def _design(metres: Metres, terms: Sequence[tuple[str, str]]) -> Floats:

@@ -107,6 +107,18 @@ def test_a_class_of_few_metres_has_the_coefficients_of_all_the_rest():
     assert np.isfinite(found.power_watt(metres)).all()
 
 
+def test_a_class_driven_straight_says_nothing_of_what_turning_on_it_takes():
+    """Forty metres of mud that hardly turn, whose resistance changes half-way: their hair of a turn would explain the change."""
+    metres = made(2)
+    metres.terrain[:40] = "mud"
+    metres.turn_rate_radps[:40] = np.linspace(0.0, 0.02, 40)
+    metres.power_watt[20:40] += 60.0
+    found = fit_physics(metres, standing_watt=STANDING_WATT)
+    assert {name for term, name in found.terms if term == "turning"} == {"grass", "paved"}
+    turned = replace(metres.take(np.arange(40)), turn_rate_radps=np.full(40, 0.3))
+    assert np.abs(found.power_watt(turned) - turned.power_watt).max() < 250.0
+
+
 def test_without_steep_descents_nothing_is_said_of_what_comes_back():
     metres = made(2)
     found = fit_physics(metres.take(metres.rise > -0.1), standing_watt=STANDING_WATT)
