@@ -33,7 +33,7 @@ COVERAGE = 0.9
 """Share of drives that an interval is to hold."""
 
 FEWEST = 20
-"""Held-out samples without which nothing is said of errors."""
+"""Held-out samples without which nothing is said of errors, and of a class without which its bias is that of all."""
 
 _TAIL = (1.0 - COVERAGE) / 2.0
 _Z = 1.6448536269514722
@@ -207,7 +207,8 @@ def _bias(said: Floats, true: Floats, held: _Held) -> Bias:
     everywhere, error = _ratio(said, true, block)
     everywhere *= max(0.0, 1.0 - (error / everywhere) ** 2) if everywhere else 0.0
     value, std = np.full(_CLASSES, everywhere), np.full(_CLASSES, error)
-    for number in np.unique(held.class_id).tolist():
+    numbers, counts = np.unique(held.class_id, return_counts=True)
+    for number in numbers[counts >= FEWEST].tolist():  # fewer lie in a block or two, which tell no chance
         own = held.class_id == number
         found, chance = _ratio(said[own], true[own], block[own])
         beyond = found - everywhere

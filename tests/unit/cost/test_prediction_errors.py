@@ -69,6 +69,17 @@ def test_a_few_samples_of_a_class_do_not_make_its_bias():
         assert least < power[0] - 1.0 < most
 
 
+def test_the_few_samples_of_a_class_err_alike_and_make_no_bias_of_it():
+    """Six metres at one place, met by two folds that knew the class by four and by two: 30 % off, all of them, is no bias of the class."""
+    residuals = made_residuals(150, sigma=0.02)
+    few = {**residuals, "terrain_class": np.where(np.abs(np.arange(150) - 40) < 3, 7, 4).astype(np.uint8)}
+    few["terrain_class"][43] = 7
+    power, _ = centring_of(_with_power(few, 0.7, few["terrain_class"] == 7)).apply(
+        np.ones(1), np.ones(1), np.array([7])
+    )
+    assert power[0] == pytest.approx(1.0, abs=0.03)
+
+
 def test_an_end_that_two_metres_share_is_an_error_of_neither_together():
     """Where one metre is too long its neighbour is too short: ten in a row err like the two outer ends alone."""
     residuals, rng = made_residuals(8000), np.random.default_rng(1)
