@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import reduce
 
 import numpy as np
 
 from tcpipe.dataset import Split
+from tcpipe.dataset.beside import beside_of
+from tcpipe.learning.curves import fit_curves
 from tcpipe.learning.metrics import Array, costs
 from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.wheels import rolling_resistance
@@ -74,19 +75,25 @@ CLASS_AND_SLOPE, REST = "class and slope", "left: fluctuation in time, lag of th
 def variance_shares(world: World, robot: SimulatedRobot, split: Split, energy_joule: Array) -> dict[str, float]:
     """Return the share of the variance of measured E, shape (N,), that each part of the simulated world makes.
 
-    That of class and slope is the variance without all other parts; that of a part, of what changes where it alone is missing; the
-    rest, of what the plant with everything in it misses. They add up to one only as far as the parts are independent.
+    That of class and slope is what a spline of each class explains; that of a part, what such splines leave of what changes where it
+    alone is missing; the rest, what they leave of what the plant with everything in it misses. A part's mean over a class and slope is thus
+    class and slope. They add up to one only as far as the parts are independent.
     """
-    known = np.isfinite(energy_joule)
+    beside, known = beside_of(split), np.isfinite(energy_joule)
+    slope_rad, class_id = beside.slope_rad[known], beside.class_id[known]
+
+    def left(joule: Array) -> float:
+        values = joule[known][:, None]
+        return float(np.var(values - fit_curves("spline", slope_rad, class_id, values).predict(slope_rad, class_id)))
 
     def energy(without: Callable[[World, SimulatedRobot], tuple[World, SimulatedRobot]] = _nothing) -> Array:
         return plant_costs(*without(world, robot), split)["E"]
 
-    whole, plain = energy(), energy(lambda *both: reduce(lambda left, take: take(*left), _PARTS.values(), both))
-    missing = {CLASS_AND_SLOPE: plain, **{name: whole - energy(take) for name, take in _PARTS.items()}}
-    missing[REST] = energy_joule - whole
-    total = float(np.var(energy_joule[known]))
-    return {name: float(np.var(part[known])) / total for name, part in missing.items()}
+    whole, total = energy(), float(np.var(energy_joule[known]))
+    missing = {**{name: whole - energy(take) for name, take in _PARTS.items()}, REST: energy_joule - whole}
+    return {CLASS_AND_SLOPE: 1.0 - left(energy_joule) / total} | {
+        name: left(of) / total for name, of in missing.items()
+    }
 
 
 def _nothing(world: World, robot: SimulatedRobot) -> tuple[World, SimulatedRobot]:

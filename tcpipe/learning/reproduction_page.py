@@ -114,8 +114,9 @@ def _variance(shares: Mapping[str, float], hidden: float) -> Section:
         for name, share in shares.items()
     ]
     text = (
-        "Of measured E on the unseen area: the variance of what changes where a part of the simulated world is taken out. They add up to "
-        f"one only as far as they are independent. The hidden resistance has {hidden:g} times the variance of the frozen site."
+        "Of measured E on the unseen area: what a spline over the slope of each class explains; then what such splines leave of what "
+        "changes where a part of the simulated world is taken out. They add up to one only as far as they are independent. "
+        f"The hidden resistance has {hidden:g} times the variance of the frozen site."
     )
     header = ("what shows it", "of the variance of E", "of what is not class and slope")
     return Section("What E's variance is made of", text, header=header, rows=rows, figures_from=1)

@@ -45,6 +45,7 @@ def test_what_the_variance_is_made_of_is_printed(reproduced):
     assert shares["class and slope"] > 0.7
     assert 0.0005 < shares["nothing: hidden resistance"] < 0.05
     assert min(shares.values()) > 0.0
+    assert sum(shares.values()) == pytest.approx(1.0, abs=0.02)  # what is common to a class and slope counts once
 
 
 def test_table_four_is_of_the_same_samples(reproduced):
