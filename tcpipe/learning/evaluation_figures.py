@@ -39,6 +39,8 @@ _WORST = 30
 _ENOUGH = 20
 """Labels of a class and slope of which the share that intervals hold is judged, and the least that is not marked:"""
 _HELD = 0.8
+_WHOLE_JOULE = 10.0
+"""Error of E from which on whole joules tell enough: nine ranges of slope fit beside each other."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +177,7 @@ def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
     }
     rmse = {key: float(np.sqrt(np.mean(of**2))) for key, of in cells.items()}
     most = max(rmse.values(), default=1.0) or 1.0
+    digits = 0 if most >= _WHOLE_JOULE else 2
     rows: list[list[str | Shaded]] = []
     for name in names:
         row: list[str | Shaded] = [name]
@@ -186,11 +189,11 @@ def _by_class_and_slope(table: pa.Table, split: str, audit: str) -> Section:
             outside = float(np.mean((energy[here] < low[here]) | (energy[here] > high[here])))
             doubted = len(cells[name, at]) >= _ENOUGH and outside > 1.0 - _HELD
             mean = float(cells[name, at].mean())
-            text = f"{rmse[name, at]:.1f} J, {mean:+.1f} ({len(cells[name, at])}){'*' if doubted else ''}"
+            text = f"{rmse[name, at]:.{digits}f}, {mean:+.{digits}f} ({len(cells[name, at])}){'*' if doubted else ''}"
             row.append(Shaded(text, rmse[name, at] / most, alarm=doubted))
         rows.append(row)
     text = (
-        "RMSE of E, mean error (predicted less measured), and in brackets of how many metres; darker is worse. * and a dashed border: "
+        "RMSE of E [J], mean error (predicted less measured), and in brackets of how many metres; darker is worse. * and a dashed border: "
         f"90 % intervals hold fewer than {100 * _HELD:.0f} % of {_ENOUGH} labels or more there: believe no interval on such ground. {audit}"
     )
     return Section(

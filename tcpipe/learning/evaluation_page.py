@@ -318,9 +318,12 @@ def _compared(
 def _energy(found: Evaluation) -> Section:
     text = (
         "Wei and Isler predict E from heights alone: one network of grass, or one for every class, each with as many steps as ours. "
-        "All rows are of the same samples. RMSE of ours over theirs, with its 95 % interval: "
+        "All rows are of the same samples. "
     )
-    text += "; ".join(f"{row.split}, {row.baseline}: {row.rmse_ratio}" for row in found.networks)
+    ratios = "; ".join(f"{row.split}, {row.baseline}: {row.rmse_ratio}" for row in found.networks)
+    text += (
+        f"RMSE of ours over theirs, with its 95 % interval: {ratios}." if ratios else "Here none of them was trained."
+    )
     return _compared("Table IV: energy against Wei and Isler", text, found, paper.ENERGY, "E")
 
 

@@ -113,7 +113,12 @@ def _to_do(found: Evaluation) -> Iterator[Verdict]:
     standings = [standing(found.baselines, split, "E") for split in found.ordered_splits]
     better = [of.best for of in standings if of is not None and of.is_worse]
     kind = {TREES: "table", PHYSICS: "physics", **dict.fromkeys(CURVES.values(), "table")}
-    if better:
+    if better and kind[better[-1]] == found.model.training.config.model:
+        yield Verdict(
+            "do",
+            f"Drive more of this ground: '{better[-1]}' is better on the same samples, so few are they to learn more from.",
+        )
+    elif better:
         yield Verdict(
             "do",
             f"Try 'tcpipe train DATASET --model {kind[better[-1]]}': '{better[-1]}' is better on the same samples.",

@@ -202,6 +202,8 @@ def test_its_files_say_the_same(evaluated):
     assert len(tables) == 5
     assert all("label noise alone" in table for table in tables)
     assert "default-src 'none'" in page  # whatever it names, it asks for nothing
+    assert "Here none of them was trained." in page  # networks of Wei and Isler, of which table IV tells
+    assert not re.search(r"RMSE of E.*[0-9] J, [-+]", page)  # a row of nine ranges fits
     told = page[: page.index('<script type="application/json"')]
     assert not re.search(r"https?:|(src|href)=\"[^#]", told)
 

@@ -15,6 +15,7 @@ from tcpipe.learning.evaluation_facts import (
     SplitErrors,
 )
 from tcpipe.learning.evaluation_verdict import is_of_no_use, verdict
+from tcpipe.learning.fitting import FitConfig
 from tcpipe.learning.metrics import Errors
 from tcpipe.learning.ratios import Ratio
 
@@ -22,7 +23,16 @@ GOOD = Errors(500, 12.0, 6.0, 500, 90.0, 3.0, 6.0)
 BETTER = Ratio(0.8, 0.7, 0.9)
 
 
-def told(energy=GOOD, ratio=BETTER, *, split="unseen", floor=1.0, near=0.0, baseline="class and slope, spline"):
+def told(
+    energy=GOOD,
+    ratio=BETTER,
+    *,
+    split="unseen",
+    floor=1.0,
+    near=0.0,
+    baseline="class and slope, spline",
+    kind="resnet18",
+):
     """The sentences of an evaluation on one split, by kind; its own figures and those beside the best baseline."""
     floors = {"E": {"all": Errors(500, floor, 1.0, 500)}}
     part = SplitErrors(
@@ -43,8 +53,9 @@ def told(energy=GOOD, ratio=BETTER, *, split="unseen", floor=1.0, near=0.0, base
         groups=20,
         drawn_by="runs",
     )
+    training = replace(CARD.training, config=FitConfig(model=kind))
     found = Evaluation(
-        tcpipe_version="", key="", model=EvaluatedModel("", "", CARD.training), dataset=EvaluatedDataset("", "", {}),
+        tcpipe_version="", key="", model=EvaluatedModel("", "", training), dataset=EvaluatedDataset("", "", {}),
         config=EvaluateConfig(), splits={split: part}, ablation=(), energy={}, time={}, baselines=(row,), repeatability={},
         warnings=(), plots={},
     )  # fmt: skip
@@ -75,6 +86,15 @@ def test_what_does_not_beat_class_and_slope_says_so(ratio):
     _, said = told(ratio=ratio)
     assert said["doubtful"].startswith("It does not beat a curve over class and slope on the unseen area, energy:")
     assert ("tcpipe train DATASET --model table" in said["do"]) == (ratio.low > 1.0)
+
+
+@pytest.mark.parametrize(
+    ("kind", "baseline"), [("table", "class and slope, spline"), ("table", "gradient boosting"), ("physics", "physics")]
+)
+def test_nobody_is_told_to_train_what_was_evaluated(kind, baseline):
+    _, said = told(ratio=Ratio(1.2, 1.1, 1.3), baseline=baseline, kind=kind)
+    assert "tcpipe train" not in said["do"]
+    assert f"Drive more of this ground: '{baseline}' is better" in said["do"]
 
 
 def test_too_few_groups_say_neither():
