@@ -24,6 +24,10 @@ from tcpipe.tables.findings import LEFT_OUT
 
 VERSION = "1.1"
 
+_TAKEN = {"energy": ("energy_joule", "J"), "time": ("duration_s", "s"), "distance": ("length_m", "m")}
+_AS_MUCH = 0.99
+"""Share of what a path takes from which on another takes as much."""
+
 
 @dataclass(frozen=True, slots=True)
 class PlanRequest:
@@ -93,12 +97,25 @@ class PlanResult:
         lines += [f"warning: {count} pieces: {name.replace('_', ' ')}" for name, count in first.reasons.items()]
         if not first.complete:
             lines.append("warning: cells are so large that ground without a cost lies between; choose a smaller --step")
+        lines += _beaten(self.plans)
         if first.negative_steps:
             lines.append(
                 f"warning: {first.negative_steps} steps give back more than their height explains; taken as free"
             )
         same = ": nothing to do: it is made from the same model, map and points" if self.status == "unchanged" else ""
         return plain_lines((*lines, f"{self.out}{same}", *([str(self.picture)] if self.picture else [])))
+
+
+def _beaten(plans: Mapping[Objective, PlanTotals]) -> list[str]:
+    """Return a line where another of the plans takes less of what was to be least: cells do not tell what its metres do."""
+    objective, asked = next(iter(plans.items()))
+    name, unit = _TAKEN[objective]
+    taken = {other: getattr(found, name) for other, found in plans.items() if found.complete}
+    least = min(taken, key=taken.__getitem__, default=objective)
+    if not asked.complete or taken[least] >= _AS_MUCH * taken[objective]:
+        return []
+    told = f"warning: the path of least {least} takes less {objective} than this one ({taken[least]:.0f} {unit}): "
+    return [told + "metre by metre the ground is not as its cells tell; choose a smaller --step"]
 
 
 def plan(
