@@ -99,6 +99,14 @@ class DatasetMade:
 
 
 @dataclass(frozen=True, slots=True)
+class DatasetReplaced:
+    """That a dataset was overwritten where it lay, by a build; one that was moved away before was not."""
+
+    out: str
+    inputs: str
+
+
+@dataclass(frozen=True, slots=True)
 class RunName:
     """What the run of a content is called; the first that names it is right."""
 

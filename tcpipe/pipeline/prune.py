@@ -18,7 +18,7 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.numbered import numbers, read_sealed_at, stem_and_number
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
-from tcpipe.formats.record_files import DatasetMade
+from tcpipe.formats.record_files import DatasetMade, DatasetReplaced
 from tcpipe.formats.store_mark import SPOOL
 from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.calls import in_bytes
@@ -92,10 +92,10 @@ def prune(
     unknown = set(keep) - {name for key in found.rows for name in key}
     if unknown:
         raise UsageError(f"{opened.root}: no run or recipe is called {min(unknown)}; nothing is removed")
-    referred = _referred(opened)
+    referred, unread = _referred(opened)
     removed, kept = list[Leftover](), list[Leftover]()
     for what, place, parts in (*_old_recipes(opened, found, ingest_key(ruling)), *_superseded(opened, found)):
-        why = _why_it_stays(place, parts, referred, keep)
+        why = unread or _why_it_stays(place, parts, referred, keep)
         (removed if why is None else kept).append(Leftover(what, place.where(), _size(place), why))
         if why is None and not dry_run:
             _remove(place)
@@ -149,20 +149,29 @@ def _why_it_stays(
 ) -> str | None:
     if any(name in keep for part in parts for name in part):
         return "--keep names it"
-    out = next((referred[part] for part in parts if part in referred), None)
-    if out is not None:
-        return f"dataset {out} refers to it"
+    if why := next((referred[part] for part in parts if part in referred), None):
+        return why
     strange = next(strangers_in(place), None)
     return None if strange is None else f"{strange} is no file of this store"
 
 
-def _referred(store: Store) -> dict[tuple[str, str], str]:
-    """Return the ingestions that datasets are made of, and of which; one that lies where it was no more may lie elsewhere."""
-    found: dict[tuple[str, str], str] = {}
-    for made in store.records("datasets", DatasetMade):
+def _referred(store: Store) -> tuple[dict[tuple[str, str], str], str | None]:
+    """Return the ingestions that datasets are made of, and why each stays; and why everything does, where a record cannot be read.
+
+    A dataset that lies where it was no more may lie elsewhere, unless a build overwrote it.
+    """
+    found, place = dict[tuple[str, str], str](), store.place.below("records/datasets")
+    overwritten = set(store.records("replaced", DatasetReplaced))
+    for name in (name for name in place.files() if name.endswith(".json")):
+        made = store.recall(f"datasets/{name.removesuffix('.json')}", DatasetMade)
+        if made is None:
+            return {}, f"{place.where(name)} does not say what a dataset refers to; build that again, or remove it"
         if not is_replaced(made):
-            found.update(dict.fromkeys(made.runs, made.out))
-    return found
+            found.update(dict.fromkeys(made.runs, f"dataset {made.out} refers to it"))
+        elif DatasetReplaced(made.out, made.inputs) not in overwritten:
+            told = f"a dataset that lay at {made.out} refers to it; remove {place.where(name)} if that is gone"
+            found.update(dict.fromkeys(made.runs, told))
+    return found, None
 
 
 def is_replaced(made: DatasetMade) -> bool:

@@ -6,7 +6,7 @@ import logging
 import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -43,9 +43,9 @@ from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.parquet import ROWS_PER_GROUP, parquet_rows
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
-from tcpipe.formats.published import has_card, here_by_range, published, settle
+from tcpipe.formats.published import has_card, here_by_range, published, refuse_others, settle
 from tcpipe.formats.recipe_toml import recipe_of
-from tcpipe.formats.record_files import Call, DatasetMade
+from tcpipe.formats.record_files import Call, DatasetMade, DatasetReplaced
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
@@ -231,20 +231,24 @@ def build_dataset(
     )
     inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
     if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
-        result = _result(place, "unchanged", known, problems)
+        card, result = known, _result(place, "unchanged", known, problems)
     elif dry_run:
+        if isinstance(place, str):
+            refuse_others(open_place(place), CARD)
         return _planned(place, opened, inputs, jobs=jobs)
     else:
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
         with whole as directory, _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers:
-            known = _build(
+            card = _build(
                 directory, inputs, ruling, regions, earlier, file_format=file_format, workers=workers, redact=redact
             )
         for entry in workers.waiting.entries():
             workers.waiting.delete(entry.name)
-        result = _result(place, "done", known, problems)
+        result = _result(place, "done", card, problems)
     if not dry_run:
-        _remember(opened, watch, result, inputs, jobs, size=sum(of.size_bytes for of in known.checksums.values()))
+        _remember(opened, watch, result, inputs, jobs, size=sum(of.size_bytes for of in card.checksums.values()))
+        if known is not None and known.inputs != inputs.digest:
+            _note(opened, "replaced", DatasetReplaced(_lasting(result), known.inputs))
     return result
 
 
@@ -257,16 +261,26 @@ def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> B
 
 
 def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Inputs, jobs: int, *, size: int) -> None:
-    """Leave a record in the store of the dataset, for what it refers to stays, and one of the call; without where that cannot be."""
-    where = result.path if is_url(result.path) else str(Path(result.path).absolute())
-    made = DatasetMade(where, inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
-    with suppress(StoreError):
-        store.note("datasets", made)
+    """Leave a record in the store of the dataset, for what it refers to stays, and one of the call."""
+    runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
+    _note(store, "datasets", DatasetMade(_lasting(result), inputs.digest, runs))
     counts, written = {"runs": len(inputs.runs), "samples": 0, "unchanged": 1}, 0
     if result.status == "done":
         counts, written = counts | {"samples": result.samples, "unchanged": 0}, size
     call = Call(BUILD, __version__, result.exit_code, counts, jobs, written_bytes=written)
     remember_call(store, watch, call)
+
+
+def _note(store: Store, kind: str, fact: DatasetMade | DatasetReplaced) -> None:
+    try:
+        store.note(kind, fact)
+    except StoreError as error:
+        logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
+
+
+def _lasting(result: BuildResult) -> str:
+    """Return where a dataset lies, wherever that is asked from."""
+    return result.path if is_url(result.path) else str(Path(result.path).absolute())
 
 
 def _left_out(

@@ -1,6 +1,9 @@
 """A dataset of the runs that carry given tags."""
 
 import json
+import os
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,8 +15,9 @@ from tcpipe.formats.record_files import DatasetMade
 from tcpipe.pipeline.calls import latest_calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.prune import prune
 from tcpipe.pipeline.report import report
-from tcpipe.recipe import Recipe
+from tcpipe.recipe import ReadConfig, Recipe
 from tcpipe.store import open_store
 from tcpipe.tables.levels import DATA_MODEL_VERSION
 
@@ -99,3 +103,27 @@ def test_a_dry_run_counts_and_estimates_and_a_build_is_remembered(store, tmp_pat
     counted = [call.counts for call in latest_calls(store)]
     assert sorted(counts["unchanged"] for counts in counted) == [0, 1]
     assert {counts["samples"] for counts in counted} == {0, made.samples}
+
+
+def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_holds_its_runs(store, tmp_path):
+    out, old = tmp_path / "out", replace(Recipe(), read=ReadConfig(ignore_topics=["/none"]))
+    add_run(store, "a", segments("a", *lanes(np.array([0.0]), -10.0, 10.0)), recipe=old)
+    for path in store.root.glob("runs/a/*/manifest-1.json"):
+        if json.loads(path.read_text())["recipe"]["read"]["ignore_topics"]:
+            os.utime(path, ns=(10**18, 10**18))
+    build_dataset(out, store=store.root, recipe=old)
+    out.rename(tmp_path / "moved")
+    build_dataset(out, store=store.root, recipe=Recipe())
+    (kept,) = prune(store=store.root, recipe=Recipe(), dry_run=True).kept
+    assert kept.stays.startswith(f"a dataset that lay at {out} refers to it; remove ")
+    shutil.rmtree(out)
+    (tmp_path / "moved").rename(out)
+    build_dataset(out, store=store.root, recipe=Recipe())
+    assert len(prune(store=store.root, recipe=Recipe(), dry_run=True).removed) == 1
+
+
+def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_record(store, tmp_path, caplog):
+    (store.root / "records").touch()
+    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
+    assert "records is a file, wanted a directory" in caplog.text
+    assert "so 'tcpipe prune' does not know what this dataset refers to" in caplog.text

@@ -73,6 +73,20 @@ def test_what_a_dataset_refers_to_stays_also_where_that_was_moved(store, tmp_pat
     assert len(there(store)) == 5
 
 
+def test_nothing_goes_while_a_record_of_a_dataset_cannot_be_read(store):
+    store.remember("datasets/one", DatasetMade("/nowhere", "0" * 64, ()))
+    record = store.root / "records" / "datasets" / "one.json"
+    record.write_bytes(b"")
+    found = prune(store=store.root, recipe=Recipe())
+    assert found.removed == ()
+    assert len(found.kept) == 2
+    assert {each.stays for each in found.kept} == {
+        f"{record} does not say what a dataset refers to; build that again, or remove it"
+    }
+    record.unlink()
+    assert len(prune(store=store.root, recipe=Recipe()).removed) == 2
+
+
 def test_what_is_kept_and_what_is_somebody_else_s_stays(store):
     old = old_recipe(store)
     (store.root / "runs" / "b" / "notes.txt").write_text("mine")

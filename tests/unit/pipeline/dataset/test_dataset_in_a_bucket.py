@@ -66,8 +66,9 @@ def test_a_dataset_that_is_built_into_a_bucket_is_the_same_as_on_disk(made, buck
     assert files(bucket[0] / "by name" / "ds") == files(made / "zarr")
     again = build_dataset(f"{URL}/", store=made / "store", recipe=Recipe())
     assert again.status == "unchanged"
-    with pytest.raises(UsageError, match="is there already; what lies in a bucket is not replaced"):
-        build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7)
+    for dry_run in (True, False):
+        with pytest.raises(UsageError, match="is there already; what lies in a bucket is not replaced"):
+            build_dataset(URL, store=made / "store", recipe=Recipe(), seed=7, dry_run=dry_run)
     assert files(bucket[0] / "by name" / "ds") == files(made / "zarr")
 
 
