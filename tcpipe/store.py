@@ -569,9 +569,9 @@ def open_store(root: str | Path, *, create: bool = False) -> Store:
     UsageError : it is missing (unless ``create``), a file, or of an earlier layout.
     StoreError : it cannot be reached or written, or is of a data model that this version does not know.
     """
+    if is_url(root) and not str(root).rstrip("/").startswith(_BUCKETS):
+        raise UsageError(f"{root}: no store can lie there; wanted a directory, s3://bucket/name, gs:// or az://")
     root = str(root).rstrip("/") if is_url(root) else local_output(root)
-    if isinstance(root, str) and not root.startswith(_BUCKETS):
-        raise UsageError(f"{root}: no store can lie there; wanted a directory, s3://, gs:// or az://")
     store = Store(root)
     if isinstance(root, Path):
         _refuse_file(root, create=create)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import click
 
 from tcpipe.cli.options import ONE_OF_SEVERAL, json_option, min_age_option, recipe_option, robot_option, store_option
@@ -25,11 +27,15 @@ def status(
     Exit code 3: a log failed or is damaged and nobody accepted that (tcpipe accept), or a run is not as it was written.
     """
     from tcpipe.cli.output import print_json, ruling_recipe, say_lines
+    from tcpipe.errors import UsageError
+    from tcpipe.formats.object_storage import is_url
     from tcpipe.pipeline.status import status as run
     from tcpipe.store import is_store
 
     if paths and is_store(paths[0]):
         store, paths = paths[0], paths[1:]
+    elif paths and not is_url(store) and not Path(store).exists():
+        raise UsageError(f"{paths[0]}: there is no store here, nor one at {store}; name it with --store")
     found = run(paths, store=store, recipe=ruling_recipe(recipe)[0], robot=robot, min_age_s=min_age_s)
     if as_json:
         print_json(found)

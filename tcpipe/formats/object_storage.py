@@ -37,7 +37,9 @@ _RETRIES: dict[str, Any] = {
     "backoff": {"init_backoff": timedelta(milliseconds=100), "max_backoff": timedelta(seconds=1), "base": 2},
 }
 """A store that does not answer is told after less than 5 s."""
-_DENIED = ("169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden")
+_DENIED = (
+    "169.254.169.254", "Account must be specified", "401 Unauthorized", "403 Forbidden", "Missing AccessKeyId", "Missing SecretAccessKey"
+)  # fmt: skip
 """What is said where credentials are not set (a cloud machine's own are asked for, in vain), or wrong."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _REFUSED = {
@@ -193,9 +195,10 @@ def _reason(url: str, error: Exception, code: str | None, what: str) -> str:
         return _REFUSED[code]
     if denied and code == "AccessDenied" and (what == "written" or os.environ.get("AWS_ACCESS_KEY_ID")):
         return "the credentials that are set do not allow it"
+    if denied and not code and "403" in reason and scheme == "s3" and os.environ.get("AWS_ACCESS_KEY_ID"):
+        return "the store refuses the credentials that are set, or this machine's clock is not the store's"
     if denied and scheme in _CREDENTIALS:
-        clock = "" if code or "403" not in reason else "; a clock that is wrong is answered in the same way"
-        return f"the store wants credentials; set {_CREDENTIALS[scheme]}{clock}"
+        return f"the store wants credentials; set {_CREDENTIALS[scheme]}"
     return no_room(error) or reason
 
 
@@ -226,7 +229,9 @@ def connected(url: str) -> tuple[ObjectStore, str]:
     import obstore  # noqa: PLC0415
 
     container, name = _container_and_name(url)
-    scheme = container.partition("://")[0]
+    scheme, _, bucket = container.partition("://")
+    if not bucket:
+        raise ValueError(f"it names no bucket; wanted {scheme}://bucket/name")
     _refuse_endpoints_that_are_none(scheme)
     options: dict[str, Any] = {} if scheme == "file" else {"retry_config": _RETRIES}
     if scheme != "file":  # who names an endpoint without TLS means it

@@ -14,10 +14,13 @@ _LIKE_A_URL = re.compile(r"[a-z][a-z0-9+.-]+:/", re.IGNORECASE)
 
 def local_output(path: str | Path) -> Path:
     """Return where something is written. `UsageError`: it is a URL, of which a local directory ``s3:`` would become."""
-    if _LIKE_A_URL.match(str(path)):
+    found = _LIKE_A_URL.match(str(path))
+    if found and "://" in str(path):
         raise UsageError(
-            f"{path}: is a URL; this version writes on this machine only: give a path, and copy from there what is made"
+            f"{path}: is a URL; this is written on this machine: give a path, and copy from there what is made"
         )
+    if found:
+        raise UsageError(f"{path}: is no URL; wanted {found[0]}/bucket/name, or a path of this machine")
     return Path(path)
 
 
@@ -60,7 +63,7 @@ def input_directory(path: str | Path) -> Path:
 
 def _there(path: str | Path, wanted: str) -> Path:
     if _kind(Path(path)) is None:
-        why = "; only logs are read from a URL" if _LIKE_A_URL.match(str(path)) else ""
+        why = "; it is read from this machine only" if _LIKE_A_URL.match(str(path)) else ""
         raise UsageError(f"{path}: there is no such {wanted}{why}")
     return Path(path)
 

@@ -23,6 +23,8 @@ class KnownRuns:
     """Logs that were seen, by lineage; none where they are to be read again."""
     parties: frozenset[str]
     """Runs that another has taken the place of, or did once, and those others."""
+    broken: frozenset[str]
+    """Runs with a document or file that is gone, or not as it was written."""
     failed: frozenset[str]
     """Names of the records of failures."""
 
@@ -41,4 +43,6 @@ def known_runs(store: Store, *, force: bool = False) -> KnownRuns:
         party for record in store.records("superseded", Superseded) for party in (record.run_id, record.by) if party
     }
     failed = frozenset(f"failed/{name.removesuffix('.json')}" for name in store.place.files("records/failed"))
-    return KnownRuns(runs, made, {} if force else store.seen_logs(), frozenset(parties), failed)
+    broken = {run_id for run_id, _ in runs.damaged} | {key[0] for key, row in runs.rows.items() if row.log is None}
+    seen = {} if force else store.seen_logs()
+    return KnownRuns(runs, made, seen, frozenset(parties), frozenset(broken), failed)

@@ -37,6 +37,7 @@ TO_DO: tuple[State, ...] = ("pending", "outdated", "failed_transient")
 TROUBLE: tuple[State, ...] = ("failed_permanent", "failed_transient", "partial")
 """What somebody should look at."""
 
+_NUMBER = re.compile(r"\d[\d.,]*")
 _MOST_NAMES = 3
 _MOST_CALLS = 7
 _IN_WORDS: Mapping[State, str] = {"failed_permanent": "failed for what it holds", "failed_transient": "failed for now"}
@@ -139,19 +140,27 @@ def status(
     mine = found.sources if shard is None else in_shard(found.sources, shard)
     passing = failed_for_now(calls)
     failures = _failures(opened) if known.failed else {}
-    groups: dict[tuple[State, str], list[IngestTask]] = {}
+    groups: dict[tuple[State, str], list[tuple[IngestTask, str]]] = {}
     for source in mine:
         task_source = remembered(source, known.seen.get(source.lineage, ()))
         task = IngestTask(
             task_source, opened.root, ruling, robot or ruling.robot, {}, force, message_definitions, definitions, retry_failed, min_age_s
         )  # fmt: skip
-        groups.setdefault(_standing(task, opened, known, passing, failures), []).append(task)
+        state, cause = _standing(task, opened, known, passing, failures)
+        alike = _NUMBER.sub("#", cause) if state in (*TROUBLE, "quarantined") else cause
+        groups.setdefault((state, alike), []).append((task, cause))
     told = tuple(
-        Group(state, cause, tuple(task.source.name for task in tasks), sum(_bytes(task) for task in tasks))
-        for (state, cause), tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
+        _group(*of, tasks)
+        for of, tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
     )
     ledgers_m = (run.facts.ledger_m for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling))
     return replace(_summed(opened, told, found, known, calls, sources=given, jobs=jobs), losses=losses_of(ledgers_m))
+
+
+def _group(state: State, alike: str, tasks: Sequence[tuple[IngestTask, str]]) -> Group:
+    """Return logs whose causes are ``alike`` but for numbers, which are told where they are the same."""
+    cause = alike if any(cause != tasks[0][1] for _, cause in tasks) else tasks[0][1]
+    return Group(state, cause, tuple(task.source.name for task, _ in tasks), sum(_bytes(task) for task, _ in tasks))
 
 
 def _standing(
@@ -197,7 +206,9 @@ def _why_pending(task: IngestTask, store: Store, known: KnownRuns, failures: Map
     if before := failures.get(sha256 or task.source.files_digest):
         accepted = ", accepted" if any(of.is_accepted(store) for of in before) else ""
         return f"{_how_it_failed(before, task)}{accepted}; to be tried again"
-    if sha256 and any(run_id.endswith(f"-{sha256[:8]}") for run_id, _ in known.runs.damaged):
+    if task.force:
+        return "to be done again if it is there already"
+    if sha256 and any(run_id.endswith(f"-{sha256[:8]}") for run_id in known.broken):
         return "its run is not as it was written"
     return "its content is another than before" if task.source.lineage in known.seen and not sha256 else ""
 
@@ -237,10 +248,10 @@ def failed_for_now(calls: Sequence[Call]) -> dict[str, str]:
 
 
 def _cause(line: str, task: IngestTask) -> str:
-    """Return what is wrong without what differs from log to log: its name, and numbers."""
+    """Return what is wrong without the name of the log."""
     for name in (task.source.name, *task.source.origins):
         line = line.replace(f"{name}: ", "").replace(name, "it")
-    return re.sub(r"\d[\d.,]*", "#", line)
+    return line
 
 
 def _summed(
@@ -259,7 +270,9 @@ def _summed(
     waiting = sum(group.size_bytes for group in told if group.state in TO_DO)
     trouble = any(group.state in TROUBLE for group in told)
     outdated = (f"run {name}: of data model {head.data_model_version}" for name, head in known.runs.outdated.items())
-    problems = (*chain(*found.problems.values()), *known.runs.damaged.values(), *outdated)
+    bare = (run.facts.run_id for run in known.runs.finished if run.facts.log is None)
+    orphans = (f"run {name}: its run-<n>.json is gone, or not as it was written; ingest its log again" for name in bare)
+    problems = (*chain(*found.problems.values()), *known.runs.damaged.values(), *orphans, *outdated)
     return Status(
         store=str(store.root),
         sources=tuple(sources),

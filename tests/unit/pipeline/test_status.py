@@ -120,7 +120,7 @@ def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     told = {(group.state, group.cause): group.logs for group in found.groups}
     assert told["pending", ""] == (str(logs / "new.mcap"),)
     assert told["pending", "its content is another than before"] == (str(logs / "whole.mcap"),)
-    assert told["failed_transient", "No space left on device (#)"] == (str(logs / "passing.mcap"),)
+    assert told["failed_transient", "No space left on device (28)"] == (str(logs / "passing.mcap"),)
     assert told["done", "damaged, accepted"] == (str(logs / "cut.mcap"),)
     assert found.exit_code == 3  # the disk is full
     assert found.to_do.amount == sum((logs / f"{name}.mcap").stat().st_size for name in ("new", "passing", "whole"))
@@ -164,6 +164,51 @@ def test_a_failure_that_was_accepted_is_tried_again_under_another_recipe_and_say
     for module in (known_trouble, status_module):
         monkeypatch.setattr(module, "__version__", "9.9.9")
     assert told(other) == ("pending", f"failed with tcpipe {__version__}, accepted; to be tried again")
+
+
+def test_causes_that_differ_in_numbers_alone_are_one_line_and_else_told_as_they_are(first_night, tmp_path):
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    shutil.copytree(first_night / "store", tmp_path / "store")
+
+    def told():
+        ingest([logs], store=tmp_path / "store", recipe=Recipe())
+        (group,) = where(tmp_path).groups
+        return len(group.logs), group.cause.partition(";")[0]
+
+    (logs / "a.bag").write_bytes(bytes(30))
+    assert told() == (1, "not a log: it begins with zeros")
+    assert "a .bag (2.0), or a ROS 2 bag directory or .db3" in str(where(tmp_path))
+    shutil.copy2(first_night / "logs" / "junk.bag", logs / "b.bag")
+    (logs / "c.bag").write_bytes(b"junk" * 10)
+    (logs / "a.bag").unlink()
+    assert told() == (2, "not a log: it is # bytes that begin with b'junkjunk'")
+
+
+def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_night, tmp_path):
+    shutil.copytree(first_night / "store", tmp_path / "store", copy_function=shutil.copy2)
+    (gone,) = (tmp_path / "store" / "runs").glob("whole-*/run-1.json")
+    gone.unlink()
+    found = status([first_night / "logs"], store=tmp_path / "store", recipe=Recipe())
+    (group,) = [group for group in found.groups if group.state == "pending"]
+    assert (group.cause, group.logs) == (
+        "its run is not as it was written",
+        (str(first_night / "logs" / "whole.mcap"),),
+    )
+    name = gone.parent.name
+    assert found.problems == (f"run {name}: its run-<n>.json is gone, or not as it was written; ingest its log again",)
+    assert found.exit_code == 3
+
+
+def test_a_store_that_is_not_there_is_named_as_it_was_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    told = CliRunner().invoke(cli, ["status", "nosuch"])
+    assert str(told.exception) == "nosuch: there is no store here, nor one at tcpipe-store; name it with --store"
+
+
+def test_a_dry_run_of_what_is_forced_says_that_it_is_done_again(first_night):
+    causes = {group.cause for group in where(first_night, force=True).groups}
+    assert "to be done again if it is there already" in causes
 
 
 def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_path):
