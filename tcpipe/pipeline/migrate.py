@@ -51,6 +51,8 @@ class Migrated:
     """Documents that were of this data model, and maps outside of stores, which are read as they are."""
     problems: tuple[str, ...]
     """Documents that are left as they are, and why."""
+    copied: int = 0
+    """Files that were put to another place."""
 
     @property
     def exit_code(self) -> int:
@@ -60,7 +62,9 @@ class Migrated:
     def __str__(self) -> str:
         """Return what was done, one line a document, and what was not."""
         count = f"{len(self.migrated)} documents brought to data model {DATA_MODEL_VERSION}, {self.current} left as they are"
-        head = count if self.migrated or self.problems else f"nothing to do: {self.current} documents are current"
+        if not self.migrated and not self.problems and not self.copied:
+            count = f"nothing to do: {self.current} documents are current"
+        head = f"{count}; {self.copied} files copied" if self.copied else count
         done = (f"migrated: {path}" for path in self.migrated)
         return plain_lines((f"{self.path}: {head}", *done, *(f"problem: {problem}" for problem in self.problems)))
 
@@ -103,10 +107,10 @@ def _store(source: Place, target: Place) -> Migrated:
     migrated, problems = list[str](), list[str]()
     names = [entry.name for entry in source.entries()]
     numbered = [name for name in names if stem_and_number(name.rpartition("/")[2]) and not name.startswith("records/")]
-    current = len(numbered)
+    current, copied = len(numbered), 0
     outdated = list(_outdated(source, names))
     if target != source:
-        _copy(source, target, numbered, without={name for old in outdated for name in old.replaces})
+        copied = _copy(source, target, numbered, without={name for old in outdated for name in old.replaces})
     for old in outdated:
         try:
             data = to_json(sealed(old.brought())).encode()
@@ -115,6 +119,8 @@ def _store(source: Place, target: Place) -> Migrated:
             continue
         if target.put_new(old.name, data):
             migrated.append(target.where(old.name))
+        elif target != source:
+            current += 1
         for name in old.replaces if target == source else ():
             source.delete(name)
     if target == source:
@@ -122,18 +128,20 @@ def _store(source: Place, target: Place) -> Migrated:
     marked = target.size(MARK) is not None
     remember_earlier(Store(target.where()))
     mark_store(target, found=marked)
-    return Migrated(target.where(), tuple(migrated), current, tuple(problems))
+    return Migrated(target.where(), tuple(migrated), current, tuple(problems), copied)
 
 
-def _copy(source: Place, target: Place, documents: Sequence[str], *, without: set[str]) -> None:
-    """Copy what a store holds, its documents last, so that each finds its files; what is there already in its size is not copied again."""
-    apart = {*documents, *without, MARK, "sources.json"}
+def _copy(source: Place, target: Place, documents: Sequence[str], *, without: set[str]) -> int:
+    """Copy what a store holds, its documents last, so that each finds its files; what is there already in its size is not copied again.
+
+    Returns the number of files that were copied.
+    """
     there = {entry.name: entry.size_bytes for entry in target.entries()}
-    for entry in source.entries():
-        if entry.name not in apart and there.get(entry.name) != entry.size_bytes:
-            target.put(entry.name, source.read(entry.name) or b"")
-    for name in documents:
-        target.put_new(name, source.read(name) or b"")
+    apart = {*documents, *without, MARK, "sources.json", *(name for name in there if name.startswith("index/"))}
+    absent = [of for of in source.entries() if of.name not in apart and there.get(of.name) != of.size_bytes]
+    for entry in absent:
+        target.put(entry.name, source.read(entry.name) or b"")
+    return len(absent) + sum(target.put_new(name, source.read(name) or b"") for name in documents)
 
 
 @dataclass(frozen=True, slots=True)

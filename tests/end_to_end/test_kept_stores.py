@@ -107,6 +107,10 @@ def test_what_2_0_wrote_is_read_as_it_is(tmp_path):
     for name in ("store", "zarr", "parquet"):
         assert verify(tmp_path / name).problems == ()
     assert contents(tmp_path) == before
+    copied = [str(migrate(tmp_path / "store", tmp_path / "copy")) for _ in range(2)]
+    files = len(contents(tmp_path / "copy")) - 1  # but store.json
+    assert copied[0].endswith(f"0 documents brought to data model 2.1, 3 left as they are; {files} files copied")
+    assert copied[1].endswith("copy: nothing to do: 3 documents are current")
     (run,) = open_store(tmp_path / "store").runs()
     segments = run.segments()
     assert segments.column("geometry").null_count == segments.num_rows > 0
@@ -165,7 +169,7 @@ def test_a_store_is_asked_to_be_migrated_and_its_tables_stay_where_they_are(unto
     assert verify(store).problems == ()
     again = migrate(store)
     assert (again.migrated, again.exit_code) == ((), 0)
-    assert "nothing to do" in str(again)
+    assert str(again).endswith("nothing to do: 3 documents are current")
     assert contents(store) == after
     (run,) = Store(store).runs()
     assert run.manifest.data_model_version == DATA_MODEL_VERSION
