@@ -222,9 +222,18 @@ def test_a_dry_run_says_what_would_be_done_and_does_nothing(first_night, tmp_pat
 
 
 def test_an_estimate_is_what_the_like_took():
-    night = Call("ingest", "0", 0, {}, cpu_s=20.0, done_bytes=100, written_bytes=50)
-    other = replace(night, cpu_s=10.0, done_bytes=50, written_bytes=10)
+    night = Call("ingest", "0", 0, {}, cpu_s=2_000.7, done_bytes=10**9, written_bytes=5 * 10**8)
+    other = replace(night, cpu_s=1_000.7, done_bytes=5 * 10**8, written_bytes=10**8)
     quiet, build = replace(night, done_bytes=0, cpu_s=9.0), replace(night, command="build-dataset")
-    found = calls.estimate([night, other, quiet, build], "ingest", 1_000, jobs=4)
-    assert (found.wall_s, found.written_bytes) == (pytest.approx(30 / 150 * 1_000 / 4), 400)
-    assert str(found) == "1 kB: about 50 s and 400 B (by 2 earlier calls)"
+    found = calls.estimate([night, other, quiet, build], "ingest", 10**9, jobs=4)
+    assert found.wall_s == pytest.approx(0.7 + 500.0, rel=0.01)
+    assert found.written_bytes == pytest.approx(4e8, rel=0.01)
+    assert str(found) == f"1 GB: about 8 min and {found.written_bytes / 1e6:.3g} MB (by 2 earlier calls)"
+
+
+def test_a_small_call_tells_little_of_a_million_samples():
+    small = Call("build-dataset", "0", 0, {"samples": 312}, cpu_s=2.3, written_bytes=2_900_000)
+    found = calls.estimate([small], "build-dataset", 1_000_000, jobs=1)
+    assert 100.0 < found.wall_s < 300.0, "185 s (docs/explanation/scale.md); 7,400 s in proportion"
+    assert found.written_bytes < 5e9
+    assert calls.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
