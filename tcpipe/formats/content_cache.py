@@ -38,9 +38,11 @@ def cached(key: str, fetch: Callable[[Path], object]) -> Path:
         # Nothing is synced, and what a killed process leaves goes in its turn: whoever reads it proves it.
         temporary.replace(path)
     except OSError as error:
-        raise StoreError(f"{path}: cannot be written ({error.strerror or error})") from error
+        told = f"{path}: cannot be written ({error.strerror or error}); TCPIPE_CACHE names another place for what is fetched"
+        raise StoreError(told) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):
+            temporary.unlink()
     _unseen_bytes[0] += put.st_size
     if _unseen_bytes[0] * _SHARE_UNSEEN > (most := _most_bytes()):
         _make_room(path.parent.parent, most, now=put.st_mtime)
@@ -54,7 +56,7 @@ def is_cached(key: str) -> bool:
 
 
 def _is_there(path: Path) -> bool:
-    with suppress(FileNotFoundError):
+    with suppress(FileNotFoundError, NotADirectoryError):
         os.utime(path)
         return True
     return False

@@ -174,3 +174,12 @@ def test_the_cache_is_bounded(served: Path, monkeypatch: pytest.MonkeyPatch, tmp
         place.put("a", data)
         place.local("a", Checksum(1000, hashlib.sha256(data).hexdigest()))
     assert sum(path.is_file() for path in (tmp_path / "cache").rglob("*")) == 2
+
+
+def test_a_cache_that_cannot_be_is_named_with_what_names_another(served: Path, tmp_path: Path) -> None:
+    (served / "tests").mkdir()
+    place = open_place("s3://tests")
+    place.put("a", b"content")
+    (tmp_path / "cache").touch()
+    with pytest.raises(StoreError, match=r"cache/../.*: cannot be written \(.*\); TCPIPE_CACHE names another place"):
+        place.local("a", Checksum(7, hashlib.sha256(b"content").hexdigest()))
