@@ -16,6 +16,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ LOGS = dg.DynamicPartitionsDefinition(name="logs")
 
 _DONE = {0, 3}
 """Exit codes with a result: done; done, and something in it wants to be looked at."""
+_YOUNG_NS = 600 * 10**9
+"""A log that was written to since is not asked for yet: it may still be written, or on its way."""
 
 
 def _place(name: str, default: str) -> str:
@@ -93,6 +96,7 @@ def _verified(path: str) -> dg.AssetCheckResult:
 
 @dg.asset(
     partitions_def=LOGS,
+    retry_policy=dg.RetryPolicy(max_retries=3, delay=600),  # of what may pass: a full disk, a network
     group_name="tcpipe",
     kinds={"parquet"},
     check_specs=[
@@ -106,10 +110,12 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
     """Labelled segments of one log, in the store."""
     source = _sources().get(context.partition_key)
     if source is None:
-        raise dg.Failure(f"{context.partition_key}: this log is no longer below {_place('TCPIPE_LOGS', 'recordings')}")
-    result = _answers("ingest", *source.origins)[-1]["results"][0]
+        gone = f"{context.partition_key}: this log is no longer below {_place('TCPIPE_LOGS', 'recordings')}"
+        raise dg.Failure(gone, allow_retries=False)
+    result = _answers("ingest", *source.origins, codes={0, 1, 3})[-1]["results"][0]
     if result["status"] in ("failed", "waiting"):
-        raise dg.Failure("\n".join([*result["problems"], *result["notes"]]) or result["status"])
+        said = "\n".join([*result["problems"], *result["notes"]]) or result["status"]
+        raise dg.Failure(said, allow_retries=result["transient"] or result["status"] == "waiting")
     budget = result["energy_budget"]
     return dg.MaterializeResult(
         metadata={
@@ -189,13 +195,14 @@ one_log = dg.define_asset_job("one_log", dg.AssetSelection.assets(run), descript
 
 @dg.sensor(job=one_log, minimum_interval_seconds=300, default_status=dg.DefaultSensorStatus.RUNNING)
 def new_logs(context: dg.SensorEvaluationContext) -> dg.SensorResult:
-    """Ask for a run of every log that is new, or was written to since."""
+    """Ask for a run of every log that is new, or was written to since, once it rests."""
     sources = _sources()
     known = set(context.instance.get_dynamic_partitions("logs"))
     return dg.SensorResult(
         run_requests=[
             dg.RunRequest(partition_key=place, run_key=f"{place}:{source.files_digest}")
             for place, source in sources.items()
+            if time.time_ns() - source.youngest_ns > _YOUNG_NS
         ],
         dynamic_partitions_requests=[LOGS.build_add_request(sorted(set(sources) - known))]
         if set(sources) - known

@@ -3,6 +3,7 @@
 `make test-dagster` runs it in an environment of its own.
 """
 
+import os
 import runpy
 from pathlib import Path
 
@@ -21,6 +22,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     place = tmp_path_factory.mktemp("site")
     made = simulate(place, scenario=tiny(Faults.every()))
     add_map("site", **made.rasters, store=place / "store")
+    os.utime(place / "logs" / "tiny.mcap", ns=(10**18, 10**18))
     return place
 
 
@@ -77,6 +79,18 @@ def test_a_new_log_is_found_and_becomes_a_dataset_with_metadata_and_checks(defs,
         }
 
 
+def test_a_log_that_is_still_written_is_not_asked_for(defs, site):
+    young = site / "logs" / "young.mcap"
+    young.write_bytes(b"half")
+    try:
+        with dg.DagsterInstance.ephemeral() as instance:
+            assert [request.partition_key for request in found(defs, instance).run_requests] == ["tiny.mcap"]
+            os.utime(young, ns=(10**18, 10**18))
+            assert len(found(defs, instance).run_requests) == 2
+    finally:
+        young.unlink()
+
+
 def test_what_cannot_be_read_fails_with_the_commands_own_words(defs, site):
     (site / "logs" / "junk.mcap").write_bytes(b"junk")
     try:
@@ -87,6 +101,9 @@ def test_what_cannot_be_read_fails_with_the_commands_own_words(defs, site):
             assert not failed.success
             (event,) = [event for event in failed.all_events if event.is_step_failure]
             assert "junk.mcap" in event.step_failure_data.user_failure_data.description
+            assert not [event for event in failed.all_events if event.is_step_up_for_retry], (
+                "what it holds does not pass"
+            )
     finally:
         (site / "logs" / "junk.mcap").unlink()
 
