@@ -150,7 +150,11 @@ def _store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
 
 def _label_sections(samples: pa.Table) -> list[Section]:
     labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
-    drawn = [histogram(name, floats(samples, name), label=label, of_what="samples") for label, name in labels.items()]
+    drawn = [
+        histogram(name, values, label=label, of_what="samples")
+        for label, name in labels.items()
+        if np.isfinite(values := floats(samples, name)).any()
+    ]
     return [Section("Labels", "One value a sample.", plots=drawn)] if samples.num_rows else []
 
 

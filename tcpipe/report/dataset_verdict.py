@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.report.page import Verdict
 
+_FEW_SAMPLES = 100
 _MANY_DOUBTFUL = 0.1
 _NOISY = 0.05
 
@@ -18,14 +19,18 @@ def verdict(card: DatasetCard, lost: list[str]) -> list[Verdict]:
     return [*_good(card), *_thin(card), *_doubtful(card, lost), *_to_do(card)]
 
 
-def _good(card: DatasetCard) -> Iterator[Verdict]:
+def _size(card: DatasetCard) -> str:
     classes = sum(
         any(part.get(name) for part in card.terrain.values()) for name in {n for p in card.terrain.values() for n in p}
     )
     ground = f" on {classes} terrain {'class' if classes == 1 else 'classes'}" if classes else ""
-    yield Verdict(
-        "good", f"{card.samples} samples of {len(card.runs)} {'run' if len(card.runs) == 1 else 'runs'}{ground}."
-    )
+    runs = f"{len(card.runs)} {'run' if len(card.runs) == 1 else 'runs'}"
+    return f"{card.samples} {'sample' if card.samples == 1 else 'samples'} of {runs}{ground}"
+
+
+def _good(card: DatasetCard) -> Iterator[Verdict]:
+    if card.samples >= _FEW_SAMPLES:
+        yield Verdict("good", f"{_size(card)}.")
     if card.energy_budget is not None and card.energy_budget.total < _NOISY:
         yield Verdict("good", f"Labels are sharp: the noise floor of E is {100 * card.energy_budget.total:.1f} %.")
     tested = [part for part in card.split.audit if part.samples]
@@ -34,6 +39,8 @@ def _good(card: DatasetCard) -> Iterator[Verdict]:
 
 
 def _thin(card: DatasetCard) -> Iterator[Verdict]:
+    if card.samples < _FEW_SAMPLES:
+        yield Verdict("thin", f"Only {_size(card)}.")
     empty = [name for name in ("train", "test", "unseen") if not card.splits.get(name)]
     if empty:
         yield Verdict("thin", f"Nothing is in {' and '.join(empty)}.")

@@ -214,8 +214,9 @@ def _label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str
         return
     labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
     drawn = [
-        histogram(f"of {name}", floats(segments, name), label=label, of_what="segments")
+        histogram(f"of {name}", values, label=label, of_what="segments")
         for label, name in labels.items()
+        if np.isfinite(values := floats(segments, name)).any()
     ]
     yield Section("Labels", "One value a segment.", plots=drawn)
     if physics is None or not physics.fitted:

@@ -16,6 +16,7 @@ _FEW_SEGMENTS = 30
 _MANY = 0.1
 _NOISY = 0.05
 _LARGE_LOSS = 0.05
+_LITTLE_USED = 0.5
 _MOST_LOSSES = 3
 _SENSORS = {
     "power": "No power: no segment has w or E.",
@@ -32,17 +33,22 @@ def verdict(manifest: Manifest, quality: Mapping[str, int], missing: Sequence[st
     driven_m = sum(manifest.ledger_m.values())
     segments = manifest.counts.segments
     return [
-        *_good(facts, segments, manifest.ledger_m.get("kept", 0.0), driven_m),
+        *_used(segments, manifest.ledger_m.get("kept", 0.0), driven_m),
+        *_good(facts),
         *_thin(manifest, segments, missing),
         *_doubtful(manifest, facts, quality, segments),
         *_to_do(manifest, facts, driven_m),
     ]
 
 
-def _good(facts: RunFacts, segments: int, kept_m: float, driven_m: float) -> Iterator[Verdict]:
+def _used(segments: int, kept_m: float, driven_m: float) -> Iterator[Verdict]:
     if segments:
-        share = 100 * kept_m / max(driven_m, 1e-9)
-        yield Verdict("good", f"{segments} segments: {kept_m:.0f} of {driven_m:.0f} m driven are used ({share:.0f} %).")
+        share = kept_m / max(driven_m, 1e-9)
+        said = f"{segments} segments: {kept_m:.0f} of {driven_m:.0f} m driven are used ({100 * share:.0f} %)."
+        yield Verdict("good" if share >= _LITTLE_USED else "thin", said)
+
+
+def _good(facts: RunFacts) -> Iterator[Verdict]:
     budget = facts.label.energy_budget if facts.label else None
     if budget is not None and budget.total < _NOISY:
         yield Verdict("good", f"Labels are sharp: the noise floor of E is {100 * budget.total:.1f} %.")

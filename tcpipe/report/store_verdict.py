@@ -67,7 +67,8 @@ def _good(runs: Sequence[StoredRun]) -> Iterator[Verdict]:
     floors = [run.floor for run in runs if run.floor is not None]
     if floors and (middle := float(np.median(floors))) < _NOISY:
         yield Verdict(
-            "good", f"Labels are sharp: half of the runs have a noise floor of E of {100 * middle:.1f} % or less."
+            "good",
+            f"Labels are sharp: the noise floor of E is {100 * middle:.1f} % (median of {_many(len(floors), 'run')}).",
         )
 
 
@@ -75,6 +76,11 @@ def _thin(store: StoreFacts, runs: Sequence[StoredRun]) -> Iterator[Verdict]:
     bare = sum(not (run.facts and run.facts.segments) for run in runs)
     if bare:
         yield Verdict("thin", f"{_many(bare, 'run')} without a segment.")
+    if unpowered := sum(bool(run.facts and run.facts.segments) and run.floor is None for run in runs):
+        yield Verdict(
+            "thin",
+            f"{_many(unpowered, 'run')} of which no noise floor of E is known: without power they tell v and T alone.",
+        )
     if little := sum(run.used_share < _LITTLE_USED for run in runs if run.used_share is not None):
         yield Verdict(
             "thin", f"{_many(little, 'run')} of which less than {100 * _LITTLE_USED:.0f} % of the metres are used."
@@ -94,7 +100,8 @@ def _doubtful(store: StoreFacts, runs: Sequence[StoredRun], current: Sequence[St
     floors = [run.floor for run in current if run.floor is not None]
     if floors and (middle := float(np.median(floors))) >= _NOISY:
         yield Verdict(
-            "doubtful", f"Labels are noisy: half of the runs have a noise floor of E above {100 * middle:.1f} %."
+            "doubtful",
+            f"Labels are noisy: the noise floor of E is {100 * middle:.1f} % (median of {_many(len(floors), 'run')}).",
         )
     for text in changes(current):
         yield Verdict("doubtful", text)

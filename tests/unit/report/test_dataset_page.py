@@ -4,6 +4,7 @@ import base64
 import io
 import re
 import shutil
+from dataclasses import replace
 from html import unescape
 
 import numpy as np
@@ -22,6 +23,7 @@ from tcpipe.pipeline.verify import verify
 from tcpipe.report import dataset_samples
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.dataset_samples import COLUMNS, nearest_train_m, samples_shown
+from tcpipe.report.dataset_verdict import verdict
 from tcpipe.report.quality import QUALITY_WORDS
 from tcpipe.store import open_store
 from tcpipe.tables.bits import Quality
@@ -164,6 +166,15 @@ def test_few_samples_are_shown_as_well(built, count):
     shown = samples_shown(card, table.slice(0, count))
     assert shown.xy_m.shape == (count, 2)
     assert len(unpacked(shown.json["packed"], "energy")) == count
+
+
+@pytest.mark.parametrize(
+    ("count", "kind", "words"), [(1, "thin", "Only 1 sample of 2 runs"), (300, "good", "300 samples of 2 runs")]
+)
+def test_one_sample_is_not_called_good(built, count, kind, words):
+    first = verdict(replace(open_dataset(built).card, samples=count), [])
+    (told,) = [line for line in first if words in line.text]
+    assert told.kind == kind
 
 
 def test_a_damaged_dataset_says_so_on_its_page(built, tmp_path):

@@ -135,6 +135,14 @@ def test_a_run_without_power_map_or_sensors_says_so(tmp_path):
     assert told["ground"] == []
     assert "power" not in {line["plot"] for line in told["lines"]}
     assert np.isnan(unpacked(told["segments"], "power")).all()
+    assert "Histogram of v [m/s]" in html
+    assert "Histogram of w [W]" not in html  # an empty frame that Bokeh complains of
+
+
+def test_a_run_of_which_less_than_half_is_used_is_not_called_good(tmp_path):
+    html = page_of(tmp_path, drive(), ledger_m={"kept": 33.0, "accelerating": 51.0})
+    said = html.split("33 of 84 m driven are used (39 %)")[0]
+    assert said.rindex("<b>Thin</b>") > said.rfind("<b>Good</b>")
 
 
 def test_a_run_without_track_or_segments_is_a_page_too(tmp_path):

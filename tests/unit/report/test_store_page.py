@@ -75,6 +75,12 @@ def test_each_run_is_there_as_its_documents_say(store):
     assert not report(store.root, runs=False)[0].changed
 
 
+def test_runs_without_power_are_counted_and_labels_are_sharp_of_those_that_have_it(store):
+    html = shown(store)[1]
+    assert "3 runs of which no noise floor of E is known: without power they tell v and T alone." in html
+    assert "Labels are sharp" not in html
+
+
 def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
     _, html, *_ = shown(store)
     manifests = [store.recipes_of(name)[-1].manifest for name in ("a", "c")]
