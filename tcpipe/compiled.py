@@ -70,7 +70,7 @@ CPUContext.load_additional_registries = _load_without_blas
 
 def kernel(function: Callable[..., Any]) -> Any:
     """Compile ``function`` with numba on first call: no Python objects, no GIL, IEEE arithmetic, cached on disk."""
-    options = {"cache": True, "nogil": True, "error_model": "numpy"}
+    options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
     try:
         compiled = numba.njit(**options)(function)
     except RuntimeError:  # numba finds no place to write its cache

@@ -27,6 +27,7 @@ from tcpipe.fusion.state_kernel import (
     Matrix,
     N,
     Vector,
+    copied,
     saved,
     workspace,
 )
@@ -236,7 +237,7 @@ def filter_block(
             nis[e] = value
         row = e - first
         if keep:
-            store_F[row] = F
+            copied(F, store_F[row])
             store_y[row, 0] = 1.0 if dt[e] > 0.0 else 0.0
             store_y[row, 1] = 1.0 - dt[e] * densities[mode[e], DECAY]
             store_y[row, 2] = 1.0 if hears else 0.0
@@ -253,12 +254,12 @@ def filter_block(
             refused[k] = 0.0
             silent[k] = 0.0
             if keep:
-                store_KH[row, 0] = work[1]
+                copied(work[1], store_KH[row, 0])
                 for a in range(3):
                     for b in range(3):
                         store_y[row, 15 + 3 * a + b] = J[a, b]
         if keep and output[e] >= 0:
-            store_P[wanted] = P
+            copied(P, store_P[wanted])
             wanted += 1
         if output[e] >= 0:
             saved(x, P, outputs[output[e]])

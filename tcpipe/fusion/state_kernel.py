@@ -165,6 +165,14 @@ def factor(P: Matrix, U: Matrix, tally: Vector) -> None:
 
 
 @kernel
+def copied(values: Matrix, out: Matrix) -> None:
+    """Fill ``out``; a slice that is assigned makes numba compile the words of an error for it, in seconds."""
+    for i in range(values.shape[0]):
+        for j in range(values.shape[1]):
+            out[i, j] = values[i, j]
+
+
+@kernel
 def saved(x: Vector, P: Matrix, out: Vector) -> None:
     """State, then variances of p (3), yaw and forward velocity, then of s_w and s_v, then the fixes' error, shape (33,)."""
     for i in range(NX):
