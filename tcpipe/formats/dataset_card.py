@@ -221,7 +221,10 @@ class Shard:
 class Redacted:
     """What a redacted dataset does not tell, and what it does not hide."""
 
-    moved: str = "to 0 N 0 E as a whole, grid north up: lon, lat, course, heights, regions; distances in the maps' plane are as they were"
+    moved: str = (
+        "to 0 N 0 E as a whole, grid north up: lon, lat, x, y, course, heights, regions; distances in the maps' plane are as they were, to "
+        "a centimetre"
+    )
     cut: str = (
         "names of logs, runs and maps; topics, paths, hosts, users; checksums of rasters; the recipe's sections read, robots, "
         "power_sources and tables"

@@ -28,6 +28,12 @@ PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs
 REACH_DEG = 5.0
 """No redacted dataset lies further from there."""
 
+_PLACE_M, _PLACE_DIGITS_DEG = 0.01, 7
+"""Places are told to a centimetre: finer, their distances would tell the scale of the maps' plane."""
+
+_REDACTED_WITHIN_M = 0.1
+"""Of lon and lat lie x and y of a redacted dataset."""
+
 _ENDS, _AXES = ("start", "end"), ("lon", "lat")
 _PLACES = re.compile(r"\b[\w.+-]+@[\w.-]+|(?<![\w/])(?:[A-Za-z]:(?=\\)|[a-z]\w*:/)?[~.]{0,2}[/\\][\w./\\~@%+-]+")
 """Users at hosts; paths, topics and URLs."""
@@ -63,10 +69,18 @@ class Redaction:
         return self.runs[run_id] + name[len(run_id) :]
 
     def table(self, samples: pa.Table) -> pa.Table:
-        """Return samples with the places and names that are told; their courses are from the east of the maps' grid."""
+        """Return samples with the places and names that are told; courses and x, y are along the maps' grid.
+
+        In its run's own frame x is towards the east: against the grid that would tell the meridian's convergence, and so the latitude.
+        """
         ends = {end: self.in_plane(lonlat_deg(samples, end)) for end in _ENDS}
         columns: dict[str, Any] = {
             f"{end}_{axis}_deg": _laid_down(xy_m)[:, at] for end, xy_m in ends.items() for at, axis in enumerate(_AXES)
+        }
+        columns |= {
+            f"{end}_{axis}_m": (xy_m[:, at] / _PLACE_M).round() * _PLACE_M
+            for end, xy_m in ends.items()
+            for at, axis in enumerate("xy")
         }
         columns["course_rad"] = np.arctan2(*(ends["end"] - ends["start"]).T[::-1])
         columns["height_min_m"] = floats(samples, "height_min_m") - self.height_m
@@ -95,7 +109,8 @@ def _between(source: str, target: str) -> Transformer:
 
 def _laid_down(xy_m: Floats) -> Floats:
     """Return (lon, lat) [deg] of places in the plane at 0 N 0 E, shape (..., 2)."""
-    return np.stack(_between(PLANE, "EPSG:4326").transform(xy_m[..., 0], xy_m[..., 1]), axis=-1)
+    lonlat = _between(PLANE, "EPSG:4326").transform(xy_m[..., 0], xy_m[..., 1])
+    return np.stack(lonlat, axis=-1).round(_PLACE_DIGITS_DEG)
 
 
 def redaction_of(content: Content, inputs: Inputs, recipe: Recipe) -> Redaction:
@@ -198,8 +213,15 @@ def moved_coordinates(coordinates: Any, move: Callable[[Floats], Floats]) -> Any
 
 
 def what_is_told(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
-    """Yield a line for each thing that a redacted dataset tells and should not; ``samples`` has their four lon and lat columns."""
+    """Yield a line for each thing that a redacted dataset tells and should not; ``samples`` has where their ends lie."""
     for end in _ENDS:
+        lon, lat, x_m, y_m = (floats(samples, f"{end}_{name}") for name in ("lon_deg", "lat_deg", "x_m", "y_m"))
+        plane_x_m, plane_y_m = _between("EPSG:4326", PLANE).transform(lon, lat)
+        if (np.hypot(x_m - plane_x_m, y_m - plane_y_m) > _REDACTED_WITHIN_M).any():
+            yield (
+                f"it is said to be redacted, but {end}_x_m and {end}_y_m are not along its lon and lat: their angle tells the latitude; "
+                "build it again"
+            )
         for axis in _AXES:
             if (np.abs(floats(samples, f"{end}_{axis}_deg")) > REACH_DEG).any():
                 yield f"it is said to be redacted, but {end}_{axis}_deg is beyond {REACH_DEG:g} degrees"

@@ -59,13 +59,15 @@ def test_all_of_it_is_moved_by_one_offset_in_the_plane_of_the_map(built):
     redacted, is_m = places_m(here / "redacted", "EPSG:4326", PLANE)
     moved_m = was_m - is_m
     assert np.hypot(*moved_m[0]) > 1e5
-    np.testing.assert_allclose(moved_m, np.broadcast_to(moved_m[0], moved_m.shape), atol=1e-6)
+    np.testing.assert_allclose(moved_m, np.broadcast_to(moved_m.mean(axis=0), moved_m.shape), atol=0.012)  # 1e-7 deg
     assert np.abs(is_m).max() < 100.0
     start, end = np.split(is_m, 2)
-    np.testing.assert_allclose(redacted["course_rad"], np.arctan2(*(end - start).T[::-1]), atol=1e-9)
+    np.testing.assert_allclose(redacted["course_rad"], np.arctan2(*(end - start).T[::-1]), atol=0.03)
     grid = read_card(here / "redacted").maps[0]
     before = read_card(here / "told").maps[0]
-    np.testing.assert_allclose([before.x_min_m - grid.x_min_m, before.y_max_m - grid.y_max_m], moved_m[0], atol=1e-6)
+    np.testing.assert_allclose(
+        [before.x_min_m - grid.x_min_m, before.y_max_m - grid.y_max_m], moved_m.mean(axis=0), atol=0.001
+    )
     lift_m = told["height_min_m"].to_numpy() - redacted["height_min_m"].to_numpy()
     assert np.ptp(lift_m) < 1e-9
     assert 0.0 <= redacted["height_min_m"].to_numpy().min() < 1.0
@@ -77,10 +79,20 @@ def test_samples_patches_splits_and_labels_are_as_they_were(built):
         sorted((here / "told/data").iterdir()), sorted((here / "redacted/data").iterdir()), strict=True
     ):
         was, now = pq.read_table(old), pq.read_table(new)
-        changed = {"sample_id", "segment_id", "run_id", "map", "course_rad", "height_min_m", "geometry"}
+        axes = {f"{end}_{axis}_m" for end in ("start", "end") for axis in "xy"}
+        changed = axes | {"sample_id", "segment_id", "run_id", "map", "course_rad", "height_min_m", "geometry"}
         same = [name for name in was.column_names if name not in changed and not name.endswith("_deg")]
         assert {"ortho", "power_watt", "split", "start_ns", "slope_rad"} <= set(same)
         assert now.select(same).equals(was.select(same))
+
+
+def test_no_frame_of_it_is_turned_against_another(built):
+    """A run's own east against the grid's tells the convergence of the meridians, and so the latitude: x and y are along the grid, too."""
+    here, *_ = built
+    samples, plane_m = places_m(here / "redacted", "EPSG:4326", PLANE)
+    own_m = np.concatenate([np.stack([samples[f"{end}_{axis}_m"] for axis in "xy"], -1) for end in ("start", "end")])
+    np.testing.assert_allclose(own_m, plane_m, atol=0.012)
+    np.testing.assert_allclose(own_m, own_m.round(2), atol=1e-9)
 
 
 def test_nothing_names_logs_maps_places_or_paths(built):
@@ -124,7 +136,7 @@ def test_verify_says_that_it_is_redacted_and_finds_what_is_told_all_the_same(bui
     assert verify(here / "told").notes == ()
     card, samples = read_card(here / "redacted"), read_samples(here / "redacted")
     assert list(what_is_told(card, samples)) == []
-    assert len(list(what_is_told(card, read_samples(here / "told")))) == 4
+    assert len(list(what_is_told(card, read_samples(here / "told")))) == 6
     assert list(what_is_told(replace(card, warnings=("see /data/anna/x.bag",)), samples)) == [
         "it is said to be redacted, but tells '/data/anna/x.bag'"
     ]
