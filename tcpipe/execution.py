@@ -297,7 +297,7 @@ def _silent(*names: str) -> Iterator[None]:
 
 
 def _workers(client: Client, address: str) -> int:
-    """Return the number of workers; `UsageError` where there is none, or one runs tasks as threads of one process."""
+    """Return the number of workers; `UsageError` where there is none, or one has several threads, no tcpipe, or another."""
     try:
         with suppress(TimeoutError):
             client.wait_for_workers(1, timeout=_ANSWER_S)
@@ -313,6 +313,12 @@ def _workers(client: Client, address: str) -> int:
         raise UsageError(
             f"{many[0]}: has {threads[many[0]]} threads; wanted one a worker: dask worker {address} --nthreads 1"
         )
+    # Not a function of tcpipe: a worker that lacks it would end when it is handed one.
+    for worker, version in client.run(eval, "__import__('tcpipe').__version__", on_error="return").items():
+        if isinstance(version, ImportError):
+            raise UsageError(f"{worker}: a worker lacks tcpipe ({version}); install there what is installed here")
+        if version != __version__ and isinstance(version, str):  # else it is gone again
+            raise UsageError(f"{worker}: a worker has tcpipe {version}, wanted {__version__} as here; install that")
     return len(threads)
 
 

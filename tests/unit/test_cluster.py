@@ -74,6 +74,17 @@ def test_what_a_worker_or_the_scheduler_lacks_is_one_line(cluster, tmp_path, mon
         list(run_all(task, [1], jobs=1, cluster=cluster.address))
 
 
+def test_a_worker_without_tcpipe_is_refused_at_once(tmp_path, monkeypatch):
+    (tmp_path / "none" / "tcpipe").mkdir(parents=True)
+    (tmp_path / "none" / "tcpipe" / "__init__.py").write_text("raise ModuleNotFoundError('there is none')\n")
+    with dask_cluster(tmp_path, workers=0) as bare:
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path / "none"))
+        monkeypatch.chdir(tmp_path)  # where `python -m dask` looks before all
+        bare.start_worker()
+        with pytest.raises(UsageError, match=r"tcp://.*: a worker lacks tcpipe \(there is none\); install there what"):
+            list(run_all(where, [1], jobs=1, cluster=bare.address))
+
+
 def test_what_workers_spend_counts_here(cluster):
     before_s = cluster_cpu_s()
     assert [outcome.result for outcome in run_all(spend, [0.1, 0.1], jobs=1, cluster=cluster.address)] == [None, None]
