@@ -74,6 +74,8 @@ class Status:
     """What the next ingest will take; None where nothing is to do."""
     problems: tuple[str, ...]
     """Sources that cannot be looked at, and runs that are not as they were written."""
+    gone: tuple[str, ...]
+    """Sources that cannot be looked at and that only calls before the latest ingest were given."""
     superseded_runs: int
     history: tuple[Call, ...]
     """The latest calls, the last one first."""
@@ -87,6 +89,7 @@ class Status:
         said = ", ".join(f"{count} {_words(state)}" for state, count in self.counts.items()) or "no logs"
         lines = [f"{self.store}: {said}", *(str(group) for group in self.groups)]
         lines += [f"to do: {self.to_do}"] if self.to_do else []
+        lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
         lines += ["losses:", *map(str, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
@@ -129,7 +132,9 @@ def status(
     ruling = recipe_of(recipe)
     opened = Store(store if is_url(store) else local_output(store)) if create else open_store(store)
     calls = latest_calls(opened)
-    given = [str(log) for log in logs] or list(dict.fromkeys(log for call in calls for log in call.logs))
+    given = [str(log) for log in logs]
+    lately: Sequence[str] = given or next((call.logs for call in calls if call.logs), ())
+    given = given or list(dict.fromkeys(log for call in calls for log in call.logs))
     if not given:
         raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
     known, definitions = known_runs(opened, force=force), definitions_key(message_definitions)
@@ -154,7 +159,10 @@ def status(
         for of, tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
     )
     ledgers_m = (run.facts.ledger_m for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling))
-    return replace(_summed(opened, told, found, known, calls, sources=given, jobs=jobs), losses=losses_of(ledgers_m))
+    gone = tuple(line for path, lines in found.problems.items() if path not in lately for line in lines)
+    found = replace(found, problems={path: lines for path, lines in found.problems.items() if path in lately})
+    summed = _summed(opened, told, found, known, calls, sources=given, jobs=jobs)
+    return replace(summed, losses=losses_of(ledgers_m), gone=gone)
 
 
 def _group(state: State, alike: str, tasks: Sequence[tuple[IngestTask, str]]) -> Group:
@@ -280,6 +288,7 @@ def _summed(
         groups=told,
         to_do=estimate(calls, INGEST, waiting, jobs=jobs) if any(counts[state] for state in TO_DO) else None,
         problems=problems,
+        gone=(),
         superseded_runs=len(known.runs.superseded),
         history=tuple(calls),
         losses=(),

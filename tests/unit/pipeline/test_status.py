@@ -97,6 +97,20 @@ def test_without_logs_it_looks_where_ingest_was_told_to(first_night, tmp_path):
         status(store=tmp_path, recipe=Recipe())
 
 
+def test_a_log_that_is_gone_is_trouble_only_where_the_latest_call_was_given_it(first_night, tmp_path):
+    stick = drive_at(tmp_path / "stick" / "one.mcap", seed=3)
+    ingest([stick], store=tmp_path / "store", recipe=Recipe())
+    stick.unlink()
+    found = status(store=tmp_path / "store", recipe=Recipe())
+    assert (found.exit_code, len(found.problems), found.gone) == (3, 1, ())
+    shutil.copytree(first_night / "logs", tmp_path / "logs", ignore=lambda *_: {"cut.mcap", "junk.bag"})
+    ingest([tmp_path / "logs"], store=tmp_path / "store", recipe=Recipe())
+    found = status(store=tmp_path / "store", recipe=Recipe())
+    assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
+    assert f"of earlier calls: {stick}: there is no such file or directory" in str(found)
+    assert status([stick], store=tmp_path / "store", recipe=Recipe()).exit_code == 3
+
+
 def test_new_changed_growing_passing_and_accepted_logs_are_told_apart(night):
     logs, store = night / "logs", night / "store"
     # The copy lies elsewhere: its logs were never seen there, until the second night.
