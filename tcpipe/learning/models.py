@@ -73,6 +73,9 @@ class Model:
     @cached_property
     def network(self) -> ResNet18:
         """Return the torch module, images (N, depth, px, px) to outputs over ``card.scale``; torch is imported for it."""
+        kind = self.card.training.config.model
+        if kind != "resnet18":
+            raise ModelError(f"{self.name}: is a model of {kind}, which has no network; predict asks any model")
         check_trainable(self.card.architecture)
         from tcpipe.learning.network import resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
 

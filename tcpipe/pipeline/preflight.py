@@ -50,6 +50,7 @@ _OFTEN_THERE = 0.9
 _CLOCK = re.compile(r"\bstamps?\b|log time|^clock:|its clock is")
 _WORTH_SAYING = 0.05
 _SHORT_S = 45.0
+_TRANSFORMS = "/tf_static"
 _WINDOW_S, _FEWEST_WINDOWS = 10.0, 3
 
 
@@ -174,16 +175,17 @@ def preflight(
         topics = tuple(found.topics.values())
         read = recipe.read_of(found.topics)
         cast = roles_by(read, topics, robot, known=profiles_of(recipe))
-        record = record_command(
-            topics, [*(name for role in cast.roles.values() for name in role.topics), *cast.transforms]
-        )
+        played = [name for role in cast.roles.values() for name in role.topics]
+        record = record_command(topics, [*played, *cast.transforms])
+        placed = bool(cast.transforms)
+        record += "" if placed or not record else f" {_TRANSFORMS}"
         missing = dict(_missing_roles(cast.roles, read))
         try:
             streams = read_run(found, read, robot=robot, known=profiles_of(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
-            return _told(seen, None, missing, record, problems=error.problems)
-    return _told(seen, labelled, missing, record, problems=())
+            return _told(seen, None, missing, record, placed=placed, problems=error.problems)
+    return _told(seen, labelled, missing, record, placed=placed, problems=())
 
 
 def _told(
@@ -192,6 +194,7 @@ def _told(
     missing: Mapping[str, str],
     record: str,
     *,
+    placed: bool,
     problems: tuple[str, ...],
 ) -> Preflight:
     facts = labelled.info.findings.facts if labelled else RunFacts()
@@ -200,7 +203,8 @@ def _told(
     promise = _promise(labelled) if labelled else None
     topics = tuple(_topics(facts, seen.duration_s or 0.0))
     slow = tuple(line for line in seen.warnings or () if line.startswith("power: ") and "too slowly" in line)
-    mend = (*_missing(missing), *slow, *_mend(topics, promise, seen.duration_s or 0.0))
+    unplaced = () if placed else _unplaced(every)
+    mend = (*_missing(missing), *slow, *unplaced, *_mend(topics, promise, seen.duration_s or 0.0))
     ready = promise is not None and promise.segments and not any((mend, clock, seen.damage))
     return Preflight(
         log=seen.path,
@@ -271,6 +275,13 @@ def _missing(missing: Mapping[str, str]) -> Iterator[str]:
     for role, what in missing.items():
         types = "" if role == "power" else f" ({' or '.join(ROLE_TYPES[role][:2])})"
         yield f"{role}: no topic plays it: {what}; record one{types}, or name it under [read.topics]"
+
+
+def _unplaced(warnings: Sequence[str]) -> Iterator[str]:
+    """Yield what records where the sensors sit, of a log without transforms."""
+    roles = dict.fromkeys(line.partition(":")[0] for line in warnings if "nothing places frame" in line)
+    if roles:
+        yield f"{', '.join(roles)}: no {_TRANSFORMS} tells where they sit: record it, or say it under [read.placement]"
 
 
 def _mend(topics: Sequence[RoleTopic], promise: Promise | None, span_s: float) -> Iterator[str]:

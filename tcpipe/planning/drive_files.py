@@ -27,6 +27,7 @@ from tcpipe.terrain.tiles import MapReader
 JSON, PAGE = "drives.json", "drives.html"
 
 _NO_USE_PERCENT = 50.0
+_ENOUGH_DRIVES = 10
 _HELD = 0.7
 """Share of drives whose intervals of 90 % hold them, from which on nothing speaks against these: drives are few."""
 
@@ -135,6 +136,9 @@ def _verdict(values: Drives) -> Iterator[Verdict]:
         if told:
             kind: Literal["good", "doubtful"] = "good" if sum(told) >= _HELD * len(told) else "doubtful"
             yield Verdict(kind, f"90 % intervals hold the {called} of {sum(told)} of {len(told)} drives held back.")
+    if 0 < len(held) < _ENOUGH_DRIVES:
+        few = "One drive tells" if len(held) == 1 else f"{len(held)} drives tell"
+        yield Verdict("thin", f"{few} little of how often 90 % intervals hold: hold back {_ENOUGH_DRIVES} or more.")
 
 
 def _sums_along(number: int, drive: DriveCost) -> Iterator[Plot]:

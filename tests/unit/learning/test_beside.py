@@ -116,4 +116,7 @@ def test_an_older_dataset_cannot_tell_and_says_so(dataset, tmp_path, monkeypatch
     ):
         train(dataset, tmp_path / "other", config=config)
     train(dataset, tmp_path / "physics", config=FitConfig(model="physics"))
-    assert not load_model(tmp_path / "physics").takes_turns
+    physics = load_model(tmp_path / "physics")
+    assert not physics.takes_turns
+    with pytest.raises(ModelError, match="is a model of physics, which has no network"):
+        _ = physics.network

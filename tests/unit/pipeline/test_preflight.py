@@ -7,7 +7,7 @@ import pytest
 
 from tcpipe.logs.topics import Topic
 from tcpipe.motion.remedies import REMEDIES
-from tcpipe.pipeline.preflight import Promise, RoleTopic, _hourly_std, _mend, _missing_roles, record_command
+from tcpipe.pipeline.preflight import Promise, RoleTopic, _hourly_std, _mend, _missing_roles, _unplaced, record_command
 from tcpipe.recipe import ReadConfig
 from tcpipe.tables.bits import DropReason, Loss, name_of
 from tcpipe.tables.findings import EnergyBudget
@@ -24,6 +24,18 @@ def test_the_command_records_what_is_read_and_a_simulations_clock():
     assert record_command([topic("/fix", encoding="ros1")], ["/fix"]) == "rosbag record --lz4 -O drive /fix"
     assert record_command([topic("/fix", encoding="csv")], ["/fix"]) == ""
     assert record_command(topics, []) == ""
+
+
+def test_sensors_that_nothing_places_want_transforms_recorded():
+    lines = [
+        "gnss: nothing places frame 'gps' of /fix, it is assumed",
+        "imu: nothing places frame 'a' of /b",
+        "imu: late",
+    ]
+    assert list(_unplaced(lines)) == [
+        "gnss, imu: no /tf_static tells where they sit: record it, or say it under [read.placement]"
+    ]
+    assert list(_unplaced(lines[2:])) == []
 
 
 def promise(segments=50, budget=None):
