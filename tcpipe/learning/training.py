@@ -227,9 +227,12 @@ def training_task(data: Dataset, fold: int, variant: Variant) -> Task:
     if not len(held) or not len(fitted):
         folds = sorted({int(number) for number in train.column("fold")})
         named = ", ".join(map(str, folds))
+        cure = f"a block holds {data.card.recipe.split.block_m:g} m of ground: drive more of it"
+        if data.card.split.holdout in ("run", "tag"):
+            cure = "they are of whole runs: drive once more, or build it with --holdout block"
         raise DatasetError(
-            f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} to stop by; "
-            f"wanted both (there are folds {named}; a block holds 10 m of ground: drive more of it)"
+            f"{data.path}: fold {fold} of train leaves {len(fitted)} samples to fit and {len(held)} held out; "
+            f"wanted both (there are folds {named}; {cure})"
         )
     return Task(train, fitted, held, outputs)
 

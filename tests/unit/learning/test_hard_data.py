@@ -39,6 +39,13 @@ def bare(tmp_path_factory):
     return here
 
 
+def test_one_run_left_to_train_wants_another_or_blocks(bare, tmp_path):
+    """Of two runs one tests; the other is one fold, of whatever length."""
+    build_dataset(tmp_path / "dataset", store=bare / "store", holdout="run", recipe=Recipe())
+    with pytest.raises(DatasetError, match="they are of whole runs: drive once more, or build it with --holdout block"):
+        train(tmp_path / "dataset", tmp_path / "model", config=FitConfig(model="table"))
+
+
 @pytest.mark.parametrize("kind", ["table", "physics"])
 def test_heights_alone_are_enough(bare, tmp_path, kind):
     train(bare / "dataset", tmp_path / "model", config=FitConfig(model=kind))
