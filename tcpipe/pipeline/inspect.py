@@ -13,7 +13,7 @@ from tcpipe.errors import StoreError, TcpipeError, UsageError
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.logs.joined import opened
-from tcpipe.formats.logs.log_file import logs_below
+from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below
 from tcpipe.formats.logs.table_folders import table_files, table_folders
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.published import has_card, here_by_range
@@ -124,9 +124,6 @@ def inspect(
     """
     ask = partial(_one, recipe=recipe, robot=robot or recipe.robot, full=full, message_definitions=message_definitions)
     if is_url(path):
-        with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
-            if stored := _in_store(str(path)):
-                return stored
         return _at_url(str(path).rstrip("/"), ask)
     path = Path(path)
     if not path.exists():
@@ -143,11 +140,15 @@ def inspect(
     return _logs_or_tables(path, recipe, ask)
 
 
-def _at_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> InspectedDataset | InspectedLog | InspectedLogs:
-    if has_card(url):
-        from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
+def _at_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspected:
+    if not belongs_to_a_log(url):  # of a log nothing else need be readable
+        with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
+            if stored := _in_store(url):
+                return stored
+        if has_card(url):
+            from tcpipe.formats.dataset_files import is_shard  # noqa: PLC0415  as above
 
-        return _dataset(here_by_range(url, by_range=is_shard)[0], url)
+            return _dataset(here_by_range(url, by_range=is_shard)[0], url)
     with scratch_directory() as directory:
         urls = list(remote_logs(url, directory / "logs").values())
     return _logs_at(urls, url, ask)

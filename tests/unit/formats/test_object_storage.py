@@ -94,6 +94,12 @@ def test_a_store_that_wants_credentials_is_told_in_one_line(bucket):
     assert problem.startswith(f"s3://{FORBIDDEN}/run.mcap: it cannot be read (the store wants credentials; set AWS_")
 
 
+def test_a_log_is_inspected_where_nothing_beside_it_can_be_read(bucket):
+    with pytest.raises(LogError, match=f"^s3://{FORBIDDEN}/run.mcap: it cannot be read"):
+        inspect(f"s3://{FORBIDDEN}/run.mcap", recipe=Recipe())
+    assert inspect("s3://drives/field/my run.mcap", recipe=Recipe()).path == "s3://drives/field/my run.mcap"
+
+
 def test_a_copy_that_does_not_fit_is_told_in_one_line(bucket):
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (500, before[1]))
