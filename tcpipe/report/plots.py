@@ -216,8 +216,9 @@ def figures(plots: Sequence[Plot]) -> tuple[Json, list[str]]:
         return None, []
     whole, ids = Document(), dict[str, str]()
     ordered = sorted(plots, key=lambda plot: plot.waits)
-    for plot in ordered:
-        whole.add_root(plot.figure)
+    with whole.models.freeze():  # else every root that is added looks through all others again
+        for plot in ordered:
+            whole.add_root(plot.figure)
     told = cast("dict[str, Json]", _told(cast("Json", whole.to_json(deferred=False)), ids))
     roots, soon = cast("list[Json]", told["roots"]), sum(not plot.waits for plot in plots)
     return {"first": {**told, "roots": roots[:soon]}, "later": roots[soon:]}, [ids[plot.figure.id] for plot in plots]
