@@ -84,7 +84,8 @@ def latest_calls(store: Store) -> list[Call]:
     here = store.place.files("records/calls")
     names = sorted((name.removesuffix(".json") for name in here if name.endswith(".json")), reverse=True)
     found = (store.recall(f"calls/{name}", Call) for name in names[:_LATEST])
-    return [call for call in found if call is not None]
+    # Names tell seconds alone.
+    return sorted((call for call in found if call is not None), key=lambda call: call.begin, reverse=True)
 
 
 def estimate(calls: Sequence[Call], command: str, amount: int, *, jobs: int) -> Estimate:

@@ -165,7 +165,11 @@ def test_what_is_no_log_is_said_in_plain_lines(kind: str, code: int, tmp_path: P
         (["ingest", "LOG", "--tag", "=wet"], "wanted KEY=VALUE", 2),
         (["ingest", "LOG", "--robot", "nosuch"], "robot 'nosuch' is not known", 2),
         (["ingest", "LOG", "--recipe", "none.toml"], "there is no such file", 2),
-        (["ingest", "LOG", "--store", "https://x.org/store"], "wanted a directory, s3://, gs:// or az://", 2),
+        (
+            ["ingest", "LOG", "--store", "https://x.org/store"],
+            "wanted a directory, s3://bucket/name, gs:// or az://",
+            2,
+        ),
         (["ingest", "LOG", "--store", "LOG"], "is a file, wanted a directory", 2),
         (["ingest", "LOG", "--store", "LOG/below"], "is a file, wanted a directory", 2),
         (["build-dataset", "--store", "nosuch"], "there is no store here", 2),
