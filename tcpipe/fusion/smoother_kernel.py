@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.compiled import kernel
-from tcpipe.fusion.state_kernel import MOVED, NX, Matrix, N, Vector, displaced, saved, workspace
+from tcpipe.fusion.state_kernel import MOVED, NX, Matrix, N, Vector, copied, displaced, saved, workspace
 
 
 @kernel
@@ -159,7 +159,7 @@ def smooth_block(
                     Ps[i, j] = s
                     Ps[j, i] = s
             saved(shifted, Ps, out)
-            links[1][0, output[e] % links[1].shape[1]] = chain
+            copied(chain, links[1][0, output[e] % links[1].shape[1]])
             for i in range(n):
                 for j in range(n):
                     chain[i, j] = 1.0 if i == j else 0.0
@@ -183,7 +183,7 @@ def smooth_block(
                     Ps[i, j] = T[j, i]
             _transposed_times(F, scale, Ps, information)
             _transposed_times(F, scale, chain, T)
-            chain[:, :] = T
+            copied(T, chain)
         kept = store_y[row, 24]
         for i in range(N, n if kept != 1.0 else N):
             adjoint[i] *= kept

@@ -165,12 +165,12 @@ def _first_root(coefficients, begin):  # type: ignore[no-untyped-def]  # noqa: A
     """First u in [begin, 1] at which the Bernstein polynomial rises through zero, or -1; leftmost piece first, from a stack."""
     stack = np.empty((64, 7))
     low, high = np.empty(64), np.empty(64)
-    stack[0] = coefficients
+    _copied(coefficients, stack[0])
     low[0], high[0] = 0.0, 1.0
     top = 0
     if begin > 0.0:
         left, right = _split(coefficients, begin)
-        stack[0] = right
+        _copied(right, stack[0])
         low[0] = begin
     while top >= 0:
         piece, a, b = stack[top].copy(), low[top], high[top]
@@ -189,10 +189,18 @@ def _first_root(coefficients, begin):  # type: ignore[no-untyped-def]  # noqa: A
             continue  # touches the circle without leaving it
         left, right = _split(piece, 0.5)
         middle = 0.5 * (a + b)
-        stack[top + 1], low[top + 1], high[top + 1] = right, middle, b
-        stack[top + 2], low[top + 2], high[top + 2] = left, a, middle
+        _copied(right, stack[top + 1])
+        _copied(left, stack[top + 2])
+        low[top + 1], high[top + 1] = middle, b
+        low[top + 2], high[top + 2] = a, middle
         top += 2
     return -1.0
+
+
+@kernel
+def _copied(values, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+    for i in range(7):  # no slices, see `tcpipe.fusion.state_kernel.copied`
+        out[i] = values[i]
 
 
 @kernel

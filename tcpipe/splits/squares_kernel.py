@@ -26,15 +26,17 @@ def pair_overlaps(ours: Floats, theirs: Floats, i: NDArray[np.int64], j: NDArray
     polygon, clipped = np.empty((8, 2)), np.empty((8, 2))
     for pair in range(i.size):
         a, b = ours[i[pair]], theirs[j[pair]]
-        polygon[:4] = a
+        for k in range(4):  # not as slices, see `tcpipe.fusion.state_kernel.copied`
+            polygon[k, 0], polygon[k, 1] = a[k, 0], a[k, 1]
         corners = 4
         for edge in range(4):
             corners = _clip(polygon, corners, b[edge], b[(edge + 1) % 4], clipped)
             polygon, clipped = clipped, polygon
         area = 0.0
         for k in range(corners):
-            p, q = polygon[k] - polygon[0], polygon[(k + 1) % corners] - polygon[0]
-            area += p[0] * q[1] - p[1] * q[0]
+            px, py = polygon[k, 0] - polygon[0, 0], polygon[k, 1] - polygon[0, 1]
+            qx, qy = polygon[(k + 1) % corners, 0] - polygon[0, 0], polygon[(k + 1) % corners, 1] - polygon[0, 1]
+            area += px * qy - py * qx
         out[pair] = area / 2.0
 
 
@@ -80,9 +82,10 @@ def _clip(polygon: Floats, corners: int, p: Floats, q: Floats, out: Floats) -> i
         a, b = polygon[k], polygon[(k + 1) % corners]
         left, right = _side(p, q, a[0], a[1]), _side(p, q, b[0], b[1])
         if left >= 0.0:
-            out[kept] = a
+            out[kept, 0], out[kept, 1] = a[0], a[1]
             kept += 1
         if left * right < 0.0:
-            out[kept] = a + (b - a) * (left / (left - right))
+            for c in range(2):
+                out[kept, c] = a[c] + (b[c] - a[c]) * (left / (left - right))
             kept += 1
     return kept
