@@ -318,8 +318,12 @@ def _workers(client: Client, address: str) -> int:
         if isinstance(version, ImportError):
             raise UsageError(f"{worker}: a worker lacks tcpipe ({version}); install there what is installed here")
         if version != __version__ and isinstance(version, str):  # else it is gone again
-            raise UsageError(f"{worker}: a worker has tcpipe {version}, wanted {__version__} as here; install that")
+            raise _another(worker, version, wanted=__version__)
     return len(threads)
+
+
+def _another(worker: str, version: str, *, wanted: str) -> UsageError:
+    return UsageError(f"{worker}: a worker has tcpipe {version}, wanted {wanted} as here; install that")
 
 
 @dataclass(frozen=True, slots=True)
@@ -335,9 +339,7 @@ def _on_worker(function: Callable[[T], R], task: T, version: str, channel: _Chan
     from distributed import get_worker  # noqa: PLC0415  most calls stay on this machine
 
     if version != __version__:
-        raise UsageError(
-            f"{os.uname().nodename}: a worker has tcpipe {__version__}, wanted {version} as here; install that"
-        )
+        raise _another(os.uname().nodename, __version__, wanted=version)
     saying, began_s = _Saying(partial(get_worker().log_event, channel.topic)), time.process_time()
     logger.addHandler(saying)
     logger.setLevel(channel.level)

@@ -22,11 +22,10 @@ from tcpipe.report.dataset_verdict import verdict
 from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
-from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
+from tcpipe.report.plots import Plot, label_histograms, new_plot, waterfall
 from tcpipe.report.quality import QUALITY_WORDS, quality_sections
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.columns import floats
 
 _PAGE = "report.html"
 
@@ -149,13 +148,11 @@ def _store_pages(beside: Path, hrefs: Mapping[str, str]) -> list[Link]:
 
 
 def _label_sections(samples: pa.Table) -> list[Section]:
-    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
-    drawn = [
-        histogram(name, values, label=label, of_what="samples")
-        for label, name in labels.items()
-        if np.isfinite(values := floats(samples, name)).any()
-    ]
-    return [Section("Labels", "One value a sample.", plots=drawn)] if samples.num_rows else []
+    return (
+        [Section("Labels", "One value a sample.", plots=label_histograms(samples, "samples"))]
+        if samples.num_rows
+        else []
+    )
 
 
 def _quality_counts(samples: pa.Table) -> dict[str, int]:

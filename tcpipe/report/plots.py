@@ -18,6 +18,7 @@ from typing import Any, cast
 
 import bokeh
 import numpy as np
+import pyarrow as pa
 from bokeh.document import Document
 from bokeh.models import DataRange1d, FactorRange, HoverTool, Range1d
 from bokeh.models.annotations.geometry import Span
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import plain_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report.colours import CURSOR, DROPPED, KEPT, SPLIT_COLOURS
+from tcpipe.tables.columns import floats
 
 _TEX = re.compile(r"\$\$|\\\(|\\\[")
 _UNREAD = "\u2060"
@@ -199,6 +201,16 @@ def histogram(name: str, values: NDArray[np.float64], *, label: str, of_what: st
         plot.figure.add_tools(HoverTool(tooltips=[(label, "@left to @right"), (of_what, "@top")]))
     plot.figure.y_range.start = 0
     return plot
+
+
+def label_histograms(rows: pa.Table, of_what: str, *, prefix: str = "") -> list[Plot]:
+    """Return how often values of each label occur that any of the rows has."""
+    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
+    return [
+        histogram(f"{prefix}{name}", values, label=label, of_what=of_what)
+        for label, name in labels.items()
+        if np.isfinite(values := floats(rows, name)).any()
+    ]
 
 
 def script() -> str:

@@ -20,7 +20,7 @@ from tcpipe.report.error_budget import budget_sections
 from tcpipe.report.packed import Column, packed, shown_to
 from tcpipe.report.page import Link, Number, Section, render_page
 from tcpipe.report.physics import physics_sections
-from tcpipe.report.plots import Plot, histogram, new_plot, waterfall
+from tcpipe.report.plots import Plot, histogram, label_histograms, new_plot, waterfall
 from tcpipe.report.quality import QUALITY_WORDS, quality_sections
 from tcpipe.report.run_map import Pictures, RunMap, run_map
 from tcpipe.report.run_plots import SPEED_ROLES, Line, lines_of, reasons_told, time_plots
@@ -212,13 +212,7 @@ def _segments(segments: pa.Table, timeline: Timeline, ground: RunMap) -> Json:
 def _label_sections(segments: pa.Table, physics: PhysicsFacts | None, robot: str) -> Iterator[Section]:
     if not segments.num_rows:
         return
-    labels = {"w [W]": "power_watt", "v [m/s]": "velocity_mps", "T [s]": "duration_s", "E [J]": "energy_joule"}
-    drawn = [
-        histogram(f"of {name}", values, label=label, of_what="segments")
-        for label, name in labels.items()
-        if np.isfinite(values := floats(segments, name)).any()
-    ]
-    yield Section("Labels", "One value a segment.", plots=drawn)
+    yield Section("Labels", "One value a segment.", plots=label_histograms(segments, "segments", prefix="of "))
     if physics is None or not physics.fitted:
         return
     yield from physics_sections({} if physics.fit is None else {robot: physics.fit})
