@@ -6,7 +6,7 @@ BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 .DEFAULT_GOAL := help
 
-.PHONY: help demo test test-object-storage test-dagster test-pages test-mutants check check-and-train kernels lock schemas docs release clean
+.PHONY: help demo test test-benchmarks test-object-storage test-dagster test-pages test-mutants check check-and-train kernels lock schemas docs release clean
 
 help:
 	@sed -n 's/^#   //p' Makefile
@@ -53,6 +53,10 @@ test: .venv/installed-dev
 
 check-and-train: check
 	$(if $(TORCH),$(MAKE) .venv/installed-train)
+
+# Each program of benchmarks/ once, at its smallest size; some minutes on two cores.
+test-benchmarks: .venv/installed-dev
+	$(BIN)/pytest benchmarks/test_benchmarks.py $(PYTEST)
 
 # Stores in a real object store: OBJECT_STORAGE is a program that starts and stops one below a directory, which `start` fills with `env`.
 OBJECT_STORAGE ?= ../shared/tools/object-storage

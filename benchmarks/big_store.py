@@ -31,14 +31,19 @@ from tcpipe.tables.levels import (
 from tcpipe.tables.wkb import line_column
 
 RUN_ROWS = 3_300
+SMALL = 500
+"""Up to so many samples lie on a small site, whose map takes seconds."""
 MARGIN_M = 12.0
 
 
 def store_of(directory: Path, samples: int) -> Store:
-    """Return a store with so many segments, about all of which lie on the map; the map is made once in a directory (2 minutes)."""
-    maps = directory / "maps"
+    """Return a store with so many segments, about all of which lie on the map.
+
+    The map is made once in a directory: in 2 minutes, up to `SMALL` in seconds.
+    """
+    maps = directory / ("maps" if samples > SMALL else "small-maps")
     if not maps.exists():
-        spec = scenario("paper")
+        spec = scenario("paper" if samples > SMALL else "tiny")
         (directory / "rasters").mkdir(parents=True, exist_ok=True)
         add_map("site", store=maps, **write_rasters(directory / "rasters", spec.world, spec.rasters))
     store = Store(directory / f"store-{samples}")

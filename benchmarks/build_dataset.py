@@ -16,12 +16,11 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from big_store import store_of
+from big_store import SMALL, store_of
 from sample_patches import gather
 
-from tcpipe.formats.dataset_files import CHUNK_ROWS
+from tcpipe.formats.dataset_files import CHUNK_ROWS, open_patches, read_card
 from tcpipe.formats.maps.map_files import MapFile, open_map
-from tcpipe.formats.shards import open_sharded
 from tcpipe.pipeline.dataset import build, content
 from tcpipe.recipe import Recipe
 
@@ -82,8 +81,9 @@ def best(function, repeats=3):
 def decode_floor(path, decoded):
     """Seconds to decode every tile once that samples lie on, bytes at hand."""
     seconds = 0.0
+    levels = open_map(path)._levels[1]  # noqa: SLF001  what is measured lies below the map
     for layer in LAYERS:
-        array = open_sharded(path / layer)
+        array = levels[layer]
         encoded = [found for name, *index in decoded if name == layer and (found := _encoded(array, index))]
         out = np.empty(array.chunk_shape, array.dtype)
         seconds += best(lambda e=encoded, array=array, out=out: [array.codec.decode(tile, out=out) for tile in e])
@@ -119,8 +119,9 @@ def gather_floor(path, count):
 def encode_floor(out, samples):
     """Seconds to encode every chunk of the patches and to write the bytes."""
     seconds = 0.0
+    arrays = open_patches(out, read_card(out)).arrays
     for layer in LAYERS:
-        array = open_sharded(out / "patches.zarr" / layer)
+        array = arrays[layer]
         chunks = [array.chunk((number, 0, 0)) for number in range(min(FEW, samples // CHUNK_ROWS))]
         encoded = []
         seconds += best(
@@ -156,9 +157,6 @@ def floors_of(store, out, result, decoded):
 
 def measure(directory, samples):
     store, out = store_of(directory, samples), directory / f"built-{samples}"
-    if samples < 5_000:
-        built(store, out)
-        return
     rounds = []
     for _ in range(REPEATS if samples < LARGE else 1):
         result, *seconds = built(store, out)
@@ -186,7 +184,8 @@ def main():
     counted()
     threading.Thread(target=watch, daemon=True).start()
     directory = Path(sys.argv[1])
-    for samples in (1_000, *map(int, sys.argv[2:] or ("10886", "1000000"))):
+    built(store_of(directory, SMALL), directory / "first")
+    for samples in map(int, sys.argv[2:] or ("10886", "1000000")):
         measure(directory, samples)
 
 

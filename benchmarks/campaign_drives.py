@@ -7,7 +7,7 @@ the stage `read` the tables that a log on disk would give, and the stages from t
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any
@@ -150,6 +150,10 @@ class MemoryLog:
     def tables(self, topics: Sequence[str]) -> dict[str, pa.Table]:
         """Return the messages of topics; what a stream does not name is zero, as in a log."""
         return {m.topic: _table(m) for m in self.messages if m.topic in topics}
+
+    def batches(self, topics: Sequence[str]) -> Iterator[Mapping[str, pa.Table]]:
+        """Yield the same in one piece."""
+        yield self.tables(topics)
 
 
 def _table(m: MessageStream) -> pa.Table:

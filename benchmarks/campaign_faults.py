@@ -295,8 +295,8 @@ def _gnss(**changes: Any) -> Callable[[Sensors], Sensors]:
     return lambda sensors: sensors if sensors.gnss is None else replace(sensors, gnss=replace(sensors.gnss, **changes))
 
 
-def _power(rate_hz: float) -> Callable[[Sensors], Sensors]:
-    return lambda sensors: replace(sensors, power=Power(rate_hz=rate_hz))
+def _power(rate_hz: float, reading_hz: float | None = None) -> Callable[[Sensors], Sensors]:
+    return lambda sensors: replace(sensors, power=Power(rate_hz=rate_hz, reading_hz=reading_hz))
 
 
 _DEG = float(np.radians(1.0))
@@ -312,6 +312,7 @@ FAULTS: dict[str, Fault] = {
             Fault(f"power at {rate_hz:g} Hz", calibrated=True, sensors=_power(rate_hz))
             for rate_hz in (1.0, 5.0, 20.0)
         ),
+        Fault("power read at 1 Hz in messages at 20 Hz", calibrated=True, sensors=_power(20.0, 1.0)),
         Fault("10 s without GNSS", ("gnss",), (100.0, 110.0), readings=_of("gnss", _holes)),
         # Fixes that lie
         Fault("wrong fix", ("gnss",), MINUTE_S, "gnss", readings=_of("gnss", _wrong_fix(0.0))),

@@ -133,7 +133,7 @@ CASES = (
     Case("add-map", command(*_MAP), wants=_WORLD),
     Case("add-map --force", command(*_MAP, "--force"), (command("add-map", "site", *LAYERS[:2], "-q"),), _WORLD),
     Case("build-dataset", command(*_BUILD), wants=_WORLD),
-    Case("build-dataset over another", command(*_BUILD), (command(*_BUILD, "--seed", "5"),), _WORLD),
+    Case("build-dataset over another", command(*_BUILD, "--force"), (command(*_BUILD, "--seed", "5"),), _WORLD),
     Case("build-dataset --format parquet", command(*_BUILD, "--format", "parquet"), wants=_WORLD),
     Case("build-dataset --jobs 2", command(*_BUILD, "--jobs", "2"), wants=_WORLD),
     Case("train", command("train", DATASET, "--epochs", "2", "--width", "16", "-q"), wants=_MODEL),

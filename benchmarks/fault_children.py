@@ -38,8 +38,17 @@ WHOLE = (
 )  # fmt: skip
 """Directories that appear and change as one."""
 
-UNFINISHED = (".tmp-*", "*/.tmp-*", ".*.partial", "*.checkpoint", "tmp/tcpipe-*", "*/writing.json")
-"""What a killed call may leave for the next one: temporaries, and where a cost map and a training stand."""
+UNFINISHED = (
+    ".tmp-*",
+    "*/.tmp-*",
+    ".*.partial",
+    "*.checkpoint",
+    "tmp/tcpipe-*",
+    "*/writing.json",
+    "*/records/begun",
+    "*/records/begun/*",
+)
+"""What a killed call may leave for the next one: temporaries, where a cost map and a training stand, and that a call had begun."""
 
 PASSING = ("records/calls", "records/datasets", "index")
 """Directories of a store that hold times, inodes, and what was done by others: never twice the same."""

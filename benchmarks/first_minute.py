@@ -1,6 +1,6 @@
 """What `tcpipe preflight` makes of a drive's first minute against what the whole drive gives: the table of docs/how-to/preflight.md.
 
-python benchmarks/first_minute.py DIRECTORY
+python benchmarks/first_minute.py DIRECTORY [SCENARIO …]
 """
 
 import sys
@@ -46,7 +46,7 @@ def main() -> None:
     directory = Path(sys.argv[1])
     print("| simulated drive | first minute promises | the whole log gives | off by | E ± 1 σ, minute and whole |")
     print("|---|---|---|---|---|")
-    for name, seed in DRIVES:
+    for name, seed in [(name, 0) for name in sys.argv[2:]] or DRIVES:
         place = directory / f"{name}-{seed}"
         log = next(log for log in simulate(place, scenario=name, seed=seed).logs if log.suffix == ".mcap")
         (minute, minute_std), (whole, whole_std) = promise_of(first_minute(log, place / "minute.mcap")), promise_of(log)

@@ -186,9 +186,9 @@ class ErrorState:
         return 1e6 * (time.process_time() - begin) / self.events
 
 
-def print_paired(seconds: float = 600.0) -> None:
+def print_paired(seconds: float) -> None:
     """Interleave every estimator and print medians and paired ratios."""
-    short, drive = 4.0, ErrorState(seconds)
+    short, drive = min(4.0, seconds), ErrorState(seconds)
     ukf15_us("compiled", 1.0)
     ErrorState(5.0).us(smooth=True)
     found: dict[str, list[float]] = {}
@@ -247,12 +247,13 @@ def fuse_hours(hours: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--hours", type=float, nargs="+", default=[1.0, 6.0], help="lengths of the long logs")
+    parser.add_argument("--paired-seconds", type=float, default=600.0, help="length of the log of the paired runs")
     parser.add_argument("--only-long", action="store_true")
     given = parser.parse_args()
     if given.only_long:
         fuse_hours(given.hours[0])
         return
-    print_paired()
+    print_paired(given.paired_seconds)
     for hours in given.hours:
         subprocess.run([sys.executable, __file__, "--only-long", "--hours", str(hours)], check=True)
 

@@ -267,6 +267,62 @@ _EXTREMES = (
 )  # fmt: skip
 
 
+def _dataset(spoil: Callable[[Path], None], *commands: Arguments) -> Callable[[Path], list[Arguments]]:
+    """Return the maker of a small dataset that is spoilt and sealed again, so that all its checksums agree."""
+
+    def make(place: Path) -> list[Arguments]:
+        sys.path[:0] = [str(Path(__file__).parents[1] / "tests")]
+        from synthetic_store import small_store
+
+        from tcpipe.formats.seals import file_checksums, write_sealed
+        from tcpipe.pipeline.dataset.build import build_dataset
+
+        build_dataset(place / "d", store=small_store(place).root)
+        card = json.loads((place / "d" / "dataset.json").read_text())
+        spoil(place / "d")
+        known = file_checksums(place / "d")
+        card["checksums"] = {
+            name: {"size_bytes": known[name].size_bytes, "sha256": known[name].sha256} for name in card["checksums"]
+        }
+        write_sealed(place / "d" / "dataset.json", card)
+        return [("verify", "d"), *commands]
+
+    return make
+
+
+def _one_text_in_each_row(place: Path) -> None:
+    import numpy as np
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.read_table(place / "samples.parquet")
+    indices = pa.array(np.zeros(table.num_rows, np.int32))
+    texts = pa.DictionaryArray.from_arrays(indices, pa.array(["x" * 12_000_000]))
+    table = table.set_column(table.column_names.index("robot"), "robot", texts)
+    pq.write_table(table, place / "samples.parquet", compression="zstd", store_schema=False)
+
+
+def _many_rows(place: Path) -> None:
+    import numpy as np
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    names = pq.read_schema(place / "samples.parquet").names
+    pq.write_table(
+        pa.table({name: np.zeros(5_000_000) for name in names[:20]}), place / "samples.parquet", compression="zstd"
+    )
+
+
+def _chunk_grid(value: object) -> Callable[[Path], None]:
+    def spoil(place: Path) -> None:
+        path = place / "patches.zarr" / "height" / "zarr.json"
+        described = json.loads(path.read_text())
+        described["chunk_grid"]["configuration"]["chunk_shape"][0] = value
+        path.write_text(json.dumps(described))
+
+    return spoil
+
+
 def _named(name: bytes) -> Callable[[Path], list[Arguments]]:
     def make(place: Path) -> list[Arguments]:
         path = os.fsencode(place) + b"/" + name
@@ -342,6 +398,12 @@ def hostile_inputs() -> Iterator[Hostile]:
         ),
     )
     yield Hostile("raster: XML nested 100,000 deep", _tif("<VRTDataset>" * 100_000))
+    yield Hostile("raster: 268 bytes of comments", _tif("<!---->" * 38 + "<?"))
+    yield Hostile("definition: a megabyte of =", _definition("uint8 a\n" + "=" * 1_000_000))
+    yield Hostile("dataset: 5 GB of one text in 1 MB", _dataset(_one_text_in_each_row))
+    yield Hostile("dataset: 800 MB of zeros for 448 rows", _dataset(_many_rows))
+    for value in (0, "wide", 1e30, 2.56e11):
+        yield Hostile(f"dataset: chunk_grid of {value}", _dataset(_chunk_grid(value), ("diff", "d", "d")), (0, 1, 2, 3))
     yield Hostile("classes: ANSI in a name", _classes("value,id,name,traversable\n4,4,gr\x1b[31mass,true\n"))
     yield Hostile(
         "classes: a million rows",

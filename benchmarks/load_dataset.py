@@ -106,7 +106,7 @@ def decode_by_zarr(path, rows):
     """Decode all layers with zarr itself, ``rows`` at a call: a chunk, or a whole shard, which it decodes in one batch."""
     group = zarr.open_group(str(path), mode="r")
     for name, array in group.arrays():
-        for first in range(0, len(array) if name != "sample_id" else 0, rows):
+        for first in range(0, array.shape[0] if name != "sample_id" else 0, rows):
             array[first : first + rows]
 
 

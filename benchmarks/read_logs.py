@@ -357,7 +357,7 @@ def other_rows(directory: Path, minutes: float, rerun: Rerun) -> None:
 def by_sqlite_alone(path: Path) -> None:
     """Read a .db3 without our own reading of its pages, as one is read that is cut: what that reading is worth."""
     by_page = sqlite_file._message_table  # noqa: SLF001
-    sqlite_file._message_table = lambda *_: None  # noqa: SLF001
+    sqlite_file._message_table = lambda *_, **__: None  # noqa: SLF001
     seconds = best({"sqlite": lambda: with_tcpipe(path, NAVIGATION), "rosbags": lambda: with_rosbags(path, NAVIGATION)})
     sqlite_file._message_table = by_page  # noqa: SLF001
     row("  by SQLite alone: times rosbags' speed", None, seconds["rosbags"] / seconds["sqlite"])

@@ -1,6 +1,7 @@
 """What hours of driving cost as there are more of them, and what the measured figures say of 100,000 hours and 10⁹ samples.
 
     python benchmarks/scale.py hours DIRECTORY [HOURS] [JOBS]    write that many hours of logs, and ingest them by one call
+    python benchmarks/scale.py memory LOG [LOG ...]              the most memory that ingesting each log takes, and its CPU
     python benchmarks/scale.py paper                             the second table of docs/explanation/scale.md, from the first
 
 One simulated drive of twelve minutes is repeated, each time later, every measurement with noise of its own. CPU is that of the process
@@ -13,7 +14,9 @@ import os
 import re
 import resource
 import shutil
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -119,6 +122,17 @@ def ingest_hours(directory: Path, hours: int = 20, jobs: int = 2) -> None:
     print(f"an hour has {sum(result.segments for result in results) / hours:.0f} segments")
 
 
+def print_memory(logs: Sequence[str]) -> None:
+    """Ingest each log by a command of its own, and print the most memory that it took and its CPU seconds."""
+    for log in logs:
+        with tempfile.TemporaryDirectory() as store:
+            command = [sys.executable, "-m", "tcpipe", "ingest", log, "--store", f"{store}/store", "--quiet"]
+            child = subprocess.Popen(command)
+            _, status, used = os.wait4(child.pid, 0)
+        assert not status, f"{log}: the command failed"
+        print(f"{log}: {used.ru_maxrss / 1024:.0f} MiB at most, {used.ru_utime + used.ru_stime:.1f} s CPU")
+
+
 def cpu_s() -> float:
     """Return CPU seconds of this process and of its children that live or were waited for."""
     ticks = 0
@@ -188,6 +202,8 @@ def write_page(page: Path) -> None:
 def main(what: str, arguments: Sequence[str]) -> None:
     if what == "hours":
         ingest_hours(Path(arguments[0]), *map(int, arguments[1:]))
+    elif what == "memory":
+        print_memory(arguments)
     else:
         write_page(Path(__file__).parents[1] / "docs" / "explanation" / "scale.md")
 

@@ -1,7 +1,8 @@
 """tcpipe: from raw robot logs to datasets that a terrain-cost model can be trained on.
 
-The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `open_dataset`.
-They are loaded when first asked for, so that ``import tcpipe`` costs nothing.
+The commands are functions here too: `read_log`, `ingest`, `add_map`, `build_dataset`, `open_dataset`, `train`, `evaluate`,
+`predict_path`, `plan_path`. They are loaded when first asked for, so that ``import tcpipe`` costs nothing; ``__init__.pyi`` tells
+editors and type checkers where each is.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-__version__ = "0.8.0"
+__version__ = "0.9.0"
 
 _HOMES = {
     "read_log": ("tcpipe.formats.logs.log_file", "open_log"),
@@ -17,14 +18,37 @@ _HOMES = {
     "add_map": ("tcpipe.pipeline.maps", "add_map"),
     "build_dataset": ("tcpipe.pipeline.dataset.build", "build_dataset"),
     "open_dataset": ("tcpipe.dataset", "open_dataset"),
+    "train": ("tcpipe.api", "train"),
+    "evaluate": ("tcpipe.api", "evaluate"),
+    "predict_path": ("tcpipe.api", "predict_path"),
+    "plan_path": ("tcpipe.api", "plan_path"),
 }
 
-__all__ = ["__version__", "add_map", "build_dataset", "ingest", "open_dataset", "read_log"]
+__all__ = [
+    "__version__",
+    "add_map",
+    "build_dataset",
+    "errors",
+    "evaluate",
+    "ingest",
+    "open_dataset",
+    "plan_path",
+    "predict_path",
+    "read_log",
+    "train",
+]
 
 
 def __getattr__(name: str) -> Any:
     """Load a public function from its home on first use."""
+    if name == "errors":
+        return import_module("tcpipe.errors")
     if name not in _HOMES:
         raise AttributeError(f"module 'tcpipe' has no attribute {name!r}")
     module, attribute = _HOMES[name]
     return getattr(import_module(module), attribute)
+
+
+def __dir__() -> list[str]:
+    """List the public names; what is loaded besides is private."""
+    return __all__

@@ -22,11 +22,44 @@ The command line prints them; a traceback is a bug.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
+
+_URL = re.compile(r"(?<![a-z0-9+.-])([a-z][a-z0-9+.-]+:/{1,2})(\S+)", re.IGNORECASE)
+_CLOSING = ")]}'\",;:."
+"""What may follow a URL in a sentence."""
+
+
+def hide_secrets(text: str) -> str:
+    """Return ``text`` without the user info, query and fragment of each URL in it: what any URL is shown and stored as."""
+
+    def hide(url: re.Match[str]) -> str:
+        public, query = split_secrets(url[1], url[2])
+        return url[1] + public + query[len(query.rstrip(_CLOSING)) :]
+
+    return _URL.sub(hide, text) if ":/" in text else text
+
+
+def split_secrets(scheme: str, rest: str) -> tuple[str, str]:
+    """Return what may be shown of a URL after its scheme (``http://``), and its query or fragment; no user info is in either.
+
+    An unescaped password may hold any character, ``/`` too.
+    """
+    host = re.split(r"[/?#]", rest, maxsplit=1)[0]
+    is_http = scheme.lower().startswith("http")
+    if "@" in host:
+        rest = rest[host.rindex("@") + 1 :]
+    elif "@" in rest and ":" in host and not host.startswith("["):
+        is_port = is_http and re.fullmatch(r"\d{0,5}\W*", host.partition(":")[2])
+        rest = rest if is_port else rest.rpartition("@")[2]
+    public = re.split(r"[?#]" if is_http else r"\?", rest, maxsplit=1)[0]
+    query = rest[len(public) :]
+    return (public, query) if is_http or "=" in query else (rest, "")  # names of objects may hold question marks
 
 
 def plain_line(text: str) -> str:
-    """Return ``text`` as one line that every terminal can show: control characters and bytes that are no text as escapes."""
+    """Return ``text`` as one line that every terminal can show, without secrets: what cannot be printed as escapes."""
+    text = hide_secrets(text)
     if text.isprintable():
         return text
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)

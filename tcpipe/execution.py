@@ -202,7 +202,7 @@ _ANSWER_S = 10
 """So long a scheduler has to answer."""
 _ALONE_S = 300
 """So long it may be without a worker."""
-_ADDRESS = re.compile(r"(tcp|tls)://[^/]+:\d+")
+_ADDRESS = re.compile(r"(tcp|tls)://[^/@]+:\d+")
 _AHEAD = 2
 """Tasks that a worker is handed at once: the next waits beside it."""
 

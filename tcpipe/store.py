@@ -4,7 +4,7 @@
 
     <root>/
       store.json, report.html                       that this is a store, and of which layout; the page of all runs
-      records/<kind>/<fact>.json                    what is remembered: logs seen, failed, damaged, accepted, superseded, names of runs
+      records/<kind>/<fact>.json                    what is remembered: logs seen, known problems, superseded runs, names, calls
       maps/<name>-<n>.json                          a map: its files and their checksums
       maps/<name>/<digest>/                         <name>.zarr, and a picture of it
       runs/<run_id>/run-<n>.json                    source, robot, topics, damage; files and checksums of the streams
@@ -25,6 +25,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TypeVar
 
@@ -64,7 +65,7 @@ from tcpipe.formats.record_files import (
     read_records,
     record_name,
 )
-from tcpipe.formats.run_documents import Manifest, ManifestHead, MapDocument, RunJson, StreamInfo, Tags
+from tcpipe.formats.run_documents import Manifest, ManifestHead, MapDocument, RunJson, StreamInfo, Tags, tell_the_same
 from tcpipe.formats.seals import CHECKSUMS, Checksum, file_checksums, sealed
 from tcpipe.formats.store_mark import MARK, is_outdated, layout_of, mark_store
 from tcpipe.formats.stored_runs import (
@@ -74,7 +75,9 @@ from tcpipe.formats.stored_runs import (
     below,
     local_file,
     put_tables,
+    refuse_earlier,
     told_of,
+    with_lost,
     with_span,
 )
 from tcpipe.tables.levels import (
@@ -186,7 +189,7 @@ class Store:
     def ingestions(self, run_id: str | None = None) -> Ingestions:
         """Return what there is of all runs, or of one, by one listing.
 
-        A manifest is read and proved, unless the index has what it says and its file is as it was then.
+        A manifest is read and proved, unless the index has what it says and its file is as it was then; of all, see `with_lost`.
         """
         superseded = self.superseded() if run_id is None else {}
         known = read_runs(self.index_place) if run_id is None else {}
@@ -212,7 +215,10 @@ class Store:
                 finished += [found] if by is None else []
         current = {run.run_id for run in finished}
         outdated = {name: head for name, head in others.items() if name not in current}
-        return Ingestions(tuple(finished), outdated, damaged, superseded, rows, stale=_differ(rows, known))
+        here = Ingestions(tuple(finished), outdated, damaged, superseded, rows)
+        if run_id is None:
+            here = with_lost(here, known, self.run_ids(), runs=self.runs_place, index=self.index_place)
+        return replace(here, stale=_differ({**rows, **here.lost}, known))
 
     def _listed(self, run_id: str | None) -> Iterator[Listed]:
         """Yield the files of each run, perhaps without its streams: one listing."""
@@ -229,6 +235,7 @@ class Store:
         """
         place, name = of.runs.below(f"{of.run_id}/{recipe_id}"), name_of("manifest", number)
         state = state_of(of.files[f"{recipe_id}/{name}"])
+        refuse_earlier(place, {"manifest": number}, "" if row is None else row.state)
         if row is None or row.state != state:
             where = place.where(name)
             document = read_sealed_at(place, name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
@@ -255,6 +262,7 @@ class Store:
         state = " ".join(state_of(of.files[name]) for name in last)
         if row.log is not None and row.log.state == state:
             return row
+        refuse_earlier(of.runs.below(of.run_id), of.numbers, "" if row.log is None else row.log.state)
         try:
             known = self.run_json(row.run_id, of.numbers)
         except StoreError:
@@ -268,9 +276,9 @@ class Store:
         return self.place.below("index")
 
     def keep_index(self, found: Ingestions) -> None:
-        """Write down what was found of all runs, where that is not what the index had."""
+        """Write down what was found of all runs, and what was lost, where that is not what the index had."""
         if found.stale:
-            write_runs(self.index_place, found.rows.values())
+            write_runs(self.index_place, {**found.rows, **found.lost}.values())
 
     def prove(self, runs: Sequence[RunDirectory]) -> dict[str, str]:
         """Compare segments and tracks with what the manifests have of them; return by run what is wrong.
@@ -407,9 +415,8 @@ class Store:
         """Write what is known of a run's log; where that is known already nothing is written."""
         place, last = self.runs_place.below(run_id), numbers(self.runs_place.files(run_id))
         known = self.known_run(run_id) if last.get("run") else None
-        if known is None or not _alike(known, values) or values.streams != known.streams:
-            settled = lambda found: _alike(found, values)  # noqa: E731
-            known = put_next(place, "run", values, after=last.get("run", 0), settled=settled)
+        if known is None or not tell_the_same(known, values) or values.streams != known.streams:
+            known = put_next(place, "run", values, after=last.get("run", 0), settled=partial(tell_the_same, values))
         if last.get("tags") or not values.tags.items() <= known.tags.items():
             self.tag_run(run_id, values.tags)
 
@@ -499,12 +506,6 @@ def _differ(rows: Mapping[tuple[str, str], object], known: Mapping[tuple[str, st
     return rows != known and {key: as_stored(row) for key, row in rows.items()} != known
 
 
-def _alike(one: RunJson, other: RunJson) -> bool:
-    """Tell whether two documents say the same of a log; what was computed may differ in the last bit on another processor, tags later."""
-    bare = RunJson(one.source).findings
-    return replace(one, streams={}, findings=bare, tags={}) == replace(other, streams={}, findings=bare, tags={})
-
-
 def add_by_hash(runs: dict[str, list[str]], run_id: str) -> None:
     """Add a new run to `Store.run_ids_by_hash`."""
     runs.setdefault(run_id.rpartition("-")[2][:_NAME_HEX], []).append(run_id)
@@ -518,6 +519,8 @@ def is_named_after(run_id: str, sha256: str) -> bool:
 
 def is_store(path: Path | str) -> bool:
     """Tell whether a place is a store; `UsageError` if it is one of an earlier layout."""
+    if is_url(path) and not str(path).startswith(_BUCKETS):
+        return False
     place = open_place(path)
     if place.read(MARK) is not None:  # not its size: only what is asked for with a body is refused with a reason
         return True
@@ -534,7 +537,7 @@ def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
 
     Raises
     ------
-    StoreError : it is a run's, but holds no finished ingestion of this data-model version.
+    StoreError : it is a run's, but holds no finished run of this data-model version.
     """
     inside = inside_store(path)
     if inside is None:
@@ -545,9 +548,7 @@ def run_at(path: Path | str) -> tuple[Store, list[RunDirectory]] | None:
     if damaged := [line for (_, recipe), line in found.damaged.items() if recipe_id in (None, recipe)]:
         raise StoreError(*damaged)
     if not runs:
-        raise StoreError(
-            f"{path}: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again"
-        )
+        raise StoreError(f"{path}: holds no finished run of data model {DATA_MODEL_VERSION}; ingest its log again")
     return store, runs
 
 

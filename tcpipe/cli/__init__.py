@@ -8,7 +8,6 @@ import platform
 import shlex
 import signal
 import sys
-import traceback
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn, TypeVar
 
@@ -28,7 +27,7 @@ from tcpipe.cli.ingest import ingest
 from tcpipe.cli.init import init
 from tcpipe.cli.inspect import inspect
 from tcpipe.cli.migrate import migrate
-from tcpipe.cli.output import debug_log, say_failure
+from tcpipe.cli.output import debug_log, print_traceback, say_failure
 from tcpipe.cli.overlay import overlay
 from tcpipe.cli.plan_path import plan_path
 from tcpipe.cli.predict_path import predict_path
@@ -42,7 +41,7 @@ from tcpipe.cli.simulate import simulate
 from tcpipe.cli.status import status
 from tcpipe.cli.train import train
 from tcpipe.cli.verify import verify
-from tcpipe.errors import TcpipeError, UsageError
+from tcpipe.errors import TcpipeError, UsageError, hide_secrets
 
 _EXTRAS = {"torch": "train", "lightgbm": "tables", "dask": "cluster", "distributed": "cluster", "dagster": "dagster"}
 """Which extra brings a package that only some commands need."""
@@ -63,7 +62,7 @@ def _begin_debugging(context: click.Context, _: click.Parameter, wanted: bool) -
         root.meta["debugging"] = True
         root.with_resource(debug_log())
         where = f"tcpipe {__version__}, Python {platform.python_version()}, {platform.platform()}"
-        logging.getLogger("tcpipe").debug("%s: %s", where, shlex.join(sys.argv[1:]))
+        logging.getLogger("tcpipe").debug("%s: %s", where, hide_secrets(shlex.join(sys.argv[1:])))
 
 
 def _debug_option(*, hidden: bool) -> Callable[[C], C]:
@@ -154,7 +153,7 @@ def _refuse_empty(arguments: list[str]) -> None:
 def _fail(problems: Sequence[str], code: int) -> NoReturn:
     """Say what went wrong, with ``--json`` as an object on stdout too, and exit."""
     if "--debug" in sys.argv:
-        traceback.print_exc()
+        print_traceback()
     try:
         say_failure(problems, code, as_json="--json" in sys.argv)
         sys.stdout.flush()

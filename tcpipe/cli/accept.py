@@ -8,11 +8,13 @@ from tcpipe.cli.options import complete_runs, json_option, store_option
 
 
 @click.command(short_help="Known trouble is no news")
-@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG...", shell_complete=complete_runs)
+@click.argument("names", nargs=-1, required=True, metavar="RUN|LOG|CALL...", shell_complete=complete_runs)
 @store_option
 @json_option
 def accept(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
-    """Accept the damage of runs and the failures of logs that have been looked at: ingest counts them no more as trouble.
+    """Accept the damage or emptiness of runs and the failures of logs that have been looked at: ingest counts them no more as trouble.
+
+    Accept a call that was killed by the name that status says, and a log that waits by its path.
 
     It holds for this content and this trouble: another one is news again.
     """

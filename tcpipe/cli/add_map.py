@@ -77,7 +77,7 @@ def add_map(
 ) -> None:
     """Put rasters that need not share grid, resolution or CRS on one common grid, and add them to the store as NAME.
 
-    A raster is a GeoTIFF, JPEG 2000, ERDAS Imagine or VRT. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
+    A raster is a GeoTIFF, JPEG 2000 or ERDAS Imagine file. One in many tiles is given as a pattern in quotes, --height 'dem/*.tif', or by
     repeating the option; where tiles overlap, the last lies on top.
     """
     from tcpipe.cli.output import progress, say_result

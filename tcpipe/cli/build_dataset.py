@@ -86,6 +86,11 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
     is_flag=True,
     help="For the public: moved to 0 N 0 E as a whole, and no log, run, topic, path, host or user is named.",
 )
+@click.option(
+    "--force",
+    is_flag=True,
+    help="Replace a dataset that was made with other options (region, map, tags, recipe …); in a bucket nothing is replaced.",
+)
 @dry_run_option
 @json_option
 @quiet_option
@@ -107,11 +112,15 @@ def build_dataset(
     keep_split: str | None,
     min_runs: int | None,
     redact: bool,
+    force: bool,
     dry_run: bool,
     as_json: bool,
     quiet: bool,
 ) -> int:
     """Sample a rotated patch for every segment, split by region, and write the dataset to OUT (default: dataset).
+
+    A dataset that is there is built again from the runs of today if its options are the same; with others it is refused
+    unless --force is given.
 
     Exit code 3: runs that belong in are left out or gone, or a split that was asked for is empty; each is a line that says what mends it.
     """
@@ -141,6 +150,7 @@ def build_dataset(
             covariates=covariates,
             min_runs=min_runs,
             redact=redact,
+            force=force,
             dry_run=dry_run,
         )
         for problem in result.problems:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import click
 
 from tcpipe.cli.options import (
@@ -14,6 +16,10 @@ from tcpipe.cli.options import (
     quiet_option,
     store_option,
 )
+
+if TYPE_CHECKING:
+    from tcpipe.learning.evaluation_files import EvaluationResult
+    from tcpipe.planning.drive_files import DrivesResult
 
 
 @click.command(short_help="Measure a model, beside the paper's tables")
@@ -59,44 +65,15 @@ def evaluate(
     With --drive: time and energy of whole drives, measured against predicted on the store's map, with intervals and figures, in
     drives.json and drives.html of OUT; DATASET, that MODEL was trained on, tells whether a drive was held back.
     """
-    if drives:
-        _on_drives(model, dataset, out, drives, map_name=map_name, store=store, as_json=as_json, quiet=quiet)
-        return
+    from tcpipe.api import evaluate as run
     from tcpipe.cli.output import print_json, progress, say_lines
-    from tcpipe.learning.evaluation_facts import EvaluateConfig
-    from tcpipe.learning.evaluation_files import run_evaluation
-
-    config = EvaluateConfig(draws=draws, baselines=baselines, retrain=retrain, seed=seed)
-    with progress("evaluate", quiet=quiet):
-        result = run_evaluation(model, dataset, out, config=config)
-    if as_json:
-        print_json(result.values)
-    else:
-        say_lines(result)
-
-
-def _on_drives(
-    model: str,
-    dataset: str,
-    out: str,
-    drives: tuple[str, ...],
-    *,
-    map_name: str | None,
-    store: str,
-    as_json: bool,
-    quiet: bool,
-) -> None:
-    from tcpipe.cli.output import print_json, progress, say_lines
-    from tcpipe.dataset import open_dataset
-    from tcpipe.learning.models import load_model
-    from tcpipe.learning.predictions import check_origin
-    from tcpipe.planning.drive_files import evaluate_drives
-    from tcpipe.planning.inputs import chosen_map
 
     with progress("evaluate", quiet=quiet):
-        asked, data = load_model(model), open_dataset(dataset)
-        check_origin(asked.card, data, model)
-        result = evaluate_drives(asked, data, chosen_map(store, map_name), drives, store=store, out=out)
+        result: EvaluationResult | DrivesResult = (
+            run(model, dataset, out, drives=drives, map_name=map_name, store=store)
+            if drives
+            else run(model, dataset, out, draws=draws, baselines=baselines, retrain=retrain, seed=seed)
+        )
     if as_json:
         print_json(result.values)
     else:

@@ -78,8 +78,8 @@ def ingest(
     one. What is in the store already (same content, same recipe) is left alone, and what failed for its content is not
     tried again. A line is printed as each log ends; of several logs, warnings follow by cause.
 
-    Exit code 3: some logs failed or are damaged, and that is news: it was not told before, and not accepted (tcpipe
-    accept).
+    Exit code 3: some logs failed, are damaged, or give no segment though the robot drove, and that is news: it was not
+    told before, and not accepted (tcpipe accept).
     """
     from dataclasses import replace
 
@@ -120,7 +120,10 @@ def ingest(
             shown.expect(sizes)
 
         def on_result(result: IngestResult) -> None:
-            shown.end(result.log, worked=result.status in ("done", "damaged") or not (result.known or result.transient))
+            shown.end(
+                result.log,
+                worked=result.status in ("done", "damaged", "empty") or not (result.known or result.transient),
+            )
             if as_json:
                 print_json_line(recast(result, LogLine))
             else:
@@ -167,20 +170,27 @@ def _of_one(result: IngestResult, *, several: bool) -> Iterator[str]:
         known = " (known, not tried again)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
-        known = " (damaged, known)" if result.damage and not result.is_news else ""
+        wrong = "damaged" if result.damage else "empty" if result.why_empty else ""
+        known = f" ({wrong}, known)" if wrong and not result.is_news else ""
         told = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
         told += f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if several and warnings else ""
         yield (
             f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
             f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{told}{aside or known}"
         )
+    if result.why_empty and (result.is_news or result.status != "unchanged"):
+        yield f"  {result.why_empty}"
+    if result.no_power and not several and result.status != "unchanged":
+        yield f"  {result.no_power.why}"
+        yield from (f"    {line}" for line in result.no_power.recipe.splitlines())
     if result.same_as:
         yield f"  {result.log} is the same recording as {result.same_as}: one run"
     if budget is not None and not several:
         yield f"  {in_words(budget)}"
     yield from (f"  {note}" for note in result.notes)
     yield from (f"  damage:  {line}" for line in result.damage if result.is_news or result.status == "damaged")
-    yield from (f"  warning: {line}" for line in warnings if not several)
+    said = result.no_power.why if result.no_power else ""
+    yield from (f"  warning: {line}" for line in warnings if not several and line not in said)
 
 
 def _print_warnings(summary: IngestSummary) -> None:
@@ -188,6 +198,10 @@ def _print_warnings(summary: IngestSummary) -> None:
     from tcpipe.tables.findings import by_cause
 
     made = [result for result in summary.results if result.run_id and result.status != "unchanged"]
+    for line in dict.fromkeys(line for of in made if of.no_power for line in (of.no_power.recipe,) if line):
+        say("power that no topic plays or that is refused (below) is read by this recipe, where it is of the drives:")
+        for part in line.splitlines():
+            say(f"  {part}")
     causes = by_cause((str(result.run_id), result.warnings) for result in made)
     for told in sorted(causes, key=lambda of: -len(of)):
         run, line = next(iter(told.items()))
@@ -199,7 +213,7 @@ def _print_sum(summary: IngestSummary) -> None:
     old = [result for result in summary.results if result.status == "failed" and not result.is_news]
     count = {
         status: sum(r.status == status for r in summary.results) - (len(old) if status == "failed" else 0)
-        for status in ("done", "unchanged", "damaged", "failed", "waiting")
+        for status in ("done", "unchanged", "damaged", "empty", "failed", "waiting")
     }
     if not number:
         say("nothing to do: this shard holds none of the logs")
@@ -222,6 +236,6 @@ def _print_known(summary: IngestSummary) -> None:
         tried = "tries them" if failed > 1 else "tries it"
         say(f"{failed} known failure{'s' * (failed > 1)}, not tried again; --retry-failed {tried}")
     if len(known) > failed:
-        say(f"{len(known) - failed} with known damage; 'tcpipe accept RUN' when it has been looked at")
+        say(f"{len(known) - failed} known to be damaged or empty; 'tcpipe accept RUN' when it has been looked at")
     if accepted:
         say(f"{accepted} with accepted trouble")

@@ -83,6 +83,10 @@ def _print_log(log: InspectedLog) -> None:
     _print_table(header, rows)
     if full:
         _print_clocks(log)
+    if log.no_power:
+        say(f"power: {log.no_power.why}")
+        for line in log.no_power.recipe.splitlines():
+            say(f"  {line}")
     if log.problems:
         say("to be decided:")
     for line in log.problems:
@@ -170,12 +174,12 @@ def _print_store(found: InspectedStore) -> None:
     _print_table(["run", "recipe", "robot", "segments", "metres", "damage"], rows)
     for run_id, version in found.outdated.items():
         say(f"of another data model ({version}): {run_id}; ingest its log again")
-    for line in found.damaged_runs.values():
+    for line in dict.fromkeys(found.damaged_runs.values()):
         say(f"damaged: {line}")
     for run_id, by in found.superseded.items():
         say(f"superseded by {by}: {run_id}; its log was completed or repaired")
     for run_id in found.unfinished:
-        say(f"not finished: {run_id}; ingest its log again")
+        say(f"not finished: {run_id}; it is being ingested, or its log failed")
 
 
 def _print_run(found: InspectedRun) -> None:

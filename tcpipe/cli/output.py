@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import click
 
-from tcpipe.errors import plain_line
+from tcpipe.errors import hide_secrets, plain_line
 from tcpipe.progress import STEP, Step, step_of
 
 if TYPE_CHECKING:
@@ -207,10 +208,15 @@ def _shown(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else json.dumps(c)[1:-1] for c in text)
 
 
+def print_traceback() -> None:
+    """Print where the error was raised that is being handled."""
+    click.echo(hide_secrets(traceback.format_exc()), err=True, nl=False)
+
+
 def say_failure(problems: Sequence[str], exit_code: int, *, as_json: bool) -> None:
     """Say on stderr what went wrong, and print it on stdout as a JSON object if that is wanted."""
     with suppress(OSError):
         for problem in problems:
             say(f"tcpipe: {problem}", err=True)
     if as_json:
-        click.echo(json.dumps({"exit_code": exit_code, "problems": list(problems)}))
+        click.echo(json.dumps({"exit_code": exit_code, "problems": [hide_secrets(problem) for problem in problems]}))

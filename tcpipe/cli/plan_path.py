@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Literal
 
 import click
@@ -82,23 +81,25 @@ def plan_path(
 
     Exit code 3: some of the path has no cost, because --step is large.
     """
+    from tcpipe.api import plan_path as run
     from tcpipe.cli.output import progress, say_result
-    from tcpipe.formats.published import here
-    from tcpipe.learning.models import chosen_model
-    from tcpipe.planning.inputs import chosen_map
-    from tcpipe.planning.plan_files import PlanRequest, plan
 
-    request = PlanRequest(start, goal, objective, step_m, allow_unseen, here(cost_map) if cost_map else None)
     with progress("plan-path", quiet=quiet) as shown:
-        source = chosen_map(store, map_name)
-        drawn = Path(picture) if picture else None
-        result = plan(
-            chosen_model(model, physics=physics, speed_mps=speed_mps),
-            source,
-            request,
-            out=Path(out),
-            picture=drawn,
-            step=shown.count,
+        result = run(
+            model,
+            start,
+            goal,
+            objective=objective,
+            map_name=map_name,
+            out=out,
+            picture=picture,
+            cost_map=cost_map,
+            step_m=step_m,
+            allow_unseen=allow_unseen,
+            physics=physics,
+            speed_mps=speed_mps,
+            store=store,
+            on_step=shown.count,
         )
     say_result(result, as_json=as_json)
     return result.exit_code

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import click
 
 from tcpipe.cli.options import (
@@ -53,18 +51,10 @@ def predict_path(
     Pieces on ground where MODEL has no business (a class, slope or relief not seen in training, off the map, no data, not
     traversable) are marked and counted. Exit code 3: some pieces have no cost.
     """
+    from tcpipe.api import predict_path as run
     from tcpipe.cli.output import progress, say_result
-    from tcpipe.learning.models import chosen_model
-    from tcpipe.planning.inputs import chosen_map
-    from tcpipe.planning.path_files import predict_path as run
 
     with progress("predict-path", quiet=quiet):
-        source = chosen_map(store, map_name)
-        result = run(
-            chosen_model(model, physics=physics, speed_mps=speed_mps),
-            source,
-            Path(path_file),
-            Path(out) if out else None,
-        )
+        result = run(model, path_file, map_name=map_name, out=out, physics=physics, speed_mps=speed_mps, store=store)
     say_result(result, as_json=as_json)
     return result.exit_code

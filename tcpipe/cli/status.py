@@ -24,7 +24,8 @@ def status(
 
     Without LOG: of the logs and folders that the latest calls of ingest were given. Nothing of a log is read.
 
-    Exit code 3: a log failed or is damaged and nobody accepted that (tcpipe accept), or a run is not as it was written.
+    Exit code 3: a log failed, is damaged or gave no segment, a call was killed, a log waits for more than two nights, and nobody
+    accepted that (tcpipe accept); or a run is not as it was written, or is gone.
     """
     from tcpipe.cli.output import print_json, ruling_recipe, say_lines
     from tcpipe.errors import UsageError

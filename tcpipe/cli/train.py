@@ -9,9 +9,6 @@ from click.core import ParameterSource
 
 from tcpipe.cli.options import PUBLISHED, SEALED, SEED, FloatRange, json_option, quiet_option
 
-_OF_THE_NETWORK = {"epochs", "patience", "batch", "learning_rate", "fold", "mirror", "width", "seed"}
-"""Options that a table and physics do not heed: who gives one wants the network."""
-
 
 @click.command(short_help="Train a model on a dataset")
 @click.argument("dataset", type=SEALED, metavar="DATASET")
@@ -60,14 +57,10 @@ def train(
     Needs an extra: pip install 'tcpipe[train]', or 'tcpipe[tables]' for a table. A network runs on a GPU when there is one; its training
     goes on where it was stopped.
     """
+    from tcpipe.api import train as run
     from tcpipe.cli.output import progress, say_result
-    from tcpipe.learning.fitting import FitConfig
-    from tcpipe.learning.training import model_for
-    from tcpipe.learning.training import train as run
 
     given = {name for name in options if context.get_parameter_source(name) is not ParameterSource.DEFAULT}
     with progress("train", quiet=quiet):
-        if options["model"] is None:
-            options["model"] = "resnet18" if given & _OF_THE_NETWORK else model_for(dataset)
-        result = run(dataset, out, config=FitConfig(**options), fresh=fresh)
+        result = run(dataset, out, fresh=fresh, **{name: options[name] for name in given})
     say_result(result, as_json=as_json)

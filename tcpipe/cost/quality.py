@@ -12,6 +12,7 @@ from tcpipe.tables.bits import Quality
 Floats = NDArray[np.float64]
 MIN_INSTANTANEOUS_HZ = 10.0
 MIN_AVERAGED_HZ = 2.0
+_VOLTAGE_SHARE = 0.02
 _RATE_TOLERANCE = 0.98  # a 10 Hz source is 10 Hz though its stamps jitter
 
 
@@ -23,13 +24,33 @@ def bits(flags: dict[Quality, NDArray[np.bool_]], count: int) -> NDArray[np.uint
     return quality
 
 
+def wanted_rate_hz(*, averaged: bool) -> float:
+    """Return how often power is wanted [Hz]."""
+    return MIN_AVERAGED_HZ if averaged else MIN_INSTANTANEOUS_HZ
+
+
+def is_too_slow(rate_hz: float, *, averaged: bool) -> bool:
+    """Return whether power at a rate [Hz] comes less often than is wanted."""
+    return rate_hz < _RATE_TOLERANCE * wanted_rate_hz(averaged=averaged)
+
+
 def low_power_rate(rails: list[Rail]) -> bool:
-    """Return whether the voltage or current of any rail comes more slowly than 10 Hz (2 Hz if averaged by its source)."""
+    """Return whether the current of any rail comes more slowly than 10 Hz (averaged by its source: 2 Hz), or a voltage that varies.
+
+    A voltage varies where it changes by more than 2 % (root mean square) from sample to sample; a battery's mostly does by less.
+    """
     return any(
-        1.0 / median_period_s(signal) < _RATE_TOLERANCE * (MIN_AVERAGED_HZ if each.averaged else MIN_INSTANTANEOUS_HZ)
-        for each in rails
-        for signal in (each.voltage, each.current)
+        _is_slow(each.current, each) or (_is_slow(each.voltage, each) and _varies(each.voltage)) for each in rails
     )
+
+
+def _is_slow(signal: Samples, each: Rail) -> bool:
+    return is_too_slow(1.0 / median_period_s(signal), averaged=each.averaged)
+
+
+def _varies(voltage: Samples) -> bool:
+    steps = np.diff(voltage.value)
+    return steps.size > 0 and float(np.sqrt(np.mean(steps**2))) > _VOLTAGE_SHARE * abs(float(np.mean(voltage.value)))
 
 
 def voltage_outside(

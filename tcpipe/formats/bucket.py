@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, TypeVar
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.content_cache import cached
-from tcpipe.formats.object_storage import connected, is_url, told
+from tcpipe.formats.object_storage import connected, is_url, split_url, told
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.seals import Checksum
 
@@ -35,7 +35,7 @@ _SETTINGS = ("AWS_", "GOOGLE_", "AZURE_", "HTTP", "NO_PROXY")
 
 def open_place(path: str | Path) -> Place:
     """Return the place that a path or a URL names; nothing is asked of it yet."""
-    return BucketPlace(str(path).rstrip("/")) if is_url(path) else DirectoryPlace(Path(path))
+    return BucketPlace(split_url(str(path))[0].rstrip("/")) if is_url(path) else DirectoryPlace(Path(path))
 
 
 def side_by_side(path: str | Path, function: Callable[[T], U], items: Sequence[T]) -> list[U]:
@@ -85,6 +85,13 @@ class BucketPlace:
         with suppress(FileNotFoundError), told(self.where(name), StoreError):
             return int(store.head(key)["size"])
         return None
+
+    def version(self, name: str) -> str | None:
+        """Return the URL of an object and its ETag; None where the bucket gives none."""
+        store, key = self._store(name)
+        with _gone(self.where(name)), told(self.where(name), StoreError):
+            tag = store.head(key)["e_tag"]
+        return None if tag is None else f"{self.where(name)} {tag}"
 
     def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
         """Return the objects below ``prefix/``, by name; so many a request that a large store takes few."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError
 from tcpipe.formats.seals import Checksum, file_checksum
 from tcpipe.logs.mapped import stamps_ns
+from tcpipe.recipe.suggestions import recipe_key
 
 TimeUnit = Literal["auto", "s", "ms", "us", "ns"]
 
@@ -133,11 +134,14 @@ def _in_utc(stamp_ns: int) -> str:
     return datetime.fromtimestamp(stamp_ns // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
 
 
+_COLUMN = recipe_key("covariates.time_column")
+
+
 def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
     there = ", ".join(table.columns)
     if wanted is not None:
         if wanted not in table.columns:
-            raise DatasetError(f"{path}: no column {wanted!r} ([covariates] time_column); there are {there}")
+            raise DatasetError(f"{path}: no column {wanted!r} ({_COLUMN}); there are {there}")
         return wanted
     endings = ("", *(f"_{unit}" for unit in _UNITS))
     found = [name for name in table.columns if name.lower() in {f"{of}{end}" for of in _TIME_NAMES for end in endings}]
@@ -147,7 +151,7 @@ def _time_column(path: Path, table: pl.DataFrame, wanted: str | None) -> str:
             if found
             else "no column is called as one of time"
         )
-        raise DatasetError(f"{path}: {said}; name it in the recipe: [covariates] time_column; there are {there}")
+        raise DatasetError(f"{path}: {said}; name it ({_COLUMN}); there are {there}")
     return found[0]
 
 
@@ -179,7 +183,7 @@ def _counted_ns(path: Path, column: pl.Series, unit: TimeUnit) -> pl.Series:
     numbers = column if column.dtype.is_integer() else column.set(~column.is_finite(), None)
     stamps = stamps_ns(numbers.drop_nulls().to_numpy(), ending if unit == "auto" and ending in _UNITS else unit)
     if isinstance(stamps, str):
-        raise DatasetError(f"{path}: {column.name}: {stamps} ([covariates] time_unit)")
+        raise DatasetError(f"{path}: {column.name}: {stamps} ({recipe_key('covariates.time_unit')})")
     made = np.zeros(len(numbers), np.int64)
     made[numbers.is_not_null().to_numpy()] = stamps
     return pl.Series(made).set(numbers.is_null(), None)

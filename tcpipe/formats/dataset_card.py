@@ -16,7 +16,7 @@ from tcpipe.motion.removal import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.holdouts import Holdout
-from tcpipe.tables.findings import LEFT_OUT, EnergyBudget, PhysicsFit
+from tcpipe.tables.findings import ABSENT, LEFT_OUT, EnergyBudget, PhysicsFit
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe dataset"
@@ -222,16 +222,17 @@ class Redacted:
     """What a redacted dataset does not tell, and what it does not hide."""
 
     moved: str = (
-        "to 0 N 0 E as a whole, grid north up: lon, lat, x, y, course, heights, regions; distances in the maps' plane are as they were, to "
-        "a centimetre"
+        "to 0 N 0 E as a whole, grid north up: lon, lat, x, y, course, heights, regions; distances are those of the ground, as chord_m, "
+        "to a centimetre"
     )
     cut: str = (
-        "names of logs, runs and maps; topics, paths, hosts, users; checksums of rasters; the recipe's sections read, robots, "
-        "power_sources and tables"
+        "names of logs, runs and maps; every text of warnings, problems and findings (they are counted); checksums of rasters; the "
+        "recipe's sections read, robots, power_sources and tables"
     )
     not_hidden: str = (
         "what the ground looks like (an aerial picture or a height model may be matched to it), when it was driven, the robot, its "
-        "power, tags and covariates as they were given, the sha256 of each log, and what name, description and creator say"
+        "power, names of classes and layers, tags and covariates as they were given, the sha256 of each log, and what name, "
+        "description and creator say"
     )
 
     def lines(self) -> tuple[str, str, str]:
@@ -278,6 +279,8 @@ class DatasetCard:
     removal: Removal
     balance: Balance
     runs: tuple[RunSource, ...]
+    run_tags: Mapping[str, str] | None = field(default=None, metadata=ABSENT)
+    """The tags that a run had to carry; None in cards of before 0.9 and of a redacted dataset, which do not tell."""
     maps: tuple[MapSource, ...]
     problems: tuple[str, ...] = ()
     """What is wrong with the choice of runs."""

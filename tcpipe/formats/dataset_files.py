@@ -25,12 +25,13 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError
 from tcpipe.formats.dataset_card import KIND, DatasetCard, Shard
 from tcpipe.formats.json_files import typed
 from tcpipe.formats.layer_descriptions import cf_attributes, layers_described
-from tcpipe.formats.parquet import column_names, parquet_bytes, read_row_group, read_table
-from tcpipe.formats.place import Place
+from tcpipe.formats.parquet import column_names, parquet_bytes, read_row_group, read_table, row_count
+from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.proved_content import wrong_files
 from tcpipe.formats.published import FetchedShards
 from tcpipe.formats.seals import prove_files, read_sealed
-from tcpipe.formats.shards import DESCRIPTION, ShardedArray, open_sharded
-from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group, open_group
+from tcpipe.formats.shards import DESCRIPTION, ShardedArray, decoded_chunk, open_sharded
+from tcpipe.formats.zarr_arrays import Compression, add_array, consolidate, create_group
 from tcpipe.splits.assignment import SPLITS
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 from tcpipe.tables.levels import SAMPLES as SAMPLES_SCHEMA
@@ -146,7 +147,7 @@ def zarr_drawers(
     threads : chunks of a shard encoded side by side; the bytes do not depend on it.
     """
     n, px = len(pixels.slots), pixels.patch_px
-    shard = min(SHARD_ROWS, max(-(-n // CHUNK_ROWS), 1) * CHUNK_ROWS)
+    shard = _shard_rows(n)
     attributes = {"Conventions": "CF-1.11", "title": "patches of a tcpipe dataset, in the order of samples.parquet"}
     group = create_group(directory / PATCHES, attributes)
     for layer in pixels.layers.values():
@@ -177,9 +178,29 @@ def zarr_drawers(
         last = min(first + SHARD_ROWS, n)
         ids[first:last] = np.array(sample_ids(first, last), dtype=object)
     consolidate(group)
-    arrays = {layer: open_sharded(directory / PATCHES / layer) for layer in pixels.layers}
+    arrays = {name: _layer_array(directory, layer, n, px) for name, layer in pixels.layers.items()}
     rows = (slice(first, first + shard) for first in range(0, n, shard))
     return [ZarrDrawer(out, pixels.of(part), arrays, number, threads) for number, part in enumerate(rows)]
+
+
+def _shard_rows(samples: int) -> int:
+    """Return how many patches a shard holds in a Zarr dataset of so many."""
+    return min(SHARD_ROWS, max(-(-samples // CHUNK_ROWS), 1) * CHUNK_ROWS)
+
+
+def _layer_array(
+    directory: Path, layer: Layer, samples: int, px: int, fetched: FetchedShards | None = None
+) -> ShardedArray:
+    """Return the array of a layer; `StoreError` if its description is not of so many patches of so many pixels."""
+    return open_sharded(
+        directory / PATCHES / layer.name,
+        shape=(samples, px, px),
+        chunk_shape=(CHUNK_ROWS, px, px),
+        shard_shape=(_shard_rows(samples), px, px),
+        dtype=np.dtype(layer.stored),
+        fill=missing(layer.stored),
+        fetched=fetched,
+    )
 
 
 def parquet_drawers(
@@ -283,6 +304,14 @@ def read_samples(directory: Path, columns: Sequence[str] | None = None) -> pa.Ta
         raise DatasetError(*error.problems) from None
 
 
+def sample_count(directory: Path) -> int:
+    """Return the rows of a dataset's samples table, from its footer; `DatasetError` if that cannot be read."""
+    try:
+        return row_count(directory / SAMPLES)
+    except StoreError as error:
+        raise DatasetError(*error.problems) from None
+
+
 def sample_columns(directory: Path) -> list[str]:
     """Return the names of the columns of a dataset's samples table; `DatasetError` if it cannot be read."""
     try:
@@ -317,8 +346,11 @@ class PatchFiles:
     def expect(self, pieces: Iterable[int], layers: Iterable[str]) -> None:
         """Have pieces brought here that are read soon, where they lie in a bucket."""
         if self.fetched is not None and self.arrays:
-            for layer in layers:
-                self.arrays[layer].expect((piece, 0, 0) for piece in pieces)
+            try:
+                for layer in layers:
+                    self.arrays[layer].expect((piece, 0, 0) for piece in pieces)
+            except StoreError as error:
+                raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
 
     def read(
         self, piece: int, layers: Iterable[str], out: Mapping[str, NDArray[Any]] | None = None
@@ -358,8 +390,18 @@ def is_shard(name: str) -> bool:
     return name.startswith(f"{SHARDS}/") or (name.startswith(f"{PATCHES}/") and "/c/" in name)
 
 
-def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | None = None) -> PatchFiles:
-    """Return where the patches of a dataset lie, here or ``fetched``; `DatasetError` if they are gone, or not what the card says."""
+def open_patches(
+    directory: Path, card: DatasetCard, fetched: FetchedShards | None = None, *, proved: bool = True
+) -> PatchFiles:
+    """Return where the patches of a dataset lie, here or ``fetched``.
+
+    Where that is to be ``proved``, shards are held against the card: on this machine at once, in a bucket each before it is first read.
+    A digest is found once and remembered, so that to open the dataset again costs a look at each file.
+
+    Raises
+    ------
+    DatasetError : they are gone, or not what the card says, as where a folder was copied in part over another build.
+    """
     px, samples = card.patch_px, card.samples
     layers = in_order(layers_described(card.layers, card.classes, directory / CARD))
     known = card.format in get_args(FileFormat)
@@ -370,19 +412,27 @@ def open_patches(directory: Path, card: DatasetCard, fetched: FetchedShards | No
         )
     if "terrain" in layers and not card.classes:
         raise DatasetError(f"{directory / CARD}: a layer terrain, but no classes; build the dataset again")
+    fetched = fetched and replace(fetched, proves=proved)
+    if proved and fetched is None:
+        shards = [name for name in card.checksums if is_shard(name)]
+        _refuse_others(wrong_files(DirectoryPlace(directory), card.checksums, shards), directory)
     if card.format == "parquet":
         return replace(_in_shards(directory, layers, px, card), fetched=fetched)
     try:
-        arrays = {layer: open_sharded(directory / PATCHES / layer, fetched=fetched) for layer in layers}
+        arrays = {name: _layer_array(directory, layer, samples, px, fetched) for name, layer in layers.items()}
     except StoreError as error:
         raise DatasetError(*(f"{problem}; build the dataset again" for problem in error.problems)) from None
-    for layer, array in arrays.items():
-        found = f"{array.shape} in {array.chunk_shape} of {array.dtype}"
-        wanted = f"{(samples, px, px)} in {(CHUNK_ROWS, px, px)} of {layers[layer].stored}"
-        if found != wanted:
-            raise DatasetError(f"{array.path}: holds {found}, the card says {wanted}; build the dataset again")
     starts = np.append(np.arange(0, samples, CHUNK_ROWS), samples)
     return PatchFiles(directory, layers, px, starts, arrays, fetched=fetched)
+
+
+def _refuse_others(wrong: Sequence[str], directory: Path) -> None:
+    """Raise one `DatasetError` for shards that are not the card's."""
+    if wrong:
+        more = f", and {len(wrong) - 1} more shards" if len(wrong) > 1 else ""
+        raise DatasetError(
+            f"{wrong[0]}{more}: not of the build that {directory / CARD} tells of; copy the whole dataset again, or build it again"
+        )
 
 
 def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: DatasetCard) -> PatchFiles:
@@ -398,15 +448,25 @@ def _in_shards(directory: Path, layers: Mapping[str, Layer], px: int, card: Data
     return PatchFiles(directory, layers, px, starts, groups=tuple((path, group) for path, group, _ in groups))
 
 
-def zarr_sample_ids(directory: Path) -> list[str]:
-    """Return the ids beside the patches of a Zarr dataset; `DatasetError` if they cannot be read."""
-    try:
-        group: Any = open_group(directory / PATCHES)
-        return [str(name) for name in group["sample_id"][:]]
-    except StoreError as error:
-        raise DatasetError(*error.problems) from None
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
-        raise DatasetError(f"{directory / PATCHES}: its sample ids cannot be read ({error}); build it again") from None
+def holds_sample_ids(directory: Path, ids: Sequence[str]) -> bool:
+    """Tell whether the ids beside the patches of a Zarr dataset are these; `StoreError` if they cannot be read.
+
+    They are compared as Zarr encodes them (vlen-utf8: a count, and each text after its length), so that no more is decoded than that.
+    """
+    place = directory / PATCHES / "sample_id"
+    for number, first in enumerate(range(0, len(ids), SHARD_ROWS)):
+        here = list(ids[first : first + SHARD_ROWS])
+        texts = [name.encode() for name in here + [""] * (SHARD_ROWS - len(here))]
+        wanted = SHARD_ROWS.to_bytes(4, "little") + b"".join(len(text).to_bytes(4, "little") + text for text in texts)
+        path = place / "c" / str(number)
+        try:
+            if decoded_chunk(place, path.read_bytes(), len(wanted)) != wanted:
+                return False
+        except FileNotFoundError:
+            raise StoreError(f"{path}: is gone") from None
+        except (OSError, ValueError, RuntimeError) as error:
+            raise StoreError(f"{path}: does not hold the ids of the samples ({error})") from None
+    return True
 
 
 def rows_in_files(card: DatasetCard, splits: NDArray[np.object_]) -> dict[str, NDArray[np.int64]]:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import gc
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping
+import re
+from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -23,8 +24,9 @@ from tcpipe.formats.parquet import parquet_of, write_table
 from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
+from tcpipe.motion.remedies import REMEDIES
 from tcpipe.tables.arrays import column_of
-from tcpipe.tables.findings import EnergyBudget, PhysicsFit
+from tcpipe.tables.findings import EnergyBudget, NoPower, PhysicsFit
 
 T = TypeVar("T")
 
@@ -33,8 +35,14 @@ logger = logging.getLogger("tcpipe")
 RUNS, LOGS = "runs.parquet", "logs.parquet"
 
 _ABOUT = b"tcpipe_index"
-_VERSION = b"4"
+_VERSION = b"5"
 """Of these tables: those of another are made again."""
+
+
+_DROVE_M = 5.0
+"""Who went less far was moved about, not driven."""
+_NO_SEGMENTS = re.compile(r"(?!^)no segments")
+"""Warnings that say why there are none; the line that begins so only sums up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,8 +106,20 @@ class RunFacts:
     """Where every metre went [m], by entry."""
     standing_watt: float | None = None
     """What the robot draws while it stands."""
+    no_power: NoPower | None = None
+    """Why there is no power, and what would read it."""
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Terms of the fit of power and their standard deviations, in SI, by ``term`` or, of one class of terrain, ``term on terrain``."""
+
+    @property
+    def why_empty(self) -> str:
+        """Why there is no segment though the robot drove, the main cause in one line; "" of any other run."""
+        if self.segments or self.driven_m < _DROVE_M:
+            return ""
+        name = max(self.ledger_m, key=lambda entry: self.ledger_m[entry])
+        lost = f"{self.ledger_m[name]:.1f} m {name.replace('_', ' ')}: {REMEDIES.get(name, '')}"
+        cause = next((line for line in self.warnings if _NO_SEGMENTS.search(line)), lost)
+        return f"no segment from {self.driven_m:.1f} m driven: {cause}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +163,7 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
         driven_m=math.fsum(manifest.ledger_m.values()),
         kept_m=manifest.ledger_m.get("kept", 0.0),
         energy_budget=None if label is None else label.energy_budget,
+        no_power=manifest.info.findings.facts.no_power,
         segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",
@@ -208,6 +229,11 @@ def write_runs(place: Place, rows: Iterable[RunFacts]) -> None:
 def write_logs(place: Place, rows: Iterable[SeenLog]) -> None:
     """Write ``logs.parquet``, unless that cannot be."""
     _write(place, LOGS, rows, _LOG_SCHEMA)
+
+
+def forget_runs(place: Place, run_ids: Container[str]) -> None:
+    """Take runs out of ``runs.parquet``: the next listing puts in what there is of them, and misses nothing."""
+    write_runs(place, [row for (name, _), row in read_runs(place).items() if name not in run_ids])
 
 
 def _rows(place: Place, name: str, cls: type[T]) -> list[T]:

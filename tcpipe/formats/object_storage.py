@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 from urllib.parse import unquote
 
-from tcpipe.errors import LogError, TcpipeError
+from tcpipe.errors import LogError, TcpipeError, UsageError, split_secrets
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.logs.log_part import no_room
 
@@ -42,6 +42,8 @@ _DENIED = (
 )  # fmt: skip
 """What is said where credentials are not set (a cloud machine's own are asked for, in vain), or wrong."""
 _CODE = re.compile(r"<Code>(\w+)</Code>")
+_STATUS = re.compile(r"\b[45]\d\d [A-Z][A-Za-z ]*(?=: )")
+"""After it follows what the server wrote, which may repeat the query."""
 _REFUSED = {
     "RequestTimeTooSkewed": "this machine's clock is not the store's; set it",
     "SignatureDoesNotMatch": "the secret key that is set is not that of the access key",
@@ -106,6 +108,41 @@ def is_url(text: str | Path) -> bool:
     return _URL.match(str(text)) is not None
 
 
+def split_url(url: str, *, one_object: bool = False) -> tuple[str, str]:
+    """Return a URL as it is shown and stored, and its query: only the server of a presigned URL gets that.
+
+    Raises
+    ------
+    UsageError : it holds a user name or password, or a query that is not one of an ``http(s)://`` URL of ``one_object``.
+    """
+    scheme, slashes, rest = url.partition("://")
+    shown, query = split_secrets(scheme, rest)
+    public = f"{scheme}{slashes}{shown}"
+    if shown + query != rest:
+        raise UsageError(f"{public}: a URL may not hold a user name or password; {_credentials(scheme)}")
+    query = query.partition("#")[0].removeprefix("?")
+    if query and not (one_object and scheme.lower() in ("http", "https")):
+        what = "only the http:// or https:// URL of one log may have a query (?…)"
+        raise UsageError(f"{public}: {what}; {_credentials(scheme)}")
+    return public, query
+
+
+def shown_path(path: str | Path) -> str:
+    """Return a path or the URL of a log as it is shown and stored."""
+    return split_url(str(path), one_object=True)[0] if is_url(path) else str(path)
+
+
+def is_presigned(path: str | Path) -> bool:
+    """Return whether this is a URL with a query: nobody can look there again without it."""
+    return is_url(path) and bool(split_url(str(path), one_object=True)[1])
+
+
+def _credentials(scheme: str) -> str:
+    """Return how to give the credentials that a URL may not hold."""
+    variables = _CREDENTIALS.get(scheme.lower())
+    return f"set {variables}" if variables else "give the presigned URL of a log, or copy the files to this machine"
+
+
 @contextmanager
 def laid_out(
     url: str, *, wanted: Callable[[str], bool], by_range: tuple[str, ...]
@@ -124,16 +161,17 @@ def laid_out(
     ------
     LogError : there is no such object, or it cannot be read. What goes wrong inside the block is told with the URL instead of the path.
     """
+    shown, query = split_url(url, one_object=True)
     with scratch_directory() as directory:
-        laid = _laid_out(url, directory, wanted)
-        place = _place_of(url, directory)
+        laid = _laid_out(shown, query, directory, wanted)
+        place = _place_of(shown, directory)
         try:
             for path, stored in laid.items():
                 if not path.name.lower().endswith(by_range):
                     stored.copy(path)
             yield place, {path: stored for path, stored in laid.items() if path.name.lower().endswith(by_range)}
         except LogError as error:
-            raise type(error)(*(problem.replace(str(place), url.rstrip("/")) for problem in error.problems)) from None
+            raise type(error)(*(problem.replace(str(place), shown.rstrip("/")) for problem in error.problems)) from None
 
 
 def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Path:
@@ -143,8 +181,9 @@ def stand_ins(url: str, directory: Path, *, wanted: Callable[[str], bool]) -> Pa
     ------
     LogError : there is no such object, or the store cannot be read.
     """
-    _laid_out(url, directory, wanted)
-    return _place_of(url, directory)
+    shown, query = split_url(url, one_object=True)
+    _laid_out(shown, query, directory, wanted)
+    return _place_of(shown, directory)
 
 
 def _place_of(url: str, directory: Path) -> Path:
@@ -152,11 +191,11 @@ def _place_of(url: str, directory: Path) -> Path:
     return directory / name if name else directory
 
 
-def _laid_out(url: str, directory: Path, wanted: Callable[[str], bool]) -> dict[Path, StoredObject]:
+def _laid_out(url: str, query: str, directory: Path, wanted: Callable[[str], bool]) -> dict[Path, StoredObject]:
     """Lay out stand-ins, and return their objects."""
     with told(url):
-        store, name = connected(url)
-        found = list(_found(store, url, name, wanted))
+        store, name = connected(url, query)
+        found = list(_found(store, url, name, wanted, presigned=bool(query)))
         if not found:
             raise LogError(f"{url}: there is no such object, and no log below it")
         laid = {_place(stored.name, directory): stored for stored in found}
@@ -186,7 +225,8 @@ def _reason(url: str, error: Exception, code: str | None, what: str) -> str:
     from obstore.exceptions import PermissionDeniedError, UnauthenticatedError  # noqa: PLC0415
 
     reason = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
-    reason = reason.partition(": <?xml")[0]
+    if status := _STATUS.search(reason):
+        reason = reason[: status.end()]
     scheme = url.partition("://")[0].lower()
     denied = isinstance(error, PermissionDeniedError | UnauthenticatedError) or any(of in reason for of in _DENIED)
     if code == "NoSuchBucket":
@@ -224,10 +264,11 @@ def _container_and_name(url: str) -> tuple[str, str]:
     return f"{scheme}://{container}", unquote(name) if scheme in _PERCENT_ENCODED else name
 
 
-def connected(url: str) -> tuple[ObjectStore, str]:
-    """Return the store, and the name of the object or prefix in it."""
+def connected(url: str, query: str = "") -> tuple[ObjectStore, str]:
+    """Return the store, and the name of the object or prefix in it; a presigned URL's server gets its ``query`` with each request."""
     import obstore  # noqa: PLC0415
 
+    url = split_url(url)[0]
     container, name = _container_and_name(url)
     scheme, _, bucket = container.partition("://")
     if not bucket:
@@ -236,11 +277,19 @@ def connected(url: str) -> tuple[ObjectStore, str]:
     options: dict[str, Any] = {} if scheme == "file" else {"retry_config": _RETRIES}
     if scheme != "file":  # who names an endpoint without TLS means it
         options["client_options"] = {"allow_http": True, "connect_timeout": timedelta(seconds=3)}
+    if query:  # also where the host is a bucket's: the query stands for the credentials
+        return obstore.store.HTTPStore.from_url(f"{container}?{query}", **options), name
     return obstore.store.from_url(container, **options), name
 
 
-def _found(store: ObjectStore, url: str, name: str, wanted: Callable[[str], bool]) -> Iterator[StoredObject]:
+def _found(
+    store: ObjectStore, url: str, name: str, wanted: Callable[[str], bool], *, presigned: bool
+) -> Iterator[StoredObject]:
     """Yield the object of a name; where there is none, what is wanted below it."""
+    if presigned:  # for one object and method: neither HEAD nor a list is allowed
+        if name:
+            yield _stored(store, url, name, store.get(name, options={"range": (0, 1)}).meta)
+        return
     if name:
         try:
             yield _stored(store, url, name, store.head(name))

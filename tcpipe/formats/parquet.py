@@ -1,15 +1,18 @@
 """Parquet, written so that the same table gives the same bytes, and read back with its metadata.
 
-Every page carries a checksum that is proved when it is read: damage is an error, never a number.
+Every page carries a checksum that is proved when it is read: damage is an error, never a number. Before a page is decoded, the headers of
+all pages say how large the table becomes: one that is out of proportion to its file is refused (`MOST_BYTES`, `MOST_TIMES`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from tcpipe.errors import StoreError
@@ -17,6 +20,12 @@ from tcpipe.formats.atomic import atomic_file
 
 ROWS_PER_GROUP = 1 << 17
 """Rows of a group: what is decoded together."""
+MOST_BYTES, MOST_TIMES = 256_000_000, 100
+"""A table in memory is at most so large [byte], or so many times its file: constant columns aside, ours shrink to a tenth."""
+_MOST_DEPTH = 4
+"""Structs in one another in the header of a page."""
+_WIDTHS = {"BOOLEAN": 1, "INT32": 4, "INT64": 8, "INT96": 12, "FLOAT": 4, "DOUBLE": 8}
+"""Bytes of a value, by physical type."""
 EMPTY_MEMBER = "structure_needs_at_least_one_member"
 
 
@@ -77,26 +86,147 @@ def _damage_of(where: Path | str) -> Iterator[None]:
     """Raise `StoreError` where the file cannot be read."""
     try:
         yield
-    except (OSError, pa.ArrowException) as error:
-        raise StoreError(f"{where}: not a readable Parquet file ({str(error).splitlines()[0]}); rebuild it") from None
+    except (OSError, pa.ArrowException, ValueError, IndexError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise StoreError(f"{where}: not a readable Parquet file ({reason}); rebuild it") from None
 
 
 def parquet_of(data: bytes, where: str, columns: list[str]) -> pa.Table:
     """Return columns of the table in the bytes of a Parquet file that lies at ``where``; `StoreError` names one that cannot be read."""
-    with _damage_of(where), pq.ParquetFile(pa.BufferReader(data), page_checksum_verification=True) as file:
-        return file.read(columns, use_threads=False)  # Arrow's threads could outlive a command that ends at once
+    with _damage_of(where):
+        return _bounded(
+            pa.py_buffer(data), columns, use_threads=False
+        )  # threads could outlive a command that ends at once
 
 
 def read_table(path: Path, columns: list[str] | None = None) -> pa.Table:
     """Read a Parquet file with its schema metadata; `StoreError` names a file that cannot be read."""
-    with _damage_of(path):
-        return pq.read_table(path, columns=columns, memory_map=True, partitioning=None, page_checksum_verification=True)
+    with _damage_of(path), pa.memory_map(str(path)) as file:
+        return _bounded(file.read_buffer(), columns)
 
 
 def read_row_group(path: Path, group: int, columns: list[str]) -> pa.Table:
     """Read columns of one row group of a Parquet file; `StoreError` names a file that cannot be read."""
-    with _damage_of(path), pq.ParquetFile(path, page_checksum_verification=True) as file:
-        return file.read_row_group(group, columns=columns)
+    with _damage_of(path), pa.memory_map(str(path)) as file:
+        return _bounded(file.read_buffer(), columns, group)
+
+
+def _bounded(
+    data: pa.Buffer, columns: list[str] | None, group: int | None = None, *, use_threads: bool = True
+) -> pa.Table:
+    """Return columns of a file, or of one of its row groups, once they are known to be in proportion to it; `ValueError` if not."""
+    about = pq.read_metadata(pa.BufferReader(data))
+    most = max(MOST_BYTES, MOST_TIMES * data.size)
+    groups = [n for n in range(about.num_row_groups) if group in (None, n) and about.row_group(n).num_rows]
+    schema = about.schema.to_arrow_schema()
+    size, at_most = 0, dict.fromkeys((field.name for field in schema if pa.types.is_string(field.type)), 0)
+    for name, least, longest in _sizes(memoryview(data), about, groups, None if columns is None else set(columns)):
+        size += least if name in at_most else longest
+        at_most[name] = at_most.get(name, 0) + longest
+    if size > most:
+        raise ValueError(f"it unfolds to {size / 1e6:.0f} MB, at most {most / 1e6:.0f}")
+    texts = [
+        field.name for field in schema if pa.types.is_string(field.type) and at_most[field.name] > MOST_BYTES // 16
+    ]
+    source = pa.BufferReader(data)
+    with pq.ParquetFile(source, metadata=about, read_dictionary=texts, page_checksum_verification=True) as file:
+        table = file.read_row_groups(groups, columns, use_threads=use_threads)
+    for at, field in enumerate(table.schema):  # a text that occurs in many rows lies here once so far
+        if pa.types.is_dictionary(field.type):
+            size += sum(_text_bytes(chunk) for chunk in table.column(at).chunks)
+            if size > most:
+                raise ValueError(f"its texts unfold to more than {most / 1e6:.0f} MB")
+            plain = schema.field(field.name)
+            table = table.set_column(at, plain, table.column(at).cast(plain.type))
+    return table
+
+
+def _text_bytes(chunk: pa.DictionaryArray) -> int:
+    return int(pc.sum(pc.binary_length(chunk.dictionary).cast(pa.int64()).take(chunk.indices)).as_py() or 0)
+
+
+def _sizes(
+    data: memoryview, about: pq.FileMetaData, groups: Iterable[int], columns: Collection[str] | None
+) -> Iterator[tuple[str, int, int]]:
+    """Yield each column of each row group and how large it becomes [byte], by the headers of its pages.
+
+    The first size is that of a column of texts whose dictionary is kept, the second if each text were all of the dictionary.
+    """
+    leaves = [about.schema.column(index) for index in range(about.num_columns)]
+    for number in groups:
+        group = about.row_group(number)
+        for index, leaf in enumerate(leaves):
+            name = leaf.path.partition(".")[0]
+            if columns is not None and name not in columns:
+                continue
+            chunk = group.column(index)
+            width = leaf.length if leaf.physical_type == "FIXED_LEN_BYTE_ARRAY" else _WIDTHS.get(leaf.physical_type, 0)
+            pages = list(_pages(data, chunk))
+            values = sum(count for _, count, _ in pages)
+            encoded = sum(size for size, *_ in pages)
+            least = encoded + values * (width or 4)
+            dictionary = 0 if width else sum(size for size, _, is_dictionary in pages if is_dictionary)
+            yield name, least, max(least, encoded + values * dictionary)
+
+
+def _pages(data: memoryview, chunk: pq.ColumnChunkMetaData) -> Iterator[tuple[int, int, bool]]:
+    """Yield of every page of a column its size without compression [byte], its values, and whether these are the dictionary."""
+    at = min(chunk.data_page_offset, chunk.dictionary_page_offset or chunk.data_page_offset)
+    end = at + chunk.total_compressed_size
+    if not 0 < at <= end <= len(data):
+        raise ValueError("a column lies beyond its end")
+    while at < end:
+        header, at = _read_struct(data, at)
+        uncompressed, compressed = header.get(2, -1), header.get(3, -1)
+        held = next((of for number in (5, 7, 8) if isinstance(of := header.get(number), dict)), {})
+        values = held.get(1, 0)
+        if not all(isinstance(value, int) and value >= 0 for value in (uncompressed, compressed, values)):
+            raise ValueError("the header of a page is damaged")
+        yield uncompressed, 0 if 7 in header else values, 7 in header
+        at += compressed
+
+
+def _read_struct(data: memoryview, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+    """Return a struct in Thrift's compact protocol by field number (texts and doubles as None), and where it ends.
+
+    The header of a page holds nothing else (Apache Parquet, parquet.thrift, PageHeader).
+    """
+    fields, number = dict[int, Any](), 0
+    while kind := data[at]:
+        at += 1
+        value: Any = None
+        if kind >> 4:
+            number += kind >> 4
+        else:
+            number, at = _read_zigzag(data, at)
+        match kind & 15:
+            case 1 | 2:
+                value = kind & 15 == 1
+            case 4 | 5 | 6:
+                value, at = _read_zigzag(data, at)
+            case 7:
+                at += 8
+            case 8:
+                length, at = _read_varint(data, at)
+                at += length
+            case 12 if depth < _MOST_DEPTH:
+                value, at = _read_struct(data, at, depth + 1)
+            case _:
+                raise ValueError("the header of a page is damaged")
+        fields[number] = value
+    return fields, at + 1
+
+
+def _read_zigzag(data: memoryview, at: int) -> tuple[int, int]:
+    value, at = _read_varint(data, at)
+    return value >> 1 ^ -(value & 1), at
+
+
+def _read_varint(data: memoryview, at: int) -> tuple[int, int]:
+    value = shift = 0
+    while (byte := data[at]) & 128 and shift < 64:
+        value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+    return value | byte << shift, at + 1
 
 
 def column_names(path: Path) -> list[str]:
@@ -108,6 +238,12 @@ def read_schema(path: Path) -> pa.Schema:
     """Return the schema of a Parquet file, with its metadata, from its footer; `StoreError` names a file that cannot be read."""
     with _damage_of(path):
         return pq.read_schema(path)
+
+
+def row_count(path: Path) -> int:
+    """Return the rows of a Parquet file from its footer; `StoreError` names a file that cannot be read."""
+    with _damage_of(path):
+        return int(pq.read_metadata(path).num_rows)
 
 
 def lowest(path: Path, column: str) -> int:

@@ -55,6 +55,9 @@ class Place(Protocol):
     def size(self, name: str) -> int | None:
         """Return how large a file is [byte]; None where there is none."""
 
+    def version(self, name: str) -> str | None:
+        """Return what changes whenever a file's content does, and names the file; None where nothing is known to."""
+
     def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
         """Return the files below ``prefix/``, however deep, by name (from here on); temporaries are none.
 
@@ -127,6 +130,12 @@ class DirectoryPlace:
         with _told(self.where(name), "read"), suppress(FileNotFoundError, NotADirectoryError):
             return path.stat().st_size if path.is_file() else None
         return None
+
+    def version(self, name: str) -> str | None:
+        """Return the inode of a file and when it was changed."""
+        with _told(self.where(name), "read"):
+            seen = self._path(name).stat()
+        return f"{seen.st_dev} {seen.st_ino} {seen.st_size} {seen.st_mtime_ns} {seen.st_ctime_ns}"
 
     def entries(self, prefix: str = "", *, but: str = "") -> list[Entry]:
         """Return the files below ``prefix/``, by name, without those in folders called ``but``."""

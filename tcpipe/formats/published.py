@@ -11,7 +11,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from tcpipe.formats.content_cache import cached, is_cached
 from tcpipe.formats.json_files import parse_json, typed
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.place import DirectoryPlace, Place
+from tcpipe.formats.proved_content import wrong_files
 from tcpipe.formats.seals import Checksum, Checksums, broken_checksums
 
 logger = logging.getLogger("tcpipe")
@@ -46,6 +47,9 @@ class FetchedShards:
     place: Place
     root: Path
     checksums: Mapping[str, Checksum]
+    proves: bool = False
+    """Whether a shard is held against its checksum before a piece of it is read: each is read whole once, until its ETag changes."""
+    _proved: set[str] = field(default_factory=set)
 
     def size(self, path: Path) -> int:
         """Return the size of a shard [byte]; `FileNotFoundError` where there is none."""
@@ -53,6 +57,7 @@ class FetchedShards:
 
     def read(self, path: Path, offset: int, size: int) -> bytes:
         """Return a piece of a shard that ends with the CRC-32C of the rest; of which the cache holds another it is fetched anew."""
+        self._prove({self._name(path)})
         for _ in range(2):
             held = self._held(path, offset, size)
             data = held.read_bytes()
@@ -63,12 +68,22 @@ class FetchedShards:
 
     def expect(self, pieces: Iterable[tuple[Path, int, int]]) -> None:
         """Have pieces (shard, offset, size) cached that are read soon, fetched side by side."""
+        pieces = list(pieces)
+        self._prove({self._name(path) for path, *_ in pieces})
         absent = [piece for piece in pieces if not is_cached(self._key(*piece))]
         side_by_side(self.place.where(), lambda piece: self._held(*piece), absent)
 
     def whole(self, path: Path) -> Path:
         """Return a cached copy of a whole file."""
         return self.place.local(self._name(path), self._checksum(path))
+
+    def _prove(self, names: set[str]) -> None:
+        """Raise `StoreError` where a shard is not what its card says."""
+        if not self.proves or names <= self._proved:
+            return
+        if wrong := wrong_files(self.place, self.checksums, sorted(names - self._proved)):
+            raise StoreError(*wrong)
+        self._proved.update(names)
 
     def _held(self, path: Path, offset: int, size: int) -> Path:
         key, name = self._key(path, offset, size), self._name(path)

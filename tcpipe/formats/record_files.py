@@ -1,5 +1,7 @@
 """Records: small sealed facts, each a JSON file that is written once, where there was none, and never changed (ADR 50).
 
+One kind goes again: that a call has begun, when it ends.
+
 The name of a record follows from the fact, so that the same fact is one file whoever writes it, and however often.
 """
 
@@ -85,6 +87,37 @@ class Call:
     def end(self) -> str:
         """When it ended, as ``begin``."""
         return (datetime.fromisoformat(self.begin) + timedelta(seconds=self.wall_s)).isoformat(timespec="milliseconds")
+
+
+@dataclass(frozen=True, slots=True)
+class Process:
+    """What tells a process from any other; "" where the system does not tell."""
+
+    host: str
+    machine: str
+    """Identity of the installed system (machine-id)."""
+    boot: str
+    """Identity of this start of the machine."""
+    namespace: str
+    """In which ``pid`` counts: that of a container is its own."""
+    pid: int
+    start: str
+    """When it began, in ticks since the start of the machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """That a call of ingest or build-dataset has begun; the record goes when the call ends, alone of all records."""
+
+    command: str
+    version: str
+    begin: str
+    """UTC, ISO 8601, by the clock of where it runs."""
+    process: Process
+    works_on: tuple[str, ...]
+    """Logs and folders, or the dataset, in full."""
+    options: str
+    """Hash of what else tells its work from that of another call."""
 
 
 @dataclass(frozen=True, slots=True)

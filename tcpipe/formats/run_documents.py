@@ -6,7 +6,7 @@ A key with a default may be missing: documents of data model 1.0 have been writt
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 from tcpipe.formats.seals import Checksum
@@ -53,6 +53,12 @@ class RunJson:
     """The tables of what was read, by their name beside this document."""
     streams_key: str = ""
     """Names the read settings that they were made with."""
+
+
+def tell_the_same(one: RunJson, other: RunJson) -> bool:
+    """Tell whether two documents say the same of a log; what was computed may differ in the last bit on another processor, tags later."""
+    bare = RunJson(one.source).findings
+    return replace(one, streams={}, findings=bare, tags={}) == replace(other, streams={}, findings=bare, tags={})
 
 
 @dataclass(frozen=True, slots=True)

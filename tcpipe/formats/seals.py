@@ -22,6 +22,9 @@ T = TypeVar("T")
 SEAL = "document_sha256"
 """Key of a sealed document that holds the sha256 (hex) of its canonical JSON without this key."""
 
+MOST_PAGE_BYTES = 256 << 20
+"""A sealed page or picture is at most so large [byte]."""
+
 CHECKSUMS = "checksums.json"
 """In a directory whose files cannot be listed elsewhere: a sealed document with the key ``checksums``."""
 
@@ -125,6 +128,8 @@ def broken(path: Path | str) -> str:
 def broken_seal(path: Path) -> str | None:
     """Return in one line why a sealed file (``.json``, ``.html``) or a ``.png`` is not as it was written, None if it is."""
     try:
+        if path.stat().st_size > MOST_PAGE_BYTES:
+            return f"{path}: is larger than {MOST_PAGE_BYTES >> 20} MB, which no page or picture is"
         return broken_seal_in(path.read_bytes(), path)
     except OSError as error:
         return f"{path}: cannot be read ({error.strerror})"
@@ -146,6 +151,10 @@ def broken_checksums(directory: Path, checksums: Mapping[str, Checksum | None]) 
             yield f"{path}: is gone"
             continue
         try:
+            size = path.stat().st_size
+            if wanted is not None and size != wanted.size_bytes:
+                yield f"{path}: has {size} bytes, wanted {wanted.size_bytes}"
+                continue
             found = file_checksum(path)
         except OSError as error:
             yield f"{path}: cannot be read ({error.strerror})"

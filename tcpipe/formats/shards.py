@@ -11,17 +11,17 @@ are written by `tcpipe.formats.zarr_arrays`; what is written here is read by zar
 
 from __future__ import annotations
 
-import json
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+import reprlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import google_crc32c
 import numcodecs
@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError
+from tcpipe.formats.json_files import read_json, typed
 
 DESCRIPTION = "zarr.json"
 """What an array or a group is, in its directory."""
@@ -95,7 +96,7 @@ class ShardedArray:
             if data is None:
                 out[...] = self.fill
             else:
-                self.codec.decode(data, out=out)
+                _decode(self.codec, data, out)
         except FileNotFoundError:
             if not self.sparse:
                 raise StoreError(f"{path}: is gone") from None
@@ -197,7 +198,12 @@ class ShardedArray:
         """Return the shard's table of offsets and sizes, shape (*chunks per shard, 2)."""
         if shard not in self._indices:
             offset, size = self._index_span(end())
-            self._indices[shard] = np.frombuffer(_checked(read, size, offset), "<u8").reshape(*self.per_shard, 2)
+            table = np.frombuffer(_checked(read, size, offset), "<u8").reshape(*self.per_shard, 2)
+            start, length = table[..., 0], table[..., 1]
+            lies_within = (start <= offset) & (length >= _CRC_BYTES) & (length <= offset - np.minimum(start, offset))
+            if not (lies_within | (start == _ABSENT)).all():
+                raise ValueError("its index names bytes beyond it")
+            self._indices[shard] = table
         return self._indices[shard]
 
     def _index_span(self, shard_bytes: int) -> tuple[int, int]:
@@ -206,48 +212,135 @@ class ShardedArray:
         return max(shard_bytes - size, 0), size
 
 
-def open_sharded(path: Path, *, sparse: bool = False, fetched: Fetched | None = None) -> ShardedArray:
-    """Return the array whose description is ``path``/zarr.json; `StoreError` if it is none that this program writes.
+def open_sharded(
+    path: Path,
+    *,
+    shape: tuple[int, ...],
+    chunk_shape: tuple[int, ...],
+    shard_shape: tuple[int, ...],
+    dtype: np.dtype[Any],
+    fill: float,
+    sparse: bool = False,
+    fetched: Fetched | None = None,
+) -> ShardedArray:
+    """Return the array in ``path``, once its description, ``zarr.json``, says that it has the form that is wanted.
 
-    Its shards lie beside the description, or are ``fetched``.
+    Every number comes from the caller, who knows it from a card: of the description only the compression is used.
+
+    Parameters
+    ----------
+    path : directory of the description, and of the shards unless they are ``fetched``.
+    shape, chunk_shape, shard_shape, dtype, fill, sparse : as of `ShardedArray`.
+    fetched : where the shards are; None: on this machine.
+
+    Raises
+    ------
+    StoreError : there is no description, or it says something else.
     """
+    where = path / DESCRIPTION
+    if not where.exists():
+        raise StoreError(f"{path}: is gone")
+    described = read_json(where)
+    compression = _compression_in(described)
+    wanted = {
+        "zarr_format": 3,
+        "node_type": "array",
+        "shape": list(shape),
+        "data_type": dtype.name,
+        "fill_value": "NaN" if math.isnan(fill) else fill,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(shard_shape)}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "codecs": _sharding(list(chunk_shape), dtype, compression),
+        "storage_transformers": [],
+    }
+    for key, value in wanted.items():
+        if described.get(key) != value:
+            raise StoreError(f"{where}: {key} is {reprlib.repr(described.get(key))}, wanted {value}")
+    codec = _codec(compression, where)
+    return ShardedArray(path, shape, chunk_shape, shard_shape, dtype, fill, sparse, codec, fetched)
+
+
+def decoded_chunk(path: Path, data: bytes, size: int) -> bytes:
+    """Return the bytes of a chunk that is a file of its own, which its array's description in ``path`` says how to decode.
+
+    Parameters
+    ----------
+    path : directory of the array.
+    data : the file's bytes, the last of which are its checksum.
+    size : how many bytes the chunk holds; no more are made.
+
+    Raises
+    ------
+    StoreError : the description names no compression that is known.
+    ValueError : the chunk is damaged, or holds more or fewer bytes.
+    """
+    codec = _codec(_compression_in(read_json(path / DESCRIPTION)), path / DESCRIPTION)
+    out = np.empty(size, np.uint8)
+    _decode(codec, _checked(lambda _, __: data, len(data), 0), out)
+    return out.tobytes()
+
+
+def _compression_in(described: Mapping[str, Any]) -> Any:
+    """Return the second codec of an array's chunks, wherever it stands; None where the description has another form."""
     try:
-        described = json.loads((path / DESCRIPTION).read_text(encoding="utf-8"))
-        sharding = described["codecs"][0]["configuration"]
-        names = [codec["name"] for codec in sharding["codecs"]]
-        index_names = [codec["name"] for codec in sharding["index_codecs"]]
-        if names[0] != "bytes" or names[2:] != ["crc32c"] or index_names != ["bytes", "crc32c"]:
-            raise ValueError(f"codecs {names}")  # noqa: TRY301  told below
-        return ShardedArray(
-            path=path,
-            shape=tuple(described["shape"]),
-            chunk_shape=tuple(sharding["chunk_shape"]),
-            shard_shape=tuple(described["chunk_grid"]["configuration"]["chunk_shape"]),
-            dtype=np.dtype(described["data_type"]),
-            fill=float(described["fill_value"]),
-            sparse=sparse,
-            codec=_codec(sharding["codecs"][1]),
-            fetched=fetched,
-        )
-    except FileNotFoundError:
-        raise StoreError(f"{path}: is gone") from None
-    except (OSError, ValueError, KeyError, IndexError, TypeError) as error:
-        raise StoreError(f"{path}: not an array that can be read ({error})") from None
+        codecs = described["codecs"]
+        return (codecs[0]["configuration"]["codecs"] if codecs[0]["name"] == "sharding_indexed" else codecs)[1]
+    except (LookupError, TypeError):
+        return None
 
 
-def _codec(described: dict[str, Any]) -> Any:
+def _sharding(chunk_shape: list[int], dtype: np.dtype[Any], compression: Any) -> list[Any]:
+    """Return the codecs of an array as this program writes them."""
+    little, crc = {"name": "bytes", "configuration": {"endian": "little"}}, {"name": "crc32c"}
+    values = {"name": "bytes"} if dtype.itemsize == 1 else little
+    inner = [values, compression, crc]
+    how = {"chunk_shape": chunk_shape, "codecs": inner, "index_codecs": [little, crc], "index_location": "end"}
+    return [{"name": "sharding_indexed", "configuration": how}]
+
+
+@dataclass(frozen=True, slots=True)
+class _Zstd:
+    level: int
+    checksum: bool
+
+
+@dataclass(frozen=True, slots=True)
+class _Blosc:
+    cname: Literal["zstd", "lz4"]
+    clevel: int
+    shuffle: Literal["noshuffle", "shuffle", "bitshuffle"]
+    blocksize: int
+
+
+def _codec(compression: Any, where: Path) -> Any:
     """Return the codec that a description asks for; it decodes all its settings."""
-    name, how = described["name"], described["configuration"]
+    name = compression.get("name") if isinstance(compression, dict) else None
     if name == "zstd":
-        return numcodecs.Zstd(level=how["level"], checksum=how["checksum"])
+        zstd = typed(compression.get("configuration"), _Zstd, where)
+        return numcodecs.Zstd(level=zstd.level, checksum=zstd.checksum)
     if name == "blosc":
-        return numcodecs.Blosc(
-            cname=how["cname"],
-            clevel=how["clevel"],
-            shuffle=_BLOSC_SHUFFLES[how["shuffle"]],
-            blocksize=how["blocksize"],
-        )
-    raise ValueError(f"codec {name}")
+        blosc = typed(compression.get("configuration"), _Blosc, where)
+        shuffle = _BLOSC_SHUFFLES[blosc.shuffle]
+        return numcodecs.Blosc(cname=blosc.cname, clevel=blosc.clevel, shuffle=shuffle, blocksize=blosc.blocksize)
+    raise StoreError(f"{where}: compressed by {reprlib.repr(name)}, wanted zstd or blosc")
+
+
+def _decode(codec: Any, data: bytes, out: NDArray[Any]) -> None:
+    """Fill ``out`` with what is encoded; `ValueError` where that is more or less."""
+    size = int.from_bytes(data[4:8], "little") if isinstance(codec, numcodecs.Blosc) else _zstd_size(data)
+    if size != out.nbytes:
+        raise ValueError(f"it holds {size} bytes, wanted {out.nbytes}")
+    codec.decode(data, out=out)
+
+
+def _zstd_size(data: bytes) -> int:
+    """Return how many bytes a frame says that it holds (RFC 8878, 3.1.1); 0 where it does not say."""
+    if len(data) < 5:
+        raise ValueError("it is cut short")
+    flag, is_single, has_dictionary = data[4] >> 6, data[4] >> 5 & 1, data[4] & 3
+    start = 5 + (1 - is_single) + (0, 1, 2, 4)[has_dictionary]
+    width = (is_single, 2, 4, 8)[flag]
+    return int.from_bytes(data[start : start + width], "little") + (256 if width == 2 else 0)
 
 
 def _crc(data: bytes) -> bytes:

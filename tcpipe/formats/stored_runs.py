@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -12,7 +12,7 @@ import pyarrow as pa
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.formats.numbered import digest_of, read_as_at
+from tcpipe.formats.numbered import digest_of, name_of, numbers, read_as_at
 from tcpipe.formats.parquet import highest, lowest, read_table, write_table
 from tcpipe.formats.place import DirectoryPlace, Entry, Place
 from tcpipe.formats.recipe_toml import read_key
@@ -112,13 +112,57 @@ class Ingestions:
     outdated: Mapping[str, ManifestHead]
     """By run, of those that are finished in other data-model versions only: the last."""
     damaged: Mapping[tuple[str, str], str]
-    """By run and recipe: what is not as it was written."""
+    """By run and recipe ("" of the whole run): what is not as it was written, or is gone."""
     superseded: Mapping[str, str] = field(default_factory=dict)
     """Runs whose log was completed or repaired, which are in none of the others, and the run that took their place."""
     rows: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
     """Of the index, by run and recipe: of all that are finished, those of superseded runs too."""
+    lost: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
+    """What the index has of those that are damaged or gone: it keeps them, so that nobody takes what is left for all."""
+    unfinished: tuple[str, ...] = ()
+    """Runs without a manifest that the index does not know: on their way, of a killed call, or not copied whole."""
     stale: bool = False
     """Whether the index has to be written again."""
+
+
+def with_lost(
+    found: Ingestions, known: Mapping[tuple[str, str], RunFacts], run_ids: Iterable[str], *, runs: Place, index: Place
+) -> Ingestions:
+    """Return what there is of all runs with what the index knows and the listing lacks, as damaged.
+
+    What `prune` removes is not missed: it is superseded, or of a recipe beside another.
+
+    Parameters
+    ----------
+    found : what was listed.
+    known : the rows of the index, read before.
+    run_ids : the runs of which anything is there.
+    runs, index : where both lie.
+    """
+    damaged, names = dict(found.damaged), set(run_ids)
+    there = {
+        *(run.run_id for run in found.finished),
+        *(name for name, _ in damaged),
+        *found.outdated,
+        *found.superseded,
+    }
+    gone = sorted({name for name, _ in known if name not in there})
+    absent = [name for name in gone if name not in names]
+    few = f"{', '.join(absent[:3])}{f' and {len(absent) - 3} more' if len(absent) > 3 else ''}"
+    what = f"{len(absent)} run{'s are' if len(absent) > 1 else ' is'} gone that the index knows: {few}"
+    why = f"copy the store again, or ingest the logs again; if you removed them, remove {index.where()} too"
+    for name in gone:
+        bare = f"{runs.where(name)}: its manifest-<n>.json is gone; ingest the log again"
+        damaged[name, ""] = bare if name in names else f"{runs.where()}: {what}; {why}"
+    lost = {key: row for key, row in known.items() if key in damaged or key[0] in gone}
+    return replace(found, damaged=damaged, lost=lost, unfinished=tuple(sorted(names - there - set(gone))))
+
+
+def refuse_earlier(place: Place, there: Mapping[str, int], states: str) -> None:
+    """Raise `StoreError` where a document is gone that the index has seen, with the states of files, and an earlier one would hold."""
+    for stem, number in numbers(state.rsplit("-", 2)[0] for state in states.split()).items():
+        if number > there.get(stem, 0):
+            raise StoreError(f"{place.where(name_of(stem, number))}: is gone; ingest the log again")
 
 
 @lru_cache(maxsize=64)

@@ -82,13 +82,3 @@ def consolidate(group: zarr.Group) -> None:
         # zarr's own reservation
         warnings.filterwarnings("ignore", message="Consolidated metadata", category=UserWarning)
         zarr.consolidate_metadata(group.store)
-
-
-def open_group(path: Path) -> zarr.Group:
-    """Open a group for reading. `StoreError`: there is none, or its description is damaged."""
-    if not path.is_dir():
-        raise StoreError(f"{path}: there is no Zarr directory")
-    try:
-        return zarr.open_group(str(path), mode="r")
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StoreError(f"{path}: not a Zarr group that can be read ({error})") from error

@@ -78,6 +78,7 @@ def run_error_state(
     run, outputs = case.passed(timeline, keep=smooth)
     wrong = None
     if errors is not None and run.fixes_contradict():  # again, with an error of theirs where both ends tell of one
+        del run, outputs, timeline  # each takes room as the log is long
         case = replace(case, errors=errors)
         timeline = case.timeline(standing, errors)
         wrong = _wrong_fixes(case, timeline)
@@ -131,6 +132,7 @@ def _wrong_fixes(case: _Case, timeline: EventTimeline) -> WrongFixes | None:
     """Return when the fixes erred together, where that explains what contradicts them."""
     follower, _ = case.passed(timeline)
     known = tuple((r.start_ns, r.end_ns) for r in reopenings(timeline, follower) if r.role == GNSS)
+    del follower
     plain, _ = case.passed(timeline, follows=False)
     usual = plain.usual()
 

@@ -16,6 +16,7 @@ _MOVED_M = 0.1
 _FEWEST = 20
 _MOVES_MPS = 0.2
 _FITS, _FITS_NOT = 0.1, 0.3
+_TURNED_RAD = 0.2
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +42,38 @@ def increments(
     velocity = rotate(inverse(_half_way(quat[:-1], quat[1:])), np.diff(position, axis=0)) / step_s
     near = step_s[:, 0] <= _MAX_INCREMENT_S
     return stamp[:-1][near] + step_ns[near] // 2, velocity[near], (turn / step_s)[near]
+
+
+def orientation_rates(
+    stamp_ns: NDArray[np.int64], rate_radps: Floats, quat_xyzw: Floats
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return angular velocities, by the orientation about every axis about which it turns while they are missing or zero throughout.
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,), not decreasing.
+    rate_radps : in the child frame, shape (N, 3), NaN where not measured.
+    quat_xyzw : shape (N, 4), NaN without.
+
+    Returns
+    -------
+    Angular velocities, shape (N, 3), and which axes are the orientation's, shape (3,).
+    """
+    zero = (np.nan_to_num(rate_radps) == 0.0).all(axis=0)
+    known = np.flatnonzero(np.isfinite(quat_xyzw).all(axis=1))
+    known = known[np.concatenate(([True], np.diff(stamp_ns[known]) > 0))] if known.size else known
+    if not zero.any() or known.size < _FEWEST:
+        return rate_radps, np.zeros(3, np.bool_)
+    stamp, quat = stamp_ns[known], quat_xyzw[known]
+    turned_rad = np.cumsum(rotation_vector_from_quat(product(inverse(quat[:-1]), quat[1:])), axis=0)
+    turns = zero & (np.ptp(turned_rad, axis=0) > _TURNED_RAD)
+    # Over two steps, so that the rate is that in the middle, at the stamp itself.
+    step_s = (stamp[2:] - stamp[:-2])[:, None] * 1e-9
+    rate = rotation_vector_from_quat(product(inverse(quat[:-2]), quat[2:])) / step_s
+    inner, near = known[1:-1], step_s[:, 0] <= _MAX_INCREMENT_S
+    rates = np.where(turns, np.nan, rate_radps)
+    rates[inner[near]] = np.where(turns, rate[near], rate_radps[inner[near]])
+    return rates, turns
 
 
 def along_pose_axes(stamp_ns: NDArray[np.int64], velocity_mps: Floats, pose_m: Floats, quat_xyzw: Floats) -> bool:

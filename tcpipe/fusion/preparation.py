@@ -7,14 +7,14 @@ too good to be true is raised to a floor: a zero covariance is not trust.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.measurements import BodyVelocities, GroundVelocities, InertialMeasurements, Positions
-from tcpipe.fusion.pose_increments import along_pose_axes, has_twist, in_child_axes, increments
+from tcpipe.fusion.pose_increments import along_pose_axes, has_twist, in_child_axes, increments, orientation_rates
 from tcpipe.fusion.signals import median_period_ns, white_noise
 from tcpipe.geometry.datum import enu_from_geodetic
 from tcpipe.geometry.rotation import inverse, matrix_from_quat, normalized, product, rotate
@@ -38,6 +38,14 @@ _GRAVITY_BAND_MPS2 = (8.0, 12.0)
 _DATUM_FIXES = 10
 _NOISE_WINDOW_S = 2.0
 _TURNS_INTO = 0.1
+_PIECE = 1 << 16
+_FEWEST_ROWS = 20
+_SCATTERS_MORE = 3.0
+"""Than is claimed: a speed by counts that come only with every other message does, a rough road does not."""
+_MEAN_S = 0.5
+_SCATTERS = (
+    "its velocity scatters from sample to sample by far more than is claimed: its mean over half a second is used"
+)
 _POSE_AXES = (
     "its twist is along the axes of its pose's frame, not of the robot as nav_msgs/Odometry asks: it is turned by its own pose (mend it "
     "in the driver)"
@@ -117,7 +125,7 @@ def body_velocities(
 ) -> tuple[BodyVelocities, Prepared]:
     """Prepare an odometry (columns of the roles wheel_odometry and visual_odometry).
 
-    Its twist is taken where it has one. A twist that is empty, or zero throughout while the poses move, is none: the velocity is then
+    Its twist is taken where it has one. One that is forward empty, or zero throughout while the poses move, is none: the velocity is then
     that of the increment from pose to pose, in the middle of the two stamps, in the axes half-way between the two. One that is surely
     along the axes of the pose's frame is turned by the pose.
 
@@ -134,7 +142,8 @@ def body_velocities(
     variance = _matrix(columns, [f"velocity_var_{axis}_m2ps2" for axis in "xyz"])
     remarks: tuple[str, ...] = ()
     quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
-    if not has_twist(velocity, pose):
+    rotation = matrix_from_quat(quat_xyzw)
+    if not has_twist(_turned(rotation, velocity)[:, :1], pose):
         stamp_ns, velocity, rate = increments(stamp_ns, pose, quat)
         variance = np.full_like(velocity, np.nan)
         yaw_rate_var = np.full(stamp_ns.size, np.nan)
@@ -144,7 +153,10 @@ def body_velocities(
         if along_pose_axes(stamp_ns, velocity, pose, quat):
             velocity = in_child_axes(velocity, quat)
             remarks = (_POSE_AXES,)
-    rotation = matrix_from_quat(quat_xyzw)
+        rates, of_orientation = orientation_rates(stamp_ns, rate, quat)
+        if of_orientation[2] or not only_forward:
+            rate = rates
+            remarks += _orientation_remarks(of_orientation)
     turned = _turned(rotation, velocity)
     measured = np.isfinite(turned[:, 0]) & ~(np.abs(turned) >= _MAX_VELOCITY_MPS).any(1)
     usable, repeated = _usable(stamp_ns, measured)
@@ -157,6 +169,12 @@ def body_velocities(
     yaw_rate = turn_rate[:, 2]
     floor = _YAW_RATE_FLOOR_RADPS**2
     yaw_rate_var = _variances(yaw_rate_var[usable, None], np.array([_YAW_RATE_STD_RADPS**2]), floor)[0][:, 0]
+    yaw_rate_var = np.maximum(yaw_rate_var, _shown_variance(stamp_ns[usable], yaw_rate, yaw_rate_var))
+    shown = _shown_variance(stamp_ns[usable], turned[:, 0], variance[:, 0])
+    if shown.any():
+        variance = np.maximum(variance, shown[:, None])
+        turned = _moving_mean(stamp_ns[usable], turned)
+        remarks += (_SCATTERS,)
     if only_forward:
         turned[:, 1:] = np.nan
         variance[:, 1:] = np.nan
@@ -166,6 +184,35 @@ def body_velocities(
     spatial = None if only_forward or not np.isfinite(turn_rate).all() else turn_rate
     made = BodyVelocities(stamp_ns[usable], turned, variance, yaw_rate, yaw_rate_var, xyz_m, spatial)
     return made, Prepared(stamp_ns[~measured], repeated, replaced, remarks)
+
+
+def _orientation_remarks(of_orientation: Mask) -> tuple[str, ...]:
+    axes = " and ".join(np.array(["x", "y", "z"])[of_orientation])
+    said = f"its angular velocity about {axes} is zero or missing throughout while its orientation turns: that of the orientation is used"
+    return (said,) if axes else ()
+
+
+def _shown_variance(stamp_ns: Ints, values: Floats, variance: Floats) -> Floats:
+    """Return the variance that samples (N,) show around each where they mostly scatter by much more than is claimed; zeros elsewhere."""
+    known = np.flatnonzero(np.isfinite(values))
+    second = np.abs(np.diff(values[known], n=2))
+    moving = second > 0.0
+    shown = np.zeros(values.size)
+    if moving.sum() < _FEWEST_ROWS:
+        return shown
+    noise = 1.4826 / np.sqrt(6.0) * float(np.median(second[moving]))
+    if noise > _SCATTERS_MORE * float(np.sqrt(np.median(variance[known]))):
+        shown[known] = np.square(_local_noise(stamp_ns[known], values[known, None]))
+    return shown
+
+
+def _moving_mean(stamp_ns: Ints, values: Floats) -> Floats:
+    """Return the mean of the samples (N, k) from a quarter of a second before each to a quarter after."""
+    half_ns = round(_MEAN_S * 0.5e9)
+    first = np.searchsorted(stamp_ns, stamp_ns - half_ns, "left")
+    last = np.searchsorted(stamp_ns, stamp_ns + half_ns, "right")
+    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
+    return np.asarray((total[last] - total[first]) / (last - first)[:, None])
 
 
 def _turned(matrix: Floats, values: Floats) -> Floats:
@@ -191,49 +238,77 @@ def inertial(
     """
     rate = _matrix(columns, [f"angular_velocity_{axis}_radps" for axis in "xyz"])
     force = _matrix(columns, [f"linear_acceleration_{axis}_mps2" for axis in "xyz"])
+    of_orientation = np.zeros(3, np.bool_)
+    if (np.nan_to_num(rate) == 0.0).all(0).any() and np.nan_to_num(
+        np.diff(force, axis=0)
+    ).any():  # a dead IMU stays dead
+        quat = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"]))
+        rate, of_orientation = orientation_rates(stamp_ns, rate, quat)
     # NaN compares false.
     good: Mask = np.all(np.abs(rate) < _MAX_RATE_RADPS, 1) & np.all(np.abs(force) < _MAX_FORCE_MPS2, 1)
     usable, repeated = _usable(stamp_ns, good)
-    rate, force = rate[usable], force[usable]
+    if usable.size < stamp_ns.size:
+        rate, force = rate[usable], force[usable]
     norm = float(np.median(np.linalg.norm(force, axis=1))) if usable.size else 0.0
     low, high = _GRAVITY_BAND_MPS2
-    remarks: tuple[str, ...] = ()
+    remarks = _orientation_remarks(of_orientation)
+    weighs = True
     if usable.size and not low <= norm <= high:
         wanted = "wanted about 9.81 (gravity included, SI units)"
-        remarks = (
+        weighs = False
+        remarks += (
             f"median specific force is {norm:.2f} m/s², {wanted}: only the gyroscope is used, roll and pitch are weak",
         )
     gyro_std = max(gyro_std_radps, white_noise(rate))
     noise = np.maximum(accelerometer_std_mps2, _local_noise(stamp_ns[usable], force))
     accelerometer_std = max(accelerometer_std_mps2, white_noise(force))
-    rate, force = rotate(quat_xyzw, rate), rotate(quat_xyzw, force)
-    force -= _lever_acceleration(stamp_ns[usable], rate, np.asarray(xyz_m))
-    orientation = normalized(_matrix(columns, [f"quat_{c}" for c in "xyzw"])[usable])
+    for piece in _pieces(usable.size):
+        rate[piece], force[piece] = rotate(quat_xyzw, rate[piece]), rotate(quat_xyzw, force[piece])
+    _move_to_base_link(stamp_ns[usable], rate, force, np.asarray(xyz_m))
     made = InertialMeasurements(
         stamp_ns[usable],
         rate,
         force,
-        product(orientation, inverse(quat_xyzw)),
+        _orientations(columns, usable, quat_xyzw),
         gyro_std,
         accelerometer_std,
-        not remarks,
+        weighs,
         accelerometer_noise_mps2=noise,
     )
     return made, Prepared(stamp_ns[~good], repeated, 0, remarks)
 
 
-def _lever_acceleration(stamp_ns: Ints, turn_radps: Floats, lever_m: Floats) -> Floats:
-    """Acceleration of the unit against base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
+def _pieces(rows: int) -> Iterator[slice]:
+    """Yield slices of so many rows: what is reckoned row by row takes little room then, however long a log is."""
+    return (slice(first, first + _PIECE) for first in range(0, rows, _PIECE))
+
+
+def _orientations(columns: Columns, usable: Ints, quat_xyzw: tuple[float, float, float, float]) -> Floats:
+    """Return enu_from_base_link by the unit's own filter, shape (N, 4); NaN where it tells none."""
+    told = [columns[f"quat_{c}"] for c in "xyzw"]
+    if any(np.isnan(component).all() for component in told):
+        return np.broadcast_to(np.nan, (usable.size, 4))
+    found = np.empty((usable.size, 4))
+    for piece in _pieces(usable.size):
+        unit = normalized(np.stack([component[usable[piece]] for component in told], -1))
+        found[piece] = product(unit, inverse(quat_xyzw))
+    return found
+
+
+def _move_to_base_link(stamp_ns: Ints, turn_radps: Floats, force_mps2: Floats, lever_m: Floats) -> None:
+    """Take off the acceleration of the unit against base_link, dw x l + w x (w x l) [m/s²], in base_link axes.
 
     The angular acceleration dw is the slope of a line through five samples (Savitzky and Golay 1964): its noise, added over time,
     cancels out, as that of any derivative.
     """
     if stamp_ns.size < 5 or not lever_m.any():
-        return np.zeros_like(turn_radps)
-    smooth = np.pad(turn_radps, ((2, 2), (0, 0)), mode="edge")
-    slope = (2 * (smooth[4:] - smooth[:-4]) + smooth[3:-1] - smooth[1:-3]) / (10e-9 * median_period_ns(stamp_ns))
-    acceleration: Floats = np.cross(slope, lever_m) + np.cross(turn_radps, np.cross(turn_radps, lever_m))
-    return acceleration
+        return
+    ten_periods_s = 10e-9 * median_period_ns(stamp_ns)
+    for piece in _pieces(stamp_ns.size):
+        rows = np.arange(piece.start - 2, min(piece.stop, stamp_ns.size) + 2)
+        smooth = turn_radps[rows.clip(0, stamp_ns.size - 1)]
+        slope = (2 * (smooth[4:] - smooth[:-4]) + smooth[3:-1] - smooth[1:-3]) / ten_periods_s
+        force_mps2[piece] -= np.cross(slope, lever_m) + np.cross(smooth[2:-2], np.cross(smooth[2:-2], lever_m))
 
 
 def _local_noise(stamp_ns: Ints, values: Floats) -> Floats:
@@ -258,6 +333,8 @@ def _matrix(columns: Columns, names: list[str] | tuple[str, ...]) -> Floats:
 def _usable(stamp_ns: Ints, good: Mask) -> tuple[Ints, int]:
     """Return rows in order of time, one a stamp (the first of equals), and how many repeated one."""
     rows = np.flatnonzero(good)
+    if (np.diff(stamp_ns[rows]) > 0).all():
+        return rows, 0
     _, first = np.unique(stamp_ns[rows], return_index=True)
     return rows[first], int(rows.size - first.size)
 

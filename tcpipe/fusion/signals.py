@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+_MIN_INPUT_GAP_NS = 100_000_000
+
 
 def seconds(stamp_ns: Ints | int, zero_ns: int) -> Floats:
     """Return the time since ``zero_ns`` [s]; the difference is taken before rounding."""
@@ -28,19 +30,18 @@ def integral(stamp_s: Floats, values: Floats, at_s: Floats) -> Floats:
     [u s], shape (M, k).
     """
     step = np.diff(stamp_s)
-    area = 0.5 * (values[1:] + values[:-1]) * step[:, None]
-    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(area, axis=0)))
     index = np.clip(np.searchsorted(stamp_s, at_s, "right") - 1, 0, stamp_s.size - 1)
-    after = (at_s - stamp_s[index])[:, None]
+    after = at_s - stamp_s[index]
     later = np.minimum(index + 1, stamp_s.size - 1)
-    inside = (index < stamp_s.size - 1) & (after[:, 0] > 0)
-    slope = np.where(
-        inside[:, None],
-        (values[later] - values[index]) / np.where(later > index, stamp_s[later] - stamp_s[index], 1.0)[:, None],
-        0.0,
-    )
-    partial: Floats = total[index] + after * (values[index] + 0.5 * after * slope)
-    return partial
+    inside = (index < stamp_s.size - 1) & (after > 0)
+    between = np.where(later > index, stamp_s[later] - stamp_s[index], 1.0)
+    found, total = np.empty((at_s.size, values.shape[1])), np.zeros(stamp_s.size)
+    for axis, value in zip(found.T, values.T, strict=True):  # one by one: a long signal takes room
+        np.cumsum(0.5 * (value[1:] + value[:-1]) * step, out=total[1:])
+        before = value[index]
+        slope = np.where(inside, (value[later] - before) / between, 0.0)
+        axis[:] = total[index] + after * (before + 0.5 * after * slope)
+    return found
 
 
 def interval_means(stamp_s: Floats, values: Floats, start_s: Floats, end_s: Floats) -> Floats:
@@ -69,6 +70,12 @@ def in_gap(stamp_ns: Ints, start_ns: Ints, end_ns: Ints, *, longest_ns: int) -> 
     after = np.clip(np.searchsorted(stamp_ns, end_ns, "left"), 0, stamp_ns.size - 1)
     touches: NDArray[np.bool_] = outside | (long[after] > long[before])
     return touches
+
+
+def is_covered(stamp_ns: Ints, start_ns: Ints, end_ns: Ints) -> NDArray[np.bool_]:
+    """Return whether each interval lies among samples without a gap: three periods of the samples, at least 0.1 s."""
+    longest = max(_MIN_INPUT_GAP_NS, 3 * median_period_ns(stamp_ns))
+    return ~in_gap(stamp_ns, start_ns, end_ns, longest_ns=longest)
 
 
 def hold_last(stamp_ns: Ints, values: Floats, at_ns: Ints) -> Floats:

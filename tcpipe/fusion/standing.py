@@ -48,14 +48,16 @@ def _window(
     """Mean and standard deviation of (N, k) values within half a window of each stamp; NaN where there are none."""
     first = np.searchsorted(stamp_ns, at_ns - _WINDOW_NS // 2, "left")
     last = np.searchsorted(stamp_ns, at_ns + _WINDOW_NS // 2, "right")
-    count = np.where(last > first, last - first, 1)[:, None]
-    zero = np.zeros((1, values.shape[1]))
-    total = np.concatenate((zero, np.cumsum(values, axis=0)))
-    squares = np.concatenate((zero, np.cumsum(values**2, axis=0)))
-    mean = (total[last] - total[first]) / count
-    spread = np.sqrt(np.maximum((squares[last] - squares[first]) / count - mean**2, 0.0))
-    nothing = (last == first)[:, None]
-    return np.where(nothing, np.nan, mean), np.where(nothing, np.nan, spread)
+    count = np.where(last > first, last - first, 1)
+    mean, spread = np.empty((2, at_ns.size, values.shape[1]))
+    total = np.zeros(stamp_ns.size + 1)
+    for k, value in enumerate(values.T):  # one by one: a long signal takes room
+        np.cumsum(value, out=total[1:])
+        mean[:, k] = (total[last] - total[first]) / count
+        np.cumsum(value**2, out=total[1:])
+        spread[:, k] = np.sqrt(np.maximum((total[last] - total[first]) / count - mean[:, k] ** 2, 0.0))
+    mean[last == first] = spread[last == first] = np.nan
+    return mean, spread
 
 
 def _intervals(stamp_ns: NDArray[np.int64], still: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -34,7 +34,7 @@ from tcpipe.fusion.process import (
     shake_density,
     turn_sources,
 )
-from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
+from tcpipe.fusion.signals import interval_means, is_covered, median_period_ns, seconds
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -47,7 +47,6 @@ _MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _STANDING_NS = 200_000_000
 _STANDING_STD_MPS = 0.01
 _LEVEL_NS = 1_000_000_000
-_MIN_INPUT_GAP_NS = 100_000_000
 _PIECE = 1 << 15
 
 
@@ -249,7 +248,7 @@ def _turn_rates(
     if imu is None or imu.stamp_ns.size == 0:
         return _odometric_turn_rate(measurements, before_ns, after_ns, zero_ns)
     rate, mode = np.zeros((before_ns.size, 3)), np.full(before_ns.size, kernel.GYRO_TURN, np.int8)
-    covered = _covered(imu.stamp_ns, before_ns, after_ns)
+    covered = is_covered(imu.stamp_ns, before_ns, after_ns)
     rate[covered] = _means(imu, imu.angular_velocity_radps, before_ns[covered], after_ns[covered], zero_ns)
     rate[~covered], mode[~covered] = _odometric_turn_rate(
         measurements, before_ns[~covered], after_ns[~covered], zero_ns
@@ -270,12 +269,6 @@ def _means(imu: InertialMeasurements, values: Floats, before_ns: Ints, after_ns:
     return found
 
 
-def _covered(stamp_ns: Ints, before_ns: Ints, after_ns: Ints) -> NDArray[np.bool_]:
-    """Whether each interval lies among samples without a gap."""
-    longest = max(_MIN_INPUT_GAP_NS, 3 * median_period_ns(stamp_ns))
-    return ~in_gap(stamp_ns, before_ns, after_ns, longest_ns=longest)
-
-
 def _odometric_turn_rate(
     measurements: Measurements, before_ns: Ints, after_ns: Ints, zero_ns: int
 ) -> tuple[Floats, NDArray[np.int8]]:
@@ -292,7 +285,7 @@ def _odometric_turn_rate(
         known = np.isfinite(source.yaw_rate_radps)
         turns = source.turn_rate_radps
         values = np.stack((0 * source.yaw_rate_radps,) * 2 + (source.yaw_rate_radps,), -1) if turns is None else turns
-        inside = _covered(source.stamp_ns[known], before_ns, after_ns) | (rank == 0)
+        inside = is_covered(source.stamp_ns[known], before_ns, after_ns) | (rank == 0)
         stamp_s = seconds(source.stamp_ns[known], zero_ns)
         rate[inside] = interval_means(stamp_s, values[known], start_s[inside], end_s[inside])
         mode[inside] = kernel.VISUAL_TURN if source is measurements.visual else kernel.FLAT_TURN

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -26,7 +26,17 @@ from numpy.typing import NDArray
 
 from tcpipe.fusion import ukf15_kernel as kernel
 from tcpipe.fusion.gates import chi_square_gate
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, BodyVelocities, InitialState, Measurements
+from tcpipe.fusion.measurements import (
+    GNSS,
+    IMU,
+    VISUAL,
+    WHEELS,
+    BodyVelocities,
+    InertialMeasurements,
+    InitialState,
+    Measurements,
+)
+from tcpipe.fusion.signals import is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
 from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
@@ -222,16 +232,20 @@ def sources_of(measurements: Measurements, initial: InitialState, *, end_ns: int
     -------
     list of SensorRows : in the order in which measurements of one stamp are fused.
     """
+    imu = measurements.imu
     sensors = (
         _imu_sources(measurements, initial)
-        + _velocity_sources(WHEELS, measurements.wheels, with_yaw_rate=measurements.imu is None)
-        + _velocity_sources(VISUAL, measurements.visual, with_yaw_rate=True)
+        + _velocity_sources(WHEELS, measurements.wheels, imu)
+        + _velocity_sources(VISUAL, measurements.visual)
         + _gnss_sources(measurements)
     )
     start_ns = min(int(source.stamp_ns[0]) for source in sensors if source.stamp_ns.size)
     std = measurements.nonholonomic_std_mps
     ground = _held(_GROUND, {kernel.VY: std, kernel.VZ: std}, start_ns, end_ns, _GROUND_PERIOD_NS)
-    return [*sensors, ground, *_priors(sensors, start_ns, end_ns)]
+    priors = _priors(sensors, start_ns, end_ns)
+    if imu is not None:  # in its gaps the filter must not go on turning and accelerating as it did before them
+        priors += _in_gaps(imu, _priors([source for source in sensors if source.role != IMU], start_ns, end_ns))
+    return [*sensors, ground, *priors]
 
 
 def _imu_sources(measurements: Measurements, initial: InitialState) -> list[SensorRows]:
@@ -255,8 +269,10 @@ def _imu_sources(measurements: Measurements, initial: InitialState) -> list[Sens
     return sources
 
 
-def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_rate: bool) -> list[SensorRows]:
-    """One source for each combination of entries that the odometry gives."""
+def _velocity_sources(
+    role: str, odometry: BodyVelocities | None, imu: InertialMeasurements | None = None
+) -> list[SensorRows]:
+    """One source for each combination of entries that the odometry gives; its yaw rate only where that ``imu`` gives none."""
     if odometry is None:
         return []
     lever = odometry.lever_arm_m
@@ -273,7 +289,9 @@ def _velocity_sources(role: str, odometry: BodyVelocities | None, *, with_yaw_ra
             entries = tuple(int(first + column) for column in columns)
             sources.append(SensorRows(role, kind, entries, odometry.stamp_ns[rows], z, variance, lever))
     rows = np.isfinite(odometry.yaw_rate_radps)
-    if with_yaw_rate and rows.any():
+    if imu is not None:
+        rows &= ~is_covered(imu.stamp_ns, odometry.stamp_ns, odometry.stamp_ns)
+    if rows.any():
         z = odometry.yaw_rate_radps[rows, None]
         scale_std = SKID_STD if role == WHEELS else SCALE_STD
         variance = odometry.yaw_rate_var[rows, None] + per_second * np.square(scale_std * z)
@@ -307,6 +325,17 @@ def _priors(sensors: Sequence[SensorRows], start_ns: int, end_ns: int) -> list[S
         for stds, period_ns in ((calm, _GROUND_PERIOD_NS), (level, _LEVEL_PERIOD_NS))
         if stds
     ]
+
+
+def _in_gaps(imu: InertialMeasurements, sources: Sequence[SensorRows]) -> list[SensorRows]:
+    """Return the rows of sources that lie in gaps of an IMU; without any, none."""
+    found = []
+    for source in sources:
+        rows = ~is_covered(imu.stamp_ns, source.stamp_ns, source.stamp_ns)
+        if rows.any():
+            inside = {name: getattr(source, name)[rows] for name in ("stamp_ns", "z", "variance")}
+            found.append(replace(source, **inside))
+    return found
 
 
 def _gate(source: SensorRows, probability: float) -> float:

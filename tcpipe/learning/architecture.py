@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 
 from tcpipe.errors import ModelError
+from tcpipe.formats.weights import ArrayForm
 
 BLOCK = 16
 """Channels that CPU convolutions hold together: of fewer, oneDNN, by which PyTorch convolves there, writes beyond its memory in the
@@ -26,9 +27,40 @@ class Architecture:
     """Numbers that it takes beside a patch, each as a channel of one value."""
 
 
+_MOST_WIDTH = 512
+_MOST_INPUTS = 1024
+"""Channels, numbers beside them, and outputs."""
+
+
+def weight_forms(shape: Architecture) -> dict[str, ArrayForm]:
+    """Return names, types and shapes of the weights of a network in a file, without making it (`tcpipe.learning.network`)."""
+    forms: dict[str, tuple[int, ...]] = {}
+
+    def add(name: str, depth: int, filters: int, size: int) -> None:
+        forms[f"{name}_convolution/kernel"] = size, size, depth, filters
+        forms.update({f"{name}_norm/{of}": (filters,) for of in ("gamma", "beta", "moving_mean", "moving_variance")})
+
+    add("stem", shape.depth + shape.beside, shape.width, 7)
+    depth = shape.width
+    for stage in range(4):
+        for block in range(2):
+            name, filters = f"stage{stage + 1}_block{block + 1}", shape.width << stage
+            add(f"{name}_first", depth, filters, 3)
+            add(f"{name}_second", filters, filters, 3)
+            if depth != filters:
+                add(f"{name}_shortcut", depth, filters, 1)
+            depth = filters
+    forms |= {"head/kernel": (depth, shape.outputs), "head/bias": (shape.outputs,)}
+    return {name: ("float32", of) for name, of in forms.items()}
+
+
 def check_trainable(shape: Architecture) -> None:
     """Raise `ModelError` if torch is not installed or the width is no multiple of `BLOCK`."""
     if find_spec("torch") is None:
         raise ModelError("torch not installed, wanted to train or use a network: pip install 'tcpipe[train]'")
-    if shape.width % BLOCK:
-        raise ModelError(f"a network of width {shape.width}: wanted a multiple of {BLOCK}, from {BLOCK} to 512")
+    if shape.width % BLOCK or not BLOCK <= shape.width <= _MOST_WIDTH:
+        raise ModelError(
+            f"a network of width {shape.width}: wanted a multiple of {BLOCK}, from {BLOCK} to {_MOST_WIDTH}"
+        )
+    if not (0 < shape.depth + shape.beside <= _MOST_INPUTS and 0 < shape.outputs <= _MOST_INPUTS):
+        raise ModelError(f"a network of {shape.depth} channels, {shape.beside} numbers and {shape.outputs} outputs")

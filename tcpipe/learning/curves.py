@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError
+from tcpipe.formats.weights import ArrayForm
 
 Floats = NDArray[np.float64]
 Form: TypeAlias = Literal["mean", "linear", "spline"]
@@ -51,18 +52,35 @@ class Curves:
         return {f"{_STORED}{name}": getattr(self, name) for name in _ARRAYS}
 
 
+_MOST_KNOTS, _MOST_CLASSES = 6, 256
 _ARRAYS, _STORED = ("knots_rad", "pooled", "class_id", "own"), "curve_"
+
+
+def curve_forms(outputs: int) -> dict[str, ArrayForm]:
+    """Return types and shapes of the arrays of curves of so many outputs."""
+    forms: dict[str, ArrayForm] = {
+        "knots_rad": ("float64", ("knots",)),
+        "pooled": ("float64", ("functions", outputs)),
+        "class_id": ("int64", ("classes",)),
+        "own": ("float64", ("classes", "functions", outputs)),
+    }
+    return {f"{_STORED}{name}": form for name, form in forms.items()}
 
 
 def curves_of(form: Form, arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[Curves, dict[str, NDArray[Any]]]:
     """Return the curves that `Curves.arrays` told of, and what else is there; `ModelError` if they are not there."""
     rest = dict(arrays)
     try:
-        return Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS)), rest
+        curves = Curves(form, *(rest.pop(f"{_STORED}{name}") for name in _ARRAYS))
     except KeyError:
         raise ModelError(
             f"{where}: holds the weights of another model, or of an older kind; train the model again"
         ) from None
+    functions = _functions(form, curves.knots_rad, np.zeros(1)).shape[1] if curves.knots_rad.size <= _MOST_KNOTS else 0
+    finite = all(np.isfinite(of).all() for of in (curves.knots_rad, curves.pooled, curves.own))
+    if len(curves.pooled) != functions or not finite or len(curves.class_id) > _MOST_CLASSES:
+        raise ModelError(f"{where}: holds curves that no training makes; train the model again")
+    return curves, rest
 
 
 def fit_curves(form: Form, slope_rad: Floats, class_id: NDArray[np.int64], labels: Floats) -> Curves:

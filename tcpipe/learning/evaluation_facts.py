@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, TypeAlias, TypedDict
+from typing import Annotated, Literal, TypeAlias, TypedDict
+
+from annotated_types import Ge, Le
 
 from tcpipe.balance.repeats import Floor
 from tcpipe.dataset.energies import EnergyName
+from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors
 from tcpipe.learning.model_card import Training
 from tcpipe.learning.ratios import Ratio
@@ -25,13 +28,13 @@ ErrorsByClass: TypeAlias = Mapping[str, Mapping[str, Errors]]
 class EvaluateConfig:
     """How much is evaluated."""
 
-    draws: int = 5
+    draws: Annotated[int, Ge(1), Le(1000)] = 5
     """Draws of noise that each ablated input set is the mean of."""
     baselines: bool = True
     """Train the networks of Wei & Isler."""
     retrain: bool = False
     """Train a network for each input set of the ablation, too."""
-    seed: int = 0
+    seed: Seed = 0
     """Of the noise."""
     plotted: int = 21
     """Patches a class in the pictures."""

@@ -7,9 +7,10 @@ import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
+from annotated_types import Ge, Gt, Le
 from numpy.typing import NDArray
 
 from tcpipe.dataset import Split
@@ -28,6 +29,9 @@ logger = logging.getLogger("tcpipe")
 
 ModelKind = Literal["resnet18", "table", "physics"]
 """The paper's network on patches, boosted trees on features of them, or coefficients of physics."""
+
+Seed = Annotated[int, Ge(0), Le(2**32 - 1)]
+"""What every generator of random numbers takes."""
 
 Floats = NDArray[np.float32]
 
@@ -52,21 +56,21 @@ class FitConfig:
 
     model: ModelKind = "resnet18"
     loss: Loss = "nrmse"
-    epochs: int = 100
+    epochs: Annotated[int, Ge(1), Le(100_000)] = 100
     """At most."""
-    patience: int = 12
+    patience: Annotated[int, Ge(1), Le(100_000)] = 12
     """Epochs without a better loss of the held-out fold before training stops."""
-    batch: int = 64
-    learning_rate: float = 1e-4
-    seed: int = 0
+    batch: Annotated[int, Ge(1), Le(65_536)] = 64
+    learning_rate: Annotated[float, Gt(0), Le(1)] = 1e-4
+    seed: Seed = 0
     """Of weights, shuffles and mirrors."""
-    fold: int = 0
+    fold: Annotated[int, Ge(0), Le(99)] = 0
     """Of train, that training is stopped by; the rest is fitted."""
     mirror: bool = True
     """Mirror every other patch across its direction of travel."""
     weights: bool = False
     """Weigh each label by its inverse variance."""
-    width: int = 64
+    width: Annotated[int, Ge(16), Le(512)] = 64
     """Filters of the first stage, a multiple of 16."""
     label: EnergyName = "total"
     """Which energy is trained on: all that was measured, or what is above standing."""

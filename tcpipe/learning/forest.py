@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tcpipe.compiled import kernel
 from tcpipe.errors import ModelError
+from tcpipe.formats.weights import ArrayForm
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.uint32]
@@ -47,7 +48,11 @@ class Forest:
     """That each tree adds to."""
 
     def predict(self, features: Floats) -> Floats:
-        """Return outputs, shape (N, outputs), of features, shape (N, features)."""
+        """Return outputs, shape (N, outputs), of features, shape (N, features); `ModelError` where a node asks for another one."""
+        if self.feature.max(initial=0) >= features.shape[1]:
+            raise ModelError(
+                f"trees of {self.feature.max() + 1} features or more, got {features.shape[1]}; train the model again"
+            )
         out = np.zeros((len(features), int(self.output.max()) + 1))
         _descend(np.ascontiguousarray(features), *(getattr(self, of.name) for of in fields(self)), out)
         return out
@@ -57,11 +62,29 @@ class Forest:
         return asdict(self)
 
 
+_INDICES, _NUMBERS = ("uint32", ("nodes",)), ("float64", ("nodes",))
+FOREST_FORMS: Mapping[str, ArrayForm] = {
+    "feature": _INDICES, "threshold": _NUMBERS, "child": ("uint32", ("nodes", 2)), "value": _NUMBERS,
+    "root": ("uint32", ("trees",)), "depth": ("uint32", ("trees",)), "output": ("uint32", ("trees",)),
+}  # fmt: skip
+"""Types and shapes of a forest's arrays."""
+_MOST_FEATURES, _MOST_DEPTH, _MOST_OUTPUTS = 100_000, 64, 1024
+
+
 def forest_of(arrays: Mapping[str, NDArray[Any]], where: str) -> Forest:
     """Return the forest that `Forest.arrays` told of; `ModelError` if these are another model's."""
     if arrays.keys() != {of.name for of in fields(Forest)}:
         raise ModelError(f"{where}: holds the weights of another model; remove it and train the model again")
-    return Forest(**arrays)
+    made = Forest(**arrays)
+    nodes = len(made.feature)
+    most = {
+        "child": nodes, "root": nodes, "feature": _MOST_FEATURES, "output": _MOST_OUTPUTS, "depth": _MOST_DEPTH,
+    }  # fmt: skip
+    if not made.root.size or any((getattr(made, name) >= bound).any() for name, bound in most.items()):
+        raise ModelError(f"{where}: holds trees that lead nowhere; train the model again")
+    if not (np.isfinite(made.threshold).all() and np.isfinite(made.value).all()):
+        raise ModelError(f"{where}: holds trees with numbers that are not finite; train the model again")
+    return made
 
 
 @dataclass(frozen=True, slots=True)

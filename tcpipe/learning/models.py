@@ -30,10 +30,10 @@ from tcpipe.formats.parquet import read_table, write_table
 from tcpipe.formats.published import here, here_by_range
 from tcpipe.formats.seals import broken_checksums, file_checksums, read_sealed, sealed, write_sealed
 from tcpipe.formats.weights import read_arrays, write_arrays
-from tcpipe.learning.architecture import check_trainable
+from tcpipe.learning.architecture import check_trainable, weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
-from tcpipe.learning.physics_model import PhysicsModel, physics_model_of
+from tcpipe.learning.physics_model import PhysicsModel, physics_forms, physics_model_of
 from tcpipe.tables.findings import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
@@ -79,22 +79,25 @@ class Model:
         check_trainable(self.card.architecture)
         from tcpipe.learning.network import resnet18  # noqa: PLC0415  torch takes seconds and half a gigabyte
 
+        arrays = read_arrays(self.place / WEIGHTS, weight_forms(self.card.architecture))
         network = resnet18(self.card.architecture, seed=0, start=[0.0] * self.card.architecture.outputs)
-        network.set_arrays(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
+        network.set_arrays(arrays, str(self.place / WEIGHTS))
         return network
 
     @cached_property
     def table(self) -> TableModel:
         """Return the curves and trees of a table."""
-        from tcpipe.learning.table_model import table_model_of  # noqa: PLC0415  numba takes a second
+        from tcpipe.learning.table_model import table_forms, table_model_of  # noqa: PLC0415  numba takes a second
 
-        arrays = read_arrays(self.place / WEIGHTS)
+        arrays = read_arrays(self.place / WEIGHTS, table_forms(len(self.card.outputs)))
         return table_model_of(arrays, str(self.place / WEIGHTS), self.channels, self.classes.count)
 
     @cached_property
     def physics_model(self) -> PhysicsModel:
         """Return the coefficients of a model of physics."""
-        return physics_model_of(read_arrays(self.place / WEIGHTS), str(self.place / WEIGHTS))
+        older = ("drivetrain_newton",)
+        arrays = read_arrays(self.place / WEIGHTS, physics_forms(), optional=older)
+        return physics_model_of(arrays, str(self.place / WEIGHTS))
 
     @property
     def takes_turns(self) -> bool:
@@ -245,7 +248,7 @@ def load_model(path: str | Path) -> Model:
     return Model(str(path), card, place, card_checksum(card), residuals)
 
 
-def chosen_model(path: str, *, physics: str | None = None, speed_mps: float | None = None) -> Model:
+def chosen_model(path: str | Path, *, physics: str | Path | None = None, speed_mps: float | None = None) -> Model:
     """Return a model as `load_model`, with the physics of a dataset and asked for a commanded speed [m/s] where these are given."""
     model = load_model(path)
     model = model if physics is None else with_physics(model, physics)

@@ -14,7 +14,8 @@ from tcpipe.dataset import Split
 from tcpipe.dataset.beside import Beside
 from tcpipe.dataset.energies import ENERGIES
 from tcpipe.errors import ModelError
-from tcpipe.learning.curves import Curves, curves_of, fit_curves
+from tcpipe.formats.weights import ArrayForm
+from tcpipe.learning.curves import Curves, curve_forms, curves_of, fit_curves
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 
 Floats = NDArray[np.float64]
@@ -60,12 +61,20 @@ class PhysicsModel:
 _NUMBERS = tuple(of.name for of in fields(PhysicsModel) if of.name != "speed")
 
 
+def physics_forms() -> dict[str, ArrayForm]:
+    """Return types and shapes of the arrays of a model of physics."""
+    by_class = ("rolling_newton", "turning_joule_per_rad")
+    return {**{name: ("float64", (_CLASSES,) if name in by_class else ()) for name in _NUMBERS}, **curve_forms(1)}
+
+
 def physics_model_of(arrays: Mapping[str, NDArray[Any]], where: str) -> PhysicsModel:
     """Return the model that `PhysicsModel.arrays` told of; `ModelError` if these are another's."""
     speed, rest = curves_of("linear", arrays, where)
     rest = {"drivetrain_newton": np.array(0.0), **rest}  # models before 0.7 have all of it in P0
     if rest.keys() != set(_NUMBERS):
         raise ModelError(f"{where}: holds the weights of another model; train the model again")
+    if not all(np.isfinite(of).all() for of in rest.values()):
+        raise ModelError(f"{where}: holds coefficients that are not finite; train the model again")
     return PhysicsModel(speed, **rest)
 
 

@@ -180,13 +180,13 @@ def _timed(result: Reproduction, stage: str) -> Iterator[None]:
 def _build(place: Path, site: SimulatedSite, jobs: int) -> None:
     """Read the logs, add the map and build the dataset, as a user would."""
     store = place / "store"
-    ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs)
+    ingested = ingest(site.logs, store=store, recipe=RECIPE, jobs=jobs, force=True)
     problems = [problem for result in ingested.results for problem in (*result.problems, *result.damage)]
     if problems:
         raise DatasetError(*problems)
     height, ortho, terrain, classes = (site.rasters[name] for name in ("height", "ortho", "terrain", "classes"))
     add_map("site", height=height, ortho=ortho, terrain=terrain, classes=classes, store=store)
-    built = build_dataset(place / "dataset", store=store, split=site.region, recipe=RECIPE, jobs=jobs)
+    built = build_dataset(place / "dataset", store=store, split=site.region, recipe=RECIPE, jobs=jobs, force=True)
     logger.info("%s", str(built).splitlines()[0])
 
 

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.learning.curves import Curves, curves_of, fit_curves
-from tcpipe.learning.forest import Forest, forest_of, grow
+from tcpipe.formats.weights import ArrayForm
+from tcpipe.learning.curves import Curves, curve_forms, curves_of, fit_curves
+from tcpipe.learning.forest import FOREST_FORMS, Forest, forest_of, grow
 from tcpipe.learning.patch_features import slope_and_class
 
 Floats = NDArray[np.float64]
@@ -36,6 +37,11 @@ class TableModel:
     def arrays(self) -> dict[str, NDArray[np.generic]]:
         """Return curves and trees by name."""
         return {**self.forest.arrays(), **self.curves.arrays()}
+
+
+def table_forms(outputs: int) -> dict[str, ArrayForm]:
+    """Return types and shapes of the arrays of a table model of so many outputs."""
+    return {**FOREST_FORMS, **curve_forms(outputs)}
 
 
 def table_model_of(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,12 +47,12 @@ _COUNTED = "it counts simulated time, which runs forward"
 class TopicTimes:
     """A topic's times in log-time order: log time and header stamp [ns], shape (N,), the header's 0 where unset.
 
-    ``content`` (N, k) tells an exact duplicate from a repeated stamp; ``prefer`` and ``offset_ns`` are the recipe's.
+    ``content``, columns of shape (N,), tells an exact duplicate from a repeated stamp; ``prefer`` and ``offset_ns`` are the recipe's.
     """
 
     log_time_ns: Ints
     header_ns: Ints | None
-    content: NDArray[np.float64]
+    content: Sequence[NDArray[Any]]
     prefer: Literal["auto", "header", "log"] = "auto"
     offset_ns: int = 0
 
@@ -295,8 +295,11 @@ def _stray_share(times: TopicTimes, known: Mask, own_steps: Sequence[tuple[int, 
 def _repeated_share(times: TopicTimes) -> float:
     if times.header_ns is None or len(times.header_ns) < 2 * _FEWEST:
         return 0.0
-    other = np.any(np.diff(times.content, axis=0) != 0, axis=-1)
-    return float(np.mean((np.diff(times.header_ns) == 0) & other))
+    again = np.diff(times.header_ns) == 0
+    rows = np.flatnonzero(again)
+    other = [column[rows + 1].astype(np.float64) - column[rows] != 0 for column in times.content]
+    again[rows] = np.any(other, axis=0)
+    return float(np.mean(again))
 
 
 def _leaps(times: TopicTimes, known: Mask) -> Mask:
@@ -341,10 +344,9 @@ def _timeline(times: TopicTimes, draft: _Draft, moves: Sequence[int]) -> Timelin
     order = rows[np.lexsort((rows, stamps[rows], draft.epoch[rows]))]
     again = _repeats(stamps[order], draft.epoch[order])
     same = np.zeros(len(order), bool)
-    content = times.content[order]
-    same[1:] = again[1:] & np.all(
-        (content[1:] == content[:-1]) | (np.isnan(content[1:]) & np.isnan(content[:-1])), axis=-1
-    )
+    repeats = np.flatnonzero(again)
+    pairs = ((column[order[repeats]], column[order[repeats - 1]]) for column in times.content)
+    same[repeats] = np.all([(a == b) | (np.isnan(a) & np.isnan(b)) for a, b in pairs], axis=0)
     dropped = {
         "unset_stamps": int(np.count_nonzero(~draft.usable)),
         "late": int(np.count_nonzero(draft.usable & (late >= LATE_NS))),

@@ -111,7 +111,7 @@ _YEARS_S = (3e8, 1e10)
 _LEAPS = ((1_341_100_800, 16), (1_435_708_800, 17), (1_483_228_800, 18))
 """From when [s since 1970] GPS time is how far ahead of UTC [s] (IERS Bulletin C)."""
 
-_SOURCE = re.compile(r"\s*([\w.]+)(?:\[(\d+)\])?\s*(?:\*\s*([-+.\w]+))?\s*")
+_SOURCE = re.compile(r"\s*+([\w.]++)(?:\[(\d++)\])?\s*+(?:\*\s*+([-+.\w]++)\s*+)?")
 
 
 def mapping_problems(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.geometry.rotation import normalized
 from tcpipe.logs import roles
 from tcpipe.logs.nmea import STATUS_AND_STD_OF_QUALITY, read_gga, read_over_ground, with_date
+from tcpipe.recipe.suggestions import suggested
 
 Columns = Mapping[str, NDArray[Any]]
 Floats = NDArray[np.float64]
@@ -83,7 +84,9 @@ def frames(columns: Columns, type_name: str) -> dict[str, int]:
     name = "child_frame_id" if type_name == roles.ODOMETRY else "header.frame_id"
     if name not in columns or type_name in (roles.POSE_STAMPED, roles.POSE_WITH_COVARIANCE_STAMPED):
         return {}
-    texts, counts = np.unique(columns[name].astype(str), return_counts=True)
+    told = columns[name]
+    alike = told.size > 0 and told.strides[0] == 0
+    texts, counts = (told[:1], [told.size]) if alike else np.unique(told.astype(str), return_counts=True)
     found: dict[str, int] = {}
     for text, count in zip(texts, counts, strict=True):
         found[text.lstrip("/")] = found.get(text.lstrip("/"), 0) + int(count)
@@ -106,12 +109,13 @@ def _kept(columns: Columns, values: dict[str, NDArray[Any]], drops: Mapping[str,
             dropped[reason] = count
         keep &= ~mask
     row = np.flatnonzero(keep)
+    every = slice(None) if row.size == keep.size else row  # nothing is copied where every row is used
     stamps = header_ns(columns)
     return Readings(
         row,
-        columns[LOG_TIME][row].astype(np.int64),
-        None if stamps is None else stamps[row],
-        {name: value[row] for name, value in values.items()},
+        columns[LOG_TIME][every].astype(np.int64, copy=False),
+        None if stamps is None else stamps[every],
+        {name: value[every] for name, value in values.items()},
         dropped,
         **extra,
     )
@@ -261,7 +265,7 @@ def _read_nmea(columns: Columns) -> Readings:
         found.columns,
         {**({"not_gga": others} if others else {}), **found.dropped},
         {"without_separation": int(np.count_nonzero(~known[found.row]))},
-        (*warnings, *_apart(own_time_ns, found.header_ns)),
+        warnings,
         own_time_ns,
     )
 
@@ -269,15 +273,16 @@ def _read_nmea(columns: Columns) -> Readings:
 _APART_S = 0.25
 
 
-def _apart(own_time_ns: Ints, stamps_ns: Ints | None) -> tuple[str, ...]:
-    """Return a warning where the sentences' UTC and their header stamps differ by more than reading a serial port takes."""
-    if stamps_ns is None or not (known := (own_time_ns > 0) & (stamps_ns > 0)).any():
+def apart_from_header(readings: Readings) -> tuple[str, ...]:
+    """Return a warning where the UTC of a receiver's sentences, which rules, lies further from their headers than a serial port takes."""
+    own_time_ns, stamps_ns = readings.own_time_ns, readings.header_ns
+    if own_time_ns is None or stamps_ns is None or not (known := (own_time_ns > 0) & (stamps_ns > 0)).any():
         return ()
     apart_s = float(np.median(own_time_ns[known] - stamps_ns[known])) / 1e9
     if abs(apart_s) <= _APART_S:
         return ()
     what = f"the UTC in its sentences is {apart_s:+.3f} s from their header stamps; the sentences' rules"
-    return (f'{what}, unless the recipe says [read.time] gnss = "header"',)
+    return (what + suggested("to let the headers rule", {"read.time": {"gnss": "header"}}),)
 
 
 def _ground_velocity(velocity: Floats, variances: Floats, status: NDArray[Any] | int = -1) -> dict[str, NDArray[Any]]:

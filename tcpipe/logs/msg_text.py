@@ -22,7 +22,7 @@ _KNOWN_AS = {
     "duration": "builtin_interfaces/msg/Duration",
     "Header": "std_msgs/msg/Header",
 }
-_SECTION = re.compile(r"={40,}[ \t]*\nMSG:[ \t]*([\w/]+)[ \t]*\n")
+_SECTION = re.compile(r"(?<!=)={40,}+[ \t]*+\nMSG:[ \t]*+([\w/]++)[ \t]*+\n")
 _FIELD = re.compile(
     r"(?P<type>[A-Za-z][\w/]*)(?:<=(?P<limit>\d+))?(?P<array>\[(?P<most><=)?(?P<size>\d*)\])?[ \t]+(?P<name>[A-Za-z]\w*)[ \t]*(?P<rest>.*)"
 )

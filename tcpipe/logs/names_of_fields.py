@@ -10,8 +10,9 @@ from tcpipe.logs.mapped import MAPPED
 from tcpipe.logs.msg_text import BASE_TYPES, FieldTypes, MsgTextError, parse_msg
 from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
 from tcpipe.logs.topics import Topic
+from tcpipe.recipe.suggestions import suggested
 
-_ANY_UNIT = re.compile(r"\s*[\[(].*|_?(deg|rad|m|mps2?|radps|volt|amp)$")
+_ANY_UNIT = re.compile(r"(?<!\s)\s*+[\[(].*|_?(deg|rad|m|mps2?|radps|volt|amp)$")
 
 
 def _axes(before: str, name: str) -> dict[str, str]:
@@ -76,10 +77,9 @@ def proposed_roles(topics: Iterable[Topic], settled: Collection[str]) -> Iterato
             continue
         for topic in held:
             if found := fields_called(role, _numbers(topic)):
-                lines = ", ".join(f'{role}.{field} = "{name}"' for field, name in found.items())
-                yield (
-                    f"{topic.name} ({topic.type_name}) could play {role}, by what its fields are called; where their units and axes "
-                    f'are right, the recipe says: [read.topics] {role} = ["{topic.name}"] and [read.fields] {lines}'
+                yield f"{topic.name} ({topic.type_name}) could play {role}, by what its fields are called" + suggested(
+                    "where their units and axes are right",
+                    {"read.topics": {role: [topic.name]}, "read.fields": {role: found}},
                 )
 
 

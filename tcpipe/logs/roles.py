@@ -19,6 +19,7 @@ from tcpipe.logs.several_robots import namespaces_of_robots, which_robot
 from tcpipe.logs.topic_texts import LISTED, listing, short_list
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
+from tcpipe.recipe.suggestions import RecipeFragment, suggested
 from tcpipe.robots.profiles import Profiles
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
@@ -534,28 +535,27 @@ def _are_sides(names: Sequence[str]) -> bool:
 def _recipe_line(role: str, names: Sequence[str]) -> str:
     others = "".join(f' or ["{name}"]' for name in names[1:])
     summed = f", or several to be summed: [{', '.join(f'{chr(34)}{name}{chr(34)}' for name in names)}]"
-    return f'{role} = ["{names[0]}"]  #{others}{summed if role == "power" else ""}'
+    line = RecipeFragment({"read.topics": {role: [names[0]]}}).toml().splitlines()[-1]
+    return f"{line}  #{others}{summed if role == 'power' else ''}"
 
 
 def _questions(decided: _Decisions) -> list[str]:
-    """Return what is ambiguous, and the recipe lines that would settle it."""
-    if not decided.ambiguous:
-        return []
-    how = ["settle it in the recipe (tcpipe.toml), for example:", "[read.topics]"]
-    return [*decided.ambiguous, *how, *decided.recipe_lines]
+    head = RecipeFragment({"read.topics": {}}).toml()
+    how = ["settle it in the recipe (tcpipe.toml), for example:", head, *decided.recipe_lines]
+    return [*decided.ambiguous, *how] if decided.ambiguous else []
 
 
 def _without_motion(decided: _Decisions, topics: Sequence[Topic]) -> list[str]:
     if any(role in decided.roles or role in decided.undecided for role in MOTION_ROLES):
         return []
     lines = ["nothing in the log tells motion: no topic plays wheel_odometry, visual_odometry or gnss"]
-    types = {topic.name: topic.type_name for topic in topics if topic.message_count != 0}
-    could = {name: why for name, why in decided.left_out.items() if _is_motion(types.get(name, ""))}
+    able = {of.name: _motion_role(of.type_name) for of in topics if of.message_count != 0}
+    could = {name: why for name, why in decided.left_out.items() if able.get(name)}
     if could:
         reasons = "; ".join(f"{name} since {why}" for name, why in list(could.items())[:LISTED])
-        name = next((name for name in could if not name.startswith(OVERLAY)), "")
-        role = "gnss" if types.get(name) in ROLE_TYPES["gnss"] else "wheel_odometry"
-        advice = f'; to use one all the same: [read.topics] {role} = ["{name}"]' if name else ""
+        readable = {of.name for of in topics if of.problem is None and not of.name.startswith(OVERLAY)}
+        name = next((name for name in could if name in readable), "")
+        advice = suggested("to use one all the same", {"read.topics": {str(able[name]): [name]}}) if name else ""
         lines.append(f"left out: {reasons}{advice}")
     return [*lines, *_undecodable(topics), f"the log holds {listing(topics)}"]
 
@@ -572,8 +572,8 @@ def _undecodable(topics: Iterable[Topic]) -> Iterable[str]:
         yield f"topics that hold data which cannot be decoded: {reasons}{more}"
 
 
-def _is_motion(type_name: str) -> bool:
-    return any(type_name in ROLE_TYPES[role] for role in MOTION_ROLES)
+def _motion_role(type_name: str) -> str | None:
+    return next((role for role in MOTION_ROLES if type_name in ROLE_TYPES[role]), None)
 
 
 def _warnings(decided: _Decisions, topics: Iterable[Topic]) -> Iterable[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 
+from tcpipe.recipe.suggestions import RecipeFragment
+
 _ENOUGH = 3
 _PLACES = frozenset({"gnss", "wheel_odometry"})
 
@@ -43,6 +45,5 @@ def which_robot(robots: Mapping[str, Sequence[str]]) -> list[str]:
     return [
         f"the log holds {len(robots)} robots, and a run is of one: {each}",
         "settle it in the recipe (tcpipe.toml), for example:",
-        "[read]",
-        f'namespace = "{first}"  #{other}',
+        *f"{RecipeFragment({'read': {'namespace': first}}).toml()}  #{other}".splitlines(),
     ]

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 from tcpipe.logs.messages import Readings
 from tcpipe.logs.placements import is_base
+from tcpipe.recipe.suggestions import suggested
 
 
-def over_ground(readings: Readings, frame: str) -> Readings:
+def over_ground(readings: Readings, frame: str, topic: str) -> Readings:
     """Return a receiver's velocities, none with a warning where their frame is the body's."""
     if not is_base(frame):
         return readings
     why = (
-        f"its frame is {frame!r}: of the body, or of the antenna over ground, nobody can tell, so it is not used; if it is east, north, "
-        "up, name it in the recipe, under [read.topics]: gnss_velocity"
+        f"its frame is {frame!r}: of the body, or of the antenna over ground, nobody can tell, so it is not used"
+        + suggested("if it is east, north, up", {"read.topics": {"gnss_velocity": [topic]}})
     )
     none = slice(0, 0)
     return replace(

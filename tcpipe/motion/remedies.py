@@ -6,7 +6,12 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+from tcpipe.recipe.suggestions import recipe_key, suggested
 from tcpipe.tables.bits import DropReason, Loss, name_of
+
+_SPEED = recipe_key("gate.max_velocity_mps")
+_KEEP_SLOWER = suggested("to keep what was driven slower", {"gate": {"require_full_speed": False}})
+_PLACE, _STD = recipe_key("read.placement"), recipe_key("sample.max_position_std_m")
 
 REMEDIES: Mapping[str, str] = {
     name_of(reason): text
@@ -17,13 +22,13 @@ REMEDIES: Mapping[str, str] = {
         DropReason.TURNING_IN_PLACE: "drive wide turns instead of turning on the spot, and longer legs between them",
         DropReason.REVERSING: "drive forwards",
         DropReason.ACCELERATING: "hold one speed over long legs: each start, stop and commanded change costs two seconds",
-        DropReason.BELOW_LIMIT: "command full speed; if that was its limit, set gate.max_velocity_mps, or gate.require_full_speed = false",
+        DropReason.BELOW_LIMIT: f"command full speed; if that was its limit, state it ({_SPEED}){_KEEP_SLOWER}",
         Loss.CURVED: "drive straighter lines: a metre whose arc is 2 % longer than its chord is no segment",
         Loss.LEFTOVER: "drive longer steady legs: each ends with up to a metre that is no whole segment",
         Loss.OUTSIDE_MAP: "a map that reaches two metres beyond what is driven",
-        Loss.NODATA: "a map without holes there, or sample.min_valid_fraction below 1",
+        Loss.NODATA: f"a map without holes there, or accept some ({recipe_key('sample.min_valid_fraction')})",
         Loss.NOT_TRAVERSABLE: "look at the terrain raster and its class table: the robot drove where they say it cannot",
-        Loss.POSITION_UNCERTAIN: "RTK corrections and the antenna's place ([read.placement]); or a larger sample.max_position_std_m",
+        Loss.POSITION_UNCERTAIN: f"RTK corrections and the antenna's place ({_PLACE}); or accept more ({_STD})",
         Loss.SPLIT_BUFFER: "fewer and larger regions: what lies near their borders goes to no split",
         Loss.NO_POWER: "record the power topic over the whole drive",
         Loss.SPLIT_EXCLUDED: "nothing: a region says so",

@@ -33,13 +33,16 @@ def vibration_mps2(stamp_ns: Stamps, specific_force_mps2: Floats, start_ns: Stam
     start_ns, end_ns : [ns], shape (M,).
     """
     unknown = np.full(len(start_ns), np.nan)
-    stamp_ns, first = np.unique(stamp_ns, return_index=True)
+    if (np.diff(stamp_ns) <= 0).any():
+        stamp_ns, first = np.unique(stamp_ns, return_index=True)
+        specific_force_mps2 = specific_force_mps2[first]
     if len(stamp_ns) < 3 or not len(start_ns):
         return unknown
     period_s = float(np.median(np.diff(stamp_ns))) * _NS
     if 1.0 / period_s < _RATE_TOLERANCE * LEAST_RATE_HZ:
         return unknown
-    square = np.sum(_band_passed(specific_force_mps2[first], period_s) ** 2, axis=1)
+    mean = specific_force_mps2.mean(axis=0)
+    square = sum(_band_passed(axis - of, period_s) ** 2 for axis, of in zip(specific_force_mps2.T, mean, strict=True))
     total = np.concatenate(([0.0], np.cumsum(square)))
     begin, end = (np.searchsorted(stamp_ns, at_ns, side="right") for at_ns in (start_ns, end_ns))
     mean_square = np.divide(total[end] - total[begin], end - begin, out=unknown.copy(), where=end > begin)
@@ -49,13 +52,13 @@ def vibration_mps2(stamp_ns: Stamps, specific_force_mps2: Floats, start_ns: Stam
 
 
 def _band_passed(values: Floats, period_s: float) -> Floats:
-    """Return what of regularly sampled values, shape (N, 3), lies in the band."""
-    spectrum = np.fft.rfft(values - values.mean(axis=0), axis=0)
+    """Return what of regularly sampled values, shape (N,), lies in the band."""
+    spectrum = np.fft.rfft(values)
     frequency_hz = np.fft.rfftfreq(len(values), period_s)[1:]
     power = 2 * _ORDER
     gain = 1.0 / ((1.0 + (frequency_hz / HIGH_HZ) ** power) * (1.0 + (LOW_HZ / frequency_hz) ** power))
-    spectrum[0], spectrum[1:] = 0.0, spectrum[1:] * gain[:, None]
-    passed: Floats = np.fft.irfft(spectrum, len(values), axis=0)
+    spectrum[0], spectrum[1:] = 0.0, spectrum[1:] * gain
+    passed: Floats = np.fft.irfft(spectrum, len(values))
     return passed
 
 

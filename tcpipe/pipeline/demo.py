@@ -79,7 +79,7 @@ def run_demo(directory: Path, *, seed: int, say: Callable[[str], None]) -> DemoR
         "site", height=height, ortho=ortho, ortho_bands="rgb", terrain=terrain, classes=classes, store=store_path
     )
     say(f"$ tcpipe build-dataset {dataset_path} --split {site.region}")
-    built = build_dataset(dataset_path, store=store_path, split=site.region, recipe=Recipe())
+    built = build_dataset(dataset_path, store=store_path, split=site.region, recipe=Recipe(), force=True)
     say(f"$ tcpipe report {dataset_path}")
     of_store = report(store_path)  # first: the dataset's page leads to it
     pages = (*report(dataset_path), *of_store)

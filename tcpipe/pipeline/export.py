@@ -17,6 +17,7 @@ from tcpipe.errors import LogError, StoreError, UsageError
 from tcpipe.formats.atomic import clear
 from tcpipe.formats.json_files import read_json, typed, write_json
 from tcpipe.formats.logs.log_file import Log, open_log
+from tcpipe.formats.object_storage import is_url, shown_path
 from tcpipe.formats.parquet import parquet_rows, read_schema, storable
 from tcpipe.pipeline.log_sources import definitions_key
 from tcpipe.power.sources import bare_unit
@@ -112,21 +113,22 @@ def export(
     """
     _refuse_what_is_ours(out)
     clear(out)
+    shown = shown_path(log_path)
     with open_log(log_path, message_definitions=message_definitions) as log:
-        wanted = _wanted(log, log_path, topics)
-        made_from = _identity(log, log_path, message_definitions)
+        wanted = _wanted(log, shown, topics)
+        made_from = _identity(log, shown, message_definitions)
         paths = _paths(out, sorted(log.topics))
         index = _index(out)
         _refuse_others_files(index, made_from, {name: paths[name] for name in wanted})
         known = {name for name in wanted if _is_there(index.get(name), made_from, out)}
         if wanted and known == set(wanted):
-            return _exported("unchanged", index, wanted, str(log_path), out)
+            return _exported("unchanged", index, wanted, shown, out)
         rows = _write(log, {name: paths[name] for name in wanted}, threads)
         if wanted and not any(count is not None for count in rows.values()):
-            raise LogError(f"{log_path}: nothing to export: no topic can be read", *map(str, log.damage))
+            raise LogError(f"{shown}: nothing to export: no topic can be read", *map(str, log.damage))
         damage, remarks = tuple(str(damage) for damage in log.damage if damage.is_loss), tuple(log.remarks)
         if not wanted:
-            return Exported(str(log_path), out, "done", (), damage, remarks, 3 if damage else 0)
+            return Exported(shown, out, "done", (), damage, remarks, 3 if damage else 0)
         entries = {
             name: IndexEntry(
                 file=None if count is None else paths[name].name,
@@ -140,10 +142,10 @@ def export(
             for name, count in rows.items()
         }
     write_json(out / INDEX, ExportIndex({**index, **entries}))
-    return _exported("done", entries, wanted, str(log_path), out)
+    return _exported("done", entries, wanted, shown, out)
 
 
-def _wanted(log: Log, log_path: Path | str, topics: Sequence[str]) -> list[str]:
+def _wanted(log: Log, log_path: str, topics: Sequence[str]) -> list[str]:
     """Return the topics asked for, each once, or all; a text that is no topic's name is taken for several with commas between."""
     parts = (part.strip() for text in topics for part in ([text] if text in log.topics else text.split(",")))
     split = list(dict.fromkeys(part for part in parts if part))
@@ -156,9 +158,9 @@ def _wanted(log: Log, log_path: Path | str, topics: Sequence[str]) -> list[str]:
     return split or sorted(log.topics)
 
 
-def _identity(log: Log, log_path: Path | str, message_definitions: Path | None) -> ExportOrigin:
+def _identity(log: Log, log_path: str, message_definitions: Path | None) -> ExportOrigin:
     return ExportOrigin(
-        log=str(log_path) if "://" in str(log_path) else str(Path(log_path).resolve()),
+        log=log_path if is_url(log_path) else str(Path(log_path).resolve()),
         size_and_time=tuple((size, time_ns) for size, time_ns in log.size_and_time),
         message_definitions=definitions_key(message_definitions),
         tcpipe_version=__version__,

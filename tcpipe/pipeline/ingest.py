@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing, nullcontext
+from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -16,16 +16,18 @@ from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.object_storage import is_url
-from tcpipe.formats.recipe_toml import recipe_of
+from tcpipe.formats.index_files import forget_runs
+from tcpipe.formats.object_storage import is_presigned, is_url
+from tcpipe.formats.recipe_toml import ingest_key, recipe_of
 from tcpipe.formats.record_files import Call
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.store_mark import gone_if_empty
+from tcpipe.pipeline.begun_calls import begun_call
 from tcpipe.pipeline.calls import INGEST, remember_call, room_of, started
 from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
 from tcpipe.pipeline.known_runs import KnownRuns, known_runs
-from tcpipe.pipeline.known_trouble import Trouble
+from tcpipe.pipeline.known_trouble import Trouble, trouble_of_run
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -55,7 +57,7 @@ class IngestSummary:
 
     @property
     def exit_code(self) -> int:
-        """0 nothing is wrong, or nothing that is news; 1 all failed; 3 some failed or are damaged."""
+        """0 nothing is wrong, or nothing that is news; 1 all failed; 3 some failed, are damaged or empty."""
         if not any(result.is_news for result in self.results):
             return 0
         return 1 if all(result.status == "failed" for result in self.results) else 3
@@ -134,11 +136,14 @@ def ingest(
     robot = robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store):
+    with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store), ExitStack() as until_it_ends:
         found = find_sources(logs, as_one=as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(store, create=True)
+        given = tuple(str(log) if is_url(log) else str(Path(log).absolute()) for log in logs if not is_presigned(log))
+        options = (ingest_key(ruling), robot, shard)
+        until_it_ends.enter_context(begun_call(opened, INGEST, given, options=options))
         remember_earlier(opened)
         known = known_runs(opened, force=force)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
@@ -163,15 +168,15 @@ def ingest(
         _keep_index(opened, known, results.values())
         summary = IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
         if any(result.run_id for result in summary.results):  # else no store may remain
-            remember_call(opened, watch, _call_of(opened, summary, logs, tasks, jobs))
+            remember_call(opened, watch, _call_of(opened, summary, given, tasks, jobs))
         return summary
 
 
 def _call_of(
-    store: Store, summary: IngestSummary, logs: Iterable[str | Path], tasks: Iterable[IngestTask], jobs: int
+    store: Store, summary: IngestSummary, given: tuple[str, ...], tasks: Iterable[IngestTask], jobs: int
 ) -> Call:
     """Return what the history holds of a call."""
-    done = [result for result in summary.results if result.status in ("done", "damaged")]
+    done = [result for result in summary.results if result.status in ("done", "damaged", "empty")]
     sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
     return Call(
         INGEST,
@@ -179,7 +184,7 @@ def _call_of(
         summary.exit_code,
         Counter(result.status for result in summary.results),
         jobs,
-        logs=tuple(str(log) if is_url(log) else str(Path(log).absolute()) for log in logs),
+        logs=given,
         failed={result.log: result.problems[0] for result in summary.results if result.transient and result.problems},
         done_bytes=sum(sizes.get(result.log, 0) for result in done),
         written_bytes=room_of(store, [result.run_id for result in done if result.run_id]),
@@ -189,7 +194,10 @@ def _call_of(
 def _keep_index(store: Store, known: KnownRuns, results: Iterable[IngestResult]) -> None:
     """Write the index, with what this call made."""
     results = list(results)
-    if all(result.status in ("unchanged", "waiting") for result in results):
+    mended = {result.run_id for result in results if result.run_id} & {run_id for run_id, _ in known.runs.lost}
+    if mended:
+        forget_runs(store.index_place, mended)
+    if not mended and all(result.status in ("unchanged", "waiting") for result in results):
         store.keep_index(known.runs)
     elif known.runs.rows or any(result.run_id for result in results):
         store.keep_index(store.ingestions())
@@ -250,7 +258,7 @@ def _judged(
     trouble = _trouble(source, result)
     if trouble is None:
         return result if notes == result.notes else replace(result, notes=notes)
-    told_before = result.known or (trouble.kind == "damaged" and trouble.is_told(store))
+    told_before = result.known or (trouble.kind != "failed" and trouble.is_told(store))
     return replace(result, notes=notes, known=told_before, accepted=trouble.is_accepted(store))
 
 
@@ -264,7 +272,7 @@ def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
     content = result.sha256 or source.files_digest
     if result.status == "failed":
         return Trouble(content, result.problems, source.origins, kind="failed")
-    return Trouble(content, result.damage, source.origins, result.run_id, "damaged") if result.damage else None
+    return trouble_of_run(result.run_id, result.why_empty, result.damage, content=content, log=source.origins)
 
 
 def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult, known: KnownRuns) -> None:
@@ -273,7 +281,7 @@ def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestR
     try:
         if result.sha256 and source.files and not known.has_seen(source, result.sha256):
             store.note(source.lineage, source.sighting(result.sha256))
-        if trouble is not None and trouble.kind == "damaged":
+        if trouble is not None and trouble.kind != "failed":
             trouble.told(store)
         elif trouble is not None and not result.transient and not result.known:
             task = replace(task, source=replace(source, sha256=result.sha256))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
+
+import pyarrow as pa
 
 from tcpipe import __version__
 from tcpipe.errors import LogError
 from tcpipe.formats.index_files import KnownLog, RunFacts, facts_of
+from tcpipe.formats.lent_tables import lend_streams
 from tcpipe.formats.logs.joined import AnyLog, open_logs
-from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.run_documents import Manifest, RunJson
@@ -25,9 +27,12 @@ from tcpipe.progress import step, working_on
 from tcpipe.store import Store
 from tcpipe.tables.levels import Streams
 
+_M_MMAP_THRESHOLD = -3
+
 
 def ingest_one(task: IngestTask) -> tuple[LogSource, IngestResult]:
     """Ingest one run from its log as that is now; every error becomes its result, so that one log never costs the others."""
+    _return_freed_memory()
     task = replace(task, source=task.source.now())
     hashed: list[str] = []
     young = too_young(task)
@@ -39,6 +44,15 @@ def ingest_one(task: IngestTask) -> tuple[LogSource, IngestResult]:
         note = "it changed while it was looked at; it is ingested when its recording has ended"
         return task.source, IngestResult(task.source.name, "waiting", notes=(note,))
     return task.source, replace(result, sha256=hashed[0]) if hashed else result
+
+
+def _return_freed_memory() -> None:
+    """Have columns go back to the system when nobody needs them: heaps would keep the room of all that a long log ever took."""
+    pa.set_memory_pool(pa.system_memory_pool())
+    with suppress(OSError, AttributeError, TypeError):  # only glibc has it
+        library = ctypes.CDLL(None)
+        library.mallopt(_M_MMAP_THRESHOLD, 1 << 20)
+        library.malloc_trim(0)
 
 
 def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
@@ -62,6 +76,8 @@ def _ingest(task: IngestTask, *, hashed: list[str]) -> IngestResult:
             known = replace(known, streams=store.write_streams(run_id, streams, key=known.streams_key))
         store.write_run_json(run_id, known)
         remember_outline(store, run_id, sha256, log)  # before it is done: then nobody looks again
+        streams = lend_streams(store.runs_place.below(run_id), streams, known.streams)
+        _return_freed_memory()
         manifest = _fuse_and_label(store, run_id, streams, known, task)
     return result_of(source, "done", facts_of(manifest, state=""), sha256, same_as=same_as)
 
@@ -85,8 +101,7 @@ def as_indexed(task: IngestTask, made: Sequence[RunFacts], sha256: str) -> Inges
 
 def _opened(task: IngestTask, stack: ExitStack) -> AnyLog:
     """Return the log, open until ``stack`` ends."""
-    files = [entry if is_url(entry) else Path(entry) for entry in task.source.origins]
-    log = open_logs(files, message_definitions=task.message_definitions, tables=task.recipe.tables)
+    log = open_logs(task.source.locations(), message_definitions=task.message_definitions, tables=task.recipe.tables)
     stack.enter_context(log)
     return log
 
@@ -115,6 +130,7 @@ def _read(
 ) -> tuple[Streams, RunJson]:
     """Return L1 and what is known of its log; from the store what was made with the same read settings."""
     from tcpipe.stages.read import read_run  # noqa: PLC0415
+    from tcpipe.stages.read_roles import find_read_config  # noqa: PLC0415
 
     key = f"{read_key(task.recipe, task.robot, definitions=task.definitions)}-{__version__}"
     if run_id and before and before.message_definitions == task.definitions and not task.force:
@@ -124,7 +140,7 @@ def _read(
             return cached, replace(
                 known, damage=before.damage, remarks=before.remarks, streams=before.streams, streams_key=key
             )
-    streams = read_run(log, task.recipe.read_of(log.topics), robot=task.robot, known=profiles_of(task.recipe))
+    streams = read_run(log, find_read_config(task.recipe, log.topics), robot=task.robot, known=profiles_of(task.recipe))
     if task.source.has_changed():
         raise LogError(f"{task.source.name}: changed while it was read")
     damage = tuple(str(damage) for damage in log.damage if damage.is_loss)

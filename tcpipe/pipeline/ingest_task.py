@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal, TypeVar
 
 from tcpipe import __version__
-from tcpipe.errors import TcpipeError, plain_line
+from tcpipe.errors import TcpipeError, hide_secrets, plain_line
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import recast
 from tcpipe.formats.recipe_toml import ingest_key
@@ -20,13 +20,13 @@ from tcpipe.pipeline.known_trouble import failure_name
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transience import is_transient
 from tcpipe.recipe import Recipe
-from tcpipe.tables.findings import EnergyBudget
+from tcpipe.tables.findings import EnergyBudget, NoPower
 
 R = TypeVar("R")
 
 logger = logging.getLogger("tcpipe")
 
-Status = Literal["done", "unchanged", "damaged", "failed", "waiting"]
+Status = Literal["done", "unchanged", "damaged", "empty", "failed", "waiting"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +76,10 @@ class IngestResult:
     warnings: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()
     damage: tuple[str, ...] = ()
+    no_power: NoPower | None = None
+    """Why there is no power though the log may tell some, and the recipe that would read it."""
+    why_empty: str = ""
+    """Why there is no segment though the robot drove."""
     same_as: str | None = None
     """The log from which the same recording was ingested before, under another path; it is one run."""
     sha256: str | None = None
@@ -84,7 +88,7 @@ class IngestResult:
     transient: bool = False
     """Whether it failed for what may pass: a full disk, a killed worker."""
     known: bool = False
-    """Whether it failed before and was not tried again, or its damage was told before."""
+    """Whether it failed before and was not tried again, or what is wrong with its run was told before."""
     accepted: bool = False
     """Whether a person has accepted what is wrong with it (`tcpipe accept`)."""
     traceback: str | None = None
@@ -93,7 +97,7 @@ class IngestResult:
     @property
     def is_news(self) -> bool:
         """Whether something is wrong that nobody was told before, or accepted."""
-        return (self.status == "failed" or bool(self.damage)) and not self.known and not self.accepted
+        return (self.status == "failed" or bool(self.damage or self.why_empty)) and not self.known and not self.accepted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,9 +110,9 @@ class LogLine(IngestResult):
 
 def result_of(source: LogSource, status: Status, made: RunFacts, sha256: str, *, same_as: str | None) -> IngestResult:
     """Return what became of a log whose run is in the store."""
-    told = "damaged" if made.damage and status == "done" else status
-    about = {"log": source.name, "status": told, "distance_m": made.driven_m, "same_as": same_as, "sha256": sha256}
-    return recast(made, IngestResult, **about)
+    trouble = "damaged" if made.damage else "empty" if made.why_empty else status
+    about = {"log": source.name, "status": trouble if status == "done" else status, "distance_m": made.driven_m}
+    return recast(made, IngestResult, **about, same_as=same_as, sha256=sha256, why_empty=made.why_empty)
 
 
 def too_young(task: IngestTask) -> IngestResult | None:
@@ -148,7 +152,7 @@ def _in_words(error: Exception, source: LogSource) -> tuple[tuple[str, ...], str
     if isinstance(error, MemoryError):
         return (f"{source.name}: not enough memory; fewer --jobs need less",), None
     what = f"internal error, {type(error).__name__}: {error}; please report it (tcpipe --debug shows where)"
-    return (plain_line(f"{source.name}: {what}"),), "".join(traceback.format_exception(error))
+    return (plain_line(f"{source.name}: {what}"),), hide_secrets("".join(traceback.format_exception(error)))
 
 
 def _naming(source: LogSource, problems: tuple[str, ...]) -> tuple[str, ...]:

@@ -15,10 +15,11 @@ from tcpipe.formats.json_files import recast
 from tcpipe.formats.logs.joined import opened
 from tcpipe.formats.logs.log_file import belongs_to_a_log, logs_below
 from tcpipe.formats.logs.table_folders import table_files, table_folders
-from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.object_storage import is_presigned, is_url, shown_path
 from tcpipe.formats.published import has_card, here_by_range
 from tcpipe.formats.run_documents import Counts, LogOrigin
 from tcpipe.formats.stored_runs import RunDirectory
+from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.log_sources import remote_logs
 from tcpipe.pipeline.table_proposal import InspectedTables, proposed
@@ -141,6 +142,8 @@ def inspect(
 
 
 def _at_url(url: str, ask: Callable[[Path | str], InspectedLog]) -> Inspected:
+    if is_presigned(url):
+        return ask(url)
     if not belongs_to_a_log(url):  # of a log nothing else need be readable
         with suppress(StoreError):  # what is wrong with the bucket is told where logs are looked for
             if stored := _in_store(url):
@@ -193,14 +196,14 @@ def _one(
     path: Path | str, *, recipe: Recipe, robot: str | None, full: bool, message_definitions: Path | None
 ) -> InspectedLog:
     with opened(path, message_definitions=message_definitions, tables=recipe.tables) as log:
-        return replace(inspect_log(log, recipe, robot, full=full), path=str(path))
+        return replace(inspect_log(log, recipe, robot, full=full), path=shown_path(path))
 
 
 def _one_of(path: Path | str, ask: Callable[[Path | str], InspectedLog]) -> InspectedLog:
     try:
         return ask(path)
     except TcpipeError as error:
-        return InspectedLog(path=str(path), problems=error.problems)
+        return InspectedLog(path=shown_path(path), problems=error.problems)
 
 
 def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedRun:
@@ -227,9 +230,8 @@ def _run(path: Path | str, store: Store, runs: list[RunDirectory]) -> InspectedR
 
 
 def _store(store: Store) -> InspectedStore:
-    found = store.ingestions()
+    found = list_runs(store)
     runs, outdated = found.finished, {run_id: str(head.data_model_version) for run_id, head in found.outdated.items()}
-    seen = {*outdated, *found.superseded, *(run.run_id for run in runs), *(run_id for run_id, _ in found.damaged)}
     return InspectedStore(
         path=str(store.root),
         maps=tuple(store.maps()),
@@ -238,9 +240,9 @@ def _store(store: Store) -> InspectedStore:
             for run in runs
         ),
         outdated=outdated,
-        damaged_runs={store.runs_place.where("/".join(run)): line for run, line in found.damaged.items()},
+        damaged_runs={store.runs_place.where("/".join(filter(None, run))): line for run, line in found.damaged.items()},
         superseded=dict(found.superseded),
-        unfinished=tuple(sorted(set(store.run_ids()) - seen)),
+        unfinished=found.unfinished,
     )
 
 

@@ -8,10 +8,12 @@ from pathlib import Path
 
 from tcpipe import __version__
 from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import digest
 from tcpipe.formats.record_files import record_name
-from tcpipe.pipeline.log_sources import lineage_of
+from tcpipe.pipeline.begun_calls import BegunCall, begun_calls
+from tcpipe.pipeline.log_sources import LogSource, find_sources, lineage_of
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import LEFT_OUT
 
@@ -20,7 +22,7 @@ _MOST_CANDIDATES = 10
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What is wrong with a content, wherever that lies: lines of damage, or why it failed."""
+    """What is wrong with a content, wherever that lies: lines of damage, why it failed, or why its run is empty."""
 
     content: str
     """The sha256 of the log; where nothing could be read, a hash of where it lies, sizes and times."""
@@ -29,7 +31,7 @@ class Trouble:
     """Where it lay when it was told."""
     run_id: str | None = None
     kind: str = ""
-    """``damaged`` or ``failed``."""
+    """``damaged``, ``empty``, ``failed``, ``waiting`` or ``killed``."""
     version: str | None = field(default=None, metadata=LEFT_OUT)
     """Of a failure: of the program that failed."""
 
@@ -51,18 +53,36 @@ class Trouble:
         return store.remember(f"accepted/{self._name}", self)
 
     def is_told(self, store: Store) -> bool:
-        """Tell whether this damage was told before."""
-        return store.recall(f"damaged/{self._name}", Trouble) is not None
+        """Tell whether this trouble of a run was told before."""
+        return store.recall(f"{self.kind}/{self._name}", Trouble) is not None
 
     def told(self, store: Store) -> None:
-        """Remember that this damage was told."""
-        store.remember(f"damaged/{self._name}", self)
+        """Remember that this trouble of a run was told."""
+        store.remember(f"{self.kind}/{self._name}", self)
+
+
+def trouble_of_run(
+    run_id: str | None, why_empty: str, damage: tuple[str, ...], *, content: str, log: tuple[str, ...]
+) -> Trouble | None:
+    """Return what is wrong with a run that is in the store, None where nothing is."""
+    lines = (why_empty, *damage) if why_empty else damage
+    return Trouble(content, lines, log, run_id, "damaged" if damage else "empty") if lines else None
 
 
 def failure_name(content: str, *, ingest_key: str, robot: str | None, definitions: str) -> str:
     """Return the name of the record of a failure: the same content, treated in the same way, fails again."""
     how = {"version": __version__, "ingest_key": ingest_key, "robot": robot, "message_definitions": definitions}
     return f"failed/{record_name(digest({'content': content, **how}))}"
+
+
+def trouble_of_call(call: BegunCall) -> Trouble:
+    """Return the trouble that a call was killed; its record names it."""
+    return Trouble(call.name, (), (), call.name, "killed")
+
+
+def trouble_of_waiting(source: LogSource) -> Trouble:
+    """Return the trouble that a log has waited for too long, as it is now."""
+    return Trouble(source.files_digest, (), source.origins, kind="waiting")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,11 +94,11 @@ class Accepted:
 
 
 def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accepted:
-    """Accept the known trouble of runs and logs: it is counted no more, until it is another.
+    """Accept the known trouble of runs, logs and killed calls: it is counted no more, until it is another.
 
     Parameters
     ----------
-    names : runs by their id, logs by path, URL or, where that is enough, file name.
+    names : runs by their id, logs by path, URL or, where that is enough, file name; killed calls by the name that `status` says.
     store : the store that knows of the trouble.
 
     Raises
@@ -88,10 +108,11 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
     """
     opened = open_store(store)
     known = known_trouble(opened, [run.facts for run in opened.runs()])
+    known += [trouble_of_call(call) for call in begun_calls(opened) if call.state == "killed"]
     chosen: list[Trouble] = []
     problems: list[str] = []
     for name in dict.fromkeys(names):
-        found = _named(name, known, opened)
+        found = _named(name, known, opened) or _waiting(name, opened)
         if len({trouble.called for trouble in found}) == 1:
             chosen += found
         else:
@@ -103,13 +124,13 @@ def accept(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Accep
 
 
 def known_trouble(store: Store, runs: Sequence[RunFacts]) -> list[Trouble]:
-    """Return all trouble that was told, and the damage of ``runs`` that were made before that was remembered."""
-    known = [replace(told, kind=kind) for kind in ("failed", "damaged") for told in store.records(kind, Trouble)]
-    known += [
-        Trouble(run.log.source.sha256, run.damage, run.log.source.paths, run.run_id, "damaged")
-        for run in runs
-        if run.damage and run.log
-    ]
+    """Return all trouble that was told, and that of ``runs`` that were made before it was remembered."""
+    kinds = ("failed", "damaged", "empty")
+    known = [replace(told, kind=kind) for kind in kinds for told in store.records(kind, Trouble)]
+    for run in runs:
+        of = run.log.source if run.log else None
+        found = trouble_of_run(run.run_id, run.why_empty, run.damage, content=of.sha256, log=of.paths) if of else None
+        known += [found] if found else []
     return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
 
 
@@ -122,6 +143,13 @@ def _named(name: str, known: Sequence[Trouble], store: Store) -> list[Trouble]:
         if trouble.content in contents or paths & {trouble.run_id, " + ".join(trouble.log), *trouble.log}
     ]
     return exact or [trouble for trouble in known if name in {Path(origin).name for origin in trouble.log}]
+
+
+def _waiting(name: str, store: Store) -> list[Trouble]:
+    """Return the trouble of a log by its path or URL that the store does not hold: nobody wants to be told that it waits."""
+    with scratch_directory() as staging:
+        sources = find_sources([name], as_one=False, staging=staging).sources
+    return [trouble_of_waiting(source) for source in sources if not store.sightings(source.lineage)]
 
 
 def _not_one(name: str, found: Sequence[Trouble], candidates: Sequence[Trouble], store: Store) -> str:

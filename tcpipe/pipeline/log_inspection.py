@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 from typing import TYPE_CHECKING, Literal
 
-from tcpipe.cost.quality import MIN_AVERAGED_HZ, MIN_INSTANTANEOUS_HZ
+from tcpipe.cost.quality import is_too_slow, wanted_rate_hz
 from tcpipe.formats.logs.log_file import Log
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.logs.clocks import Timeline, settle_clocks
@@ -18,8 +18,9 @@ from tcpipe.pipeline.log_stamps import TopicStamps
 from tcpipe.power.sources import sources_of
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.read_roles import roles_by
-from tcpipe.tables.findings import ABSENT, ClockStep
+from tcpipe.stages.read_candidates import power_candidates
+from tcpipe.stages.read_roles import find_read_config, roles_by
+from tcpipe.tables.findings import ABSENT, ClockStep, NoPower
 
 if TYPE_CHECKING:
     from tcpipe.formats.logs.table_log import TableLog
@@ -75,6 +76,8 @@ class InspectedLog:
     clock_epochs: int | None = field(default=None, metadata=ABSENT)
     """With everything read: stretches of the log between clock steps."""
     clock_steps: tuple[ClockStep, ...] | None = field(default=None, metadata=ABSENT)
+    no_power: NoPower | None = field(default=None, metadata=ABSENT)
+    """Why no power is read though the log may tell some, and the recipe that would read it."""
     problems: tuple[str, ...] = ()
     """What is to be decided before it can be ingested, or why it cannot be read."""
     warnings: tuple[str, ...] | None = field(default=None, metadata=ABSENT)
@@ -90,7 +93,8 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
     full : read every message: counts, gaps, stamps, clock steps and damage, not the index alone.
     """
     known = profiles_of(recipe)
-    cast = roles_by(recipe.read_of(log.topics), log.topics.values(), robot, known=known)
+    config = find_read_config(recipe, log.topics)
+    cast = roles_by(config, log.topics.values(), robot, known=known)
     topics, steps = tuple(_indexed(topic, cast) for topic in sorted(log.topics.values(), key=attrgetter("name"))), None
     if full:
         topics, steps = _read(log, topics)
@@ -107,6 +111,7 @@ def inspect_log(log: Log | TableLog, recipe: Recipe, robot: str | None, *, full:
         topics=topics,
         clock_epochs=None if steps is None else len(steps) + 1,
         clock_steps=steps,
+        no_power=power_candidates(log, cast, config),
         problems=tuple(cast.problems),
         warnings=(*cast.warnings, *_simulated(log.topics.values()), *_slow_power(log, cast, recipe, known)),
         damage=tuple(str(damage) for damage in log.damage if damage.is_loss),
@@ -179,18 +184,15 @@ def _slow_power(log: Log | TableLog, cast: RoleAssignment, recipe: Recipe, known
             topic.type_name, name, known.power_sources, platform=robot.platform, husky_power=recipe.read.husky_power
         )
         rate_hz = _rate_hz(topic)
-        if isinstance(choices, str) or rate_hz is None:
-            continue
+        if isinstance(choices, str) or rate_hz is None or not any(of.current or of.energy for of in choices[0]):
+            continue  # a voltage alone may be slow
         averaged = {"auto": choices[0][0].averaged, "yes": True, "no": False}[recipe.read.power_averaged]
-        wanted_hz, what = (MIN_AVERAGED_HZ, "averaged") if averaged else (MIN_INSTANTANEOUS_HZ, "sampled")
-        if rate_hz < _NEARLY * wanted_hz:
+        wanted_hz, what = wanted_rate_hz(averaged=averaged), "averaged" if averaged else "sampled"
+        if is_too_slow(rate_hz, averaged=averaged):
             speed_mps = robot.max_velocity_mps or 1.0
             metre = f"a metre at {speed_mps:g} m/s holds {rate_hz / speed_mps:.2g} values; {wanted_hz:g} Hz are wanted"
             setting = f"; what sets it: {choices[0][0].rate_setting}" if choices[0][0].rate_setting else ""
             yield f"power: {name} comes at {rate_hz:g} Hz, {what}, too slowly for segments of 1 m: {metre}{setting}"
-
-
-_NEARLY = 0.98
 
 
 def _simulated(topics: Iterable[Topic]) -> list[str]:

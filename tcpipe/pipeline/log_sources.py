@@ -7,7 +7,7 @@ import os
 import stat
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -17,7 +17,7 @@ from tcpipe.formats.logs.joined import open_logs
 from tcpipe.formats.logs.log_file import LOG_SUFFIXES, belongs_to_a_log, find_logs, logs_below
 from tcpipe.formats.logs.rosbag2 import STORAGE_SUFFIXES, is_one_bag, storage_files
 from tcpipe.formats.logs.table_folders import Mappings, table_files, table_folders
-from tcpipe.formats.object_storage import is_url, stand_ins
+from tcpipe.formats.object_storage import is_url, shown_path, split_url, stand_ins
 from tcpipe.formats.record_files import Sighting, record_name
 from tcpipe.pipeline.transience import is_transient
 
@@ -40,6 +40,8 @@ class LogSource:
     """None where it has yet to be computed."""
     urls: tuple[str, ...] = ()
     """Where the files lie, if one lies in object storage; ``paths`` then are stand-ins of the right names and sizes."""
+    queries: tuple[str, ...] = field(default=(), repr=False)
+    """Of presigned URLs, in the order of ``urls``: never shown, never stored."""
     place: str = ""
     """Where the log lies in the folder that was given: the same wherever that is mounted."""
 
@@ -52,6 +54,12 @@ class LogSource:
     def origins(self) -> tuple[str, ...]:
         """Where the files are."""
         return self.urls or tuple(str(path) for path in self.paths)
+
+    def locations(self) -> tuple[Path | str, ...]:
+        """Return what the files are opened by: paths and URLs, with the queries of those that are presigned."""
+        queries = self.queries or ("",) * len(self.origins)
+        whole = (f"{at}?{query}" if query else at for at, query in zip(self.origins, queries, strict=True))
+        return tuple(at if is_url(at) else Path(at) for at in whole)
 
     @property
     def stem(self) -> str:
@@ -79,6 +87,12 @@ class LogSource:
     def youngest_ns(self) -> int:
         """When a file of the log was last written [ns since 1970]."""
         return max((time_ns for _, time_ns in self.files), default=0)
+
+    @property
+    def arrival_ns(self) -> int:
+        """When a file of the log last came here or was changed [ns since 1970], which a copy that keeps its time does not hide."""
+        times = (seen.st_ctime_ns for path in self.paths for seen in _seen(path))
+        return self.youngest_ns if self.urls else max(times, default=0)
 
     def now(self) -> LogSource:
         """Return the log as it is now: what was written since is another content; in object storage nobody looks again."""
@@ -113,22 +127,25 @@ def find_sources(
     """
     paths: dict[str, tuple[Path, str]] = {}
     urls: dict[Path, str] = {}
+    queries: dict[Path, str] = {}
     problems: dict[str, tuple[str, ...]] = {}
     folders: dict[str, str] = {}
     transient = False
     for number, entry in enumerate(logs):
         try:
             if is_url(entry):
+                above_url, query = split_url(str(entry), one_object=True)
                 remote = remote_logs(str(entry), staging / str(number))
                 urls.update(remote)
+                queries.update(dict.fromkeys(remote, query))
                 for path, url in remote.items():
-                    paths.setdefault(str(path), (path, url.removeprefix(str(entry).rstrip("/")).lstrip("/") or url))
+                    paths.setdefault(str(path), (path, url.removeprefix(above_url.rstrip("/")).lstrip("/") or url))
             else:
                 above = Path(entry)
                 for path in _logs_at(above, tables or {}):
                     paths.setdefault(_real(path, folders), (_as_named(path), _place_in(path, above)))
         except LogError as error:
-            problems[str(entry)] = error.problems
+            problems[shown_path(entry)] = error.problems
             transient |= is_transient(error)
     for part, line in _parts_alone({path for path, _ in paths.values()}, together=as_one):
         problems[str(part)] = (line,)
@@ -139,6 +156,7 @@ def find_sources(
             tuple(path for path, _ in group),
             _files([path for path, _ in group]),
             urls=tuple(urls.get(path, str(path)) for path, _ in group if urls),
+            queries=tuple(queries.get(path, "") for path, _ in group if urls),
             place="|".join(place for _, place in group),
         )
         for group in groups
@@ -207,7 +225,7 @@ def remote_logs(url: str, directory: Path) -> dict[Path, str]:
     place = stand_ins(url, directory, wanted=belongs_to_a_log)
     folders: dict[str, str] = {}
     return {
-        Path(_real(path, folders)): "/".join((url.rstrip("/"), *path.relative_to(place).parts))
+        Path(_real(path, folders)): "/".join((shown_path(url).rstrip("/"), *path.relative_to(place).parts))
         for path in find_logs(place)
     }
 
@@ -283,7 +301,8 @@ def _size(source: LogSource) -> int:
 
 def remembered(source: LogSource, seen: Sequence[Sighting]) -> LogSource:
     """Return the source with its hash; where nothing is known of these sizes and times, or two different things, without."""
-    found = {sighting.sha256 for sighting in seen if source.files and sighting.size_and_time == source.files}
+    dated = bool(source.files) and all(time_ns for _, time_ns in source.files)  # not every server tells the time
+    found = {sighting.sha256 for sighting in seen if dated and sighting.size_and_time == source.files}
     return replace(source, sha256=found.pop()) if len(found) == 1 else source
 
 

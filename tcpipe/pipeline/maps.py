@@ -74,7 +74,7 @@ def add_map(
     Parameters
     ----------
     height, ortho, terrain
-        GeoTIFF, JPEG 2000, ERDAS Imagine or VRT; the three need not share grid, resolution or CRS. Each is one file, a pattern such as
+        GeoTIFF, JPEG 2000 or ERDAS Imagine; the three need not share grid, resolution or CRS. Each is one file, a pattern such as
         ``dem/*.tif`` (its files by name), or several of both: tiles of one grid, the last on top where they overlap. Terrain may also be
         GeoJSON polygons whose property ``class`` is a class name, value or id.
     layers

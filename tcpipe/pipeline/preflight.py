@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from tcpipe.errors import TcpipeError, plain_lines
 from tcpipe.formats.logs.joined import opened
-from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.object_storage import is_url, shown_path
 from tcpipe.formats.robot_files import profiles_of
-from tcpipe.logs.roles import ROLE_TYPES
+from tcpipe.logs.roles import OVERLAY, ROLE_TYPES
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.logs.topics import Topic
 from tcpipe.motion.remedies import REMEDIES
@@ -27,10 +27,11 @@ from tcpipe.motion.vibration import LEAST_RATE_HZ
 from tcpipe.pipeline.log_inspection import InspectedLog, inspect_log
 from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import ReadConfig, Recipe, Role
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.read import read_run
-from tcpipe.stages.read_roles import roles_by
+from tcpipe.stages.read_roles import find_read_config, roles_by
 from tcpipe.tables.columns import integers
-from tcpipe.tables.findings import EnergyBudget, RunFacts
+from tcpipe.tables.findings import EnergyBudget, NoPower, RunFacts
 from tcpipe.tables.levels import LabelledSegments
 
 MISSING: Mapping[Role, str] = {
@@ -44,6 +45,17 @@ MISSING: Mapping[Role, str] = {
 
 WANTED_HZ: Mapping[str, float] = {"gnss": 1.0, "imu": LEAST_RATE_HZ, "wheel_odometry": 10.0, "visual_odometry": 10.0}
 """Slower topics cost precision or columns; power's rate is a matter of its source (`tcpipe.cost.quality`)."""
+
+LARGE_TYPES = frozenset(
+    f"sensor_msgs/msg/{name}"
+    for name in ("Image", "CompressedImage", "PointCloud", "PointCloud2", "LaserScan", "MultiEchoLaserScan")
+) | {
+    "stereo_msgs/msg/DisparityImage",
+    "nav_msgs/msg/OccupancyGrid",
+    "velodyne_msgs/msg/VelodyneScan",
+    "livox_ros_driver2/msg/CustomMsg",
+}
+"""What fills disks and is of no use here."""
 
 _NEARLY = 0.9
 _OFTEN_THERE = 0.9
@@ -128,7 +140,11 @@ class Preflight:
     warnings: tuple[str, ...]
     """What else ingest would warn of."""
     record: str
-    """The command that records what tcpipe reads; "" where the log is no recording of ROS."""
+    """The command that records all that may be of use; "" where the log is no recording of ROS."""
+    large: Mapping[str, float | None]
+    """Images and point clouds, which it leaves out, with the messages that come of each a second."""
+    no_power: NoPower | None
+    """Why no power is read though the log may tell some, and the recipe that would read it."""
     exit_code: int
     """0 ready; 3 something is to be mended; 1 nothing would come of it."""
 
@@ -144,7 +160,11 @@ class Preflight:
             ("warning", self.warnings),
         ):
             said += [f"{name:9} {line}" for line in lines]
+        if self.no_power:
+            said += [f"power     {self.no_power.why}", *(f"  {line}" for line in self.no_power.recipe.splitlines())]
         said += [f"record    {self.record}"] if self.record else []
+        rates = ", ".join(name if hz is None else f"{name} at {hz:.3g} Hz" for name, hz in self.large.items())
+        said += [f"large     images and point clouds, not recorded by that: {rates}"] if rates else []
         said += ["ready: nothing is to be mended"] if self.exit_code == 0 else []
         return plain_lines(said)
 
@@ -171,12 +191,13 @@ def preflight(
     robot = robot or recipe.robot
     path = log if is_url(log) else Path(log)
     with opened(path, message_definitions=message_definitions, tables=recipe.tables) as found:
-        seen = replace(inspect_log(found, recipe, robot, full=False), path=str(log))
+        seen = replace(inspect_log(found, recipe, robot, full=False), path=shown_path(log))
         topics = tuple(found.topics.values())
-        read = recipe.read_of(found.topics)
+        read = find_read_config(recipe, found.topics)
         cast = roles_by(read, topics, robot, known=profiles_of(recipe))
-        played = [name for role in cast.roles.values() for name in role.topics]
-        record = record_command(topics, [*played, *cast.transforms])
+        large = {of.name: of.rate_hz for of in seen.topics or () if of.type in LARGE_TYPES and of.role is None}
+        kept = [of.name for of in topics if of.name not in large and not of.name.startswith(OVERLAY)]
+        record = record_command(topics, kept)
         placed = bool(cast.transforms)
         record += "" if placed or not record else f" {_TRANSFORMS}"
         missing = dict(_missing_roles(cast.roles, read))
@@ -184,8 +205,8 @@ def preflight(
             streams = read_run(found, read, robot=robot, known=profiles_of(recipe))
             labelled = run_stages(streams, recipe.ingest, run_id="preflight")[2]
         except TcpipeError as error:
-            return _told(seen, None, missing, record, placed=placed, problems=error.problems)
-    return _told(seen, labelled, missing, record, placed=placed, problems=())
+            return replace(_told(seen, None, missing, record, placed=placed, problems=error.problems), large=large)
+    return replace(_told(seen, labelled, missing, record, placed=placed, problems=()), large=large)
 
 
 def _told(
@@ -202,7 +223,7 @@ def _told(
     clock = tuple(line for line in every if _CLOCK.search(line))
     promise = _promise(labelled) if labelled else None
     topics = tuple(_topics(facts, seen.duration_s or 0.0))
-    slow = tuple(line for line in seen.warnings or () if line.startswith("power: ") and "too slowly" in line)
+    slow = tuple(line for line in every if line.startswith("power: ") and "too slowly" in line)
     unplaced = () if placed else _unplaced(every)
     mend = (*_missing(missing), *slow, *unplaced, *_mend(topics, promise, seen.duration_s or 0.0))
     ready = promise is not None and promise.segments and not any((mend, clock, seen.damage))
@@ -221,6 +242,8 @@ def _told(
             *(seen.damage or ()),
         ),
         record=record,
+        large={},
+        no_power=facts.no_power or seen.no_power,
         exit_code=0 if ready else 3 if promise else 1,
     )
 
@@ -274,14 +297,14 @@ def _missing_roles(played: Collection[str], read: ReadConfig) -> Iterator[tuple[
 def _missing(missing: Mapping[str, str]) -> Iterator[str]:
     for role, what in missing.items():
         types = "" if role == "power" else f" ({' or '.join(ROLE_TYPES[role][:2])})"
-        yield f"{role}: no topic plays it: {what}; record one{types}, or name it under [read.topics]"
+        yield f"{role}: no topic plays it: {what}; record one{types}, or name it ({recipe_key('read.topics')})"
 
 
 def _unplaced(warnings: Sequence[str]) -> Iterator[str]:
     """Yield what records where the sensors sit, of a log without transforms."""
     roles = dict.fromkeys(line.partition(":")[0] for line in warnings if "nothing places frame" in line)
     if roles:
-        yield f"{', '.join(roles)}: no {_TRANSFORMS} tells where they sit: record it, or say it under [read.placement]"
+        yield f"{', '.join(roles)}: no {_TRANSFORMS} tells where they sit: record it, or say it ({recipe_key('read.placement')})"
 
 
 def _mend(topics: Sequence[RoleTopic], promise: Promise | None, span_s: float) -> Iterator[str]:

@@ -25,7 +25,11 @@ def run_stages(
     track = fuse_run(streams, sections.fuse, run_id=run_id)
     step("cutting and labelling")
     gated = gate_track(
-        track, sections.gate, max_velocity_mps=profile.max_velocity_mps, chord_m=sections.segment.chord_m
+        track,
+        sections.gate,
+        max_velocity_mps=profile.max_velocity_mps,
+        max_plausible_mps=profile.max_plausible_mps,
+        chord_m=sections.segment.chord_m,
     )
     segments = segment_track(gated, sections.segment)
     labelled = label_segments(segments, gated, streams, sections.label, voltage_range_volt=profile.voltage_range_volt)

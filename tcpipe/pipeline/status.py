@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import re
+import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -14,32 +15,34 @@ from tcpipe import __version__
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.index_files import RunFacts, uncollected
-from tcpipe.formats.object_storage import is_url
+from tcpipe.formats.object_storage import is_url, shown_path
 from tcpipe.formats.places import local_output
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
 from tcpipe.formats.record_files import Call
 from tcpipe.motion.remedies import StoreLoss, losses_of
+from tcpipe.pipeline.begun_calls import BegunCall, begun_calls, is_below
 from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time, latest_calls
 from tcpipe.pipeline.ingest_task import IngestTask, too_young
 from tcpipe.pipeline.known_runs import KnownRuns, known_runs
-from tcpipe.pipeline.known_trouble import Trouble
+from tcpipe.pipeline.known_trouble import Trouble, trouble_of_call, trouble_of_run, trouble_of_waiting
 from tcpipe.pipeline.log_sources import FoundLogs, definitions_key, find_sources, in_shard, remembered
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
 State = Literal[
-    "done", "partial", "pending", "outdated", "growing", "failed_permanent", "failed_transient", "quarantined", "superseded"
+    "done", "partial", "empty", "pending", "outdated", "growing", "failed_permanent", "failed_transient", "quarantined", "superseded"
 ]  # fmt: skip
 
 STATES: tuple[State, ...] = get_args(State)
 TO_DO: tuple[State, ...] = ("pending", "outdated", "failed_transient")
 """What the next ingest takes on."""
-TROUBLE: tuple[State, ...] = ("failed_permanent", "failed_transient", "partial")
+TROUBLE: tuple[State, ...] = ("failed_permanent", "failed_transient", "partial", "empty")
 """What somebody should look at."""
 
 _NUMBER = re.compile(r"\d[\d.,]*")
 _MOST_NAMES = 3
 _MOST_CALLS = 7
+_TWO_NIGHTS_NS = 2 * 86_400 * 10**9
 _IN_WORDS: Mapping[State, str] = {"failed_permanent": "failed for what it holds", "failed_transient": "failed for now"}
 
 
@@ -73,10 +76,12 @@ class Status:
     to_do: Estimate | None
     """What the next ingest will take; None where nothing is to do."""
     problems: tuple[str, ...]
-    """Sources that cannot be looked at, and runs that are not as they were written."""
+    """Sources that cannot be looked at, runs that are not complete, logs that wait for too long, calls that were killed."""
     gone: tuple[str, ...]
     """Sources that cannot be looked at and that only calls before the latest ingest were given."""
     superseded_runs: int
+    begun: tuple[BegunCall, ...]
+    """Calls that have begun and not ended: they run, perhaps run, or were killed and nobody accepted that."""
     history: tuple[Call, ...]
     """The latest calls, the last one first."""
     losses: tuple[StoreLoss, ...]
@@ -91,6 +96,7 @@ class Status:
         lines += [f"to do: {self.to_do}"] if self.to_do else []
         lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
+        lines += [f"{call.state}: {call}" for call in self.begun if call.state != "killed"]
         lines += ["losses:", *map(str, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
         return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
@@ -131,11 +137,14 @@ def status(
     """
     ruling = recipe_of(recipe)
     opened = Store(store if is_url(store) else local_output(store)) if create else open_store(store)
-    calls = latest_calls(opened)
+    calls, begun = latest_calls(opened), begun_calls(opened)
     given = [str(log) for log in logs]
-    lately: Sequence[str] = given or next((call.logs for call in calls if call.logs), ())
-    given = given or list(dict.fromkeys(log for call in calls for log in call.logs))
-    if not given:
+    ingests = [(call.begin, call.logs) for call in calls if call.logs]
+    ingests += [(call.begin, call.works_on) for call in begun if call.command == INGEST]
+    asked = list(dict.fromkeys(log for _, logs in sorted(ingests, reverse=True) for log in logs))
+    lately: Sequence[str] = [*map(shown_path, given)] or (max(ingests)[1] if ingests else ())
+    given = given or asked
+    if not given and not calls:
         raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
     known, definitions = known_runs(opened, force=force), definitions_key(message_definitions)
     if not create:
@@ -159,10 +168,60 @@ def status(
         for of, tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
     )
     ledgers_m = (run.facts.ledger_m for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling))
+    waiting = list[tuple[State, IngestTask]]()
+    if (
+        not create
+        and all(call.state == "killed" for call in begun)
+        and all(is_below(log, asked) for log in map(_absolute, given))
+    ):
+        every = ((state, task) for (state, _), tasks in groups.items() for task, _ in tasks)
+        waiting = [of for of in every if (of[1].source.sha256 or of[1].source.files_digest) not in failures]
+    begun = [call for call in begun if not (call.state == "killed" and trouble_of_call(call).is_accepted(opened))]
+    killed = [call.problem for call in begun if call.state == "killed"]
     gone = tuple(line for path, lines in found.problems.items() if path not in lately for line in lines)
     found = replace(found, problems={path: lines for path, lines in found.problems.items() if path in lately})
-    summed = _summed(opened, told, found, known, calls, sources=given, jobs=jobs)
-    return replace(summed, losses=losses_of(ledgers_m), gone=gone)
+    summed = _summed(
+        opened,
+        told,
+        found,
+        known,
+        calls,
+        sources=[*map(shown_path, given)],
+        jobs=jobs,
+        more=(*_waiting_too_long(waiting, opened), *killed),
+    )
+    return replace(summed, losses=losses_of(ledgers_m), gone=gone, begun=tuple(begun))
+
+
+def _waiting_too_long(tasks: Iterable[tuple[State, IngestTask]], store: Store) -> Iterator[str]:
+    """Yield a line about the logs that lie there for more than two nights, were never ingested, and nobody accepted that.
+
+    Since when is told by the file system, not by the modification time, which a copy may keep.
+    """
+    before_ns = time.time_ns() - _TWO_NIGHTS_NS
+    late: dict[State, list[str]] = {"pending": [], "growing": []}
+    for state, task in tasks:
+        if (
+            state in late
+            and task.source.arrival_ns < before_ns
+            and not trouble_of_waiting(task.source).is_accepted(store)
+        ):
+            late[state].append(task.source.name)
+    for state, how in (
+        ("pending", "run 'tcpipe ingest' over them and see how it ends"),
+        (
+            "growing",
+            "their modification times lie in the future, so that --min-age never passes: set them with 'touch'",
+        ),
+    ):
+        if names := late[state]:
+            more = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+            named = f"{', '.join(names[:_MOST_NAMES])}{more}"
+            yield f"{len(names)} {state} for more than two nights: {named}; {how}, or 'tcpipe accept LOG'"
+
+
+def _absolute(log: str) -> str:
+    return log if is_url(log) else str(Path(log).absolute())
 
 
 def _group(state: State, alike: str, tasks: Sequence[tuple[IngestTask, str]]) -> Group:
@@ -202,10 +261,14 @@ def _standing_of(made: RunFacts, task: IngestTask, store: Store) -> tuple[State,
     """Return where a log stands that is in the store as it would be made now."""
     if made.superseded_by:
         return "superseded", "a longer recording has taken its place"
-    if not made.damage:
+    trouble = trouble_of_run(
+        made.run_id, made.why_empty, made.damage, content=str(task.source.sha256), log=task.source.origins
+    )
+    if trouble is None:
         return "done", ""
-    trouble = Trouble(str(task.source.sha256), made.damage, task.source.origins, made.run_id, "damaged")
-    return ("done", "damaged, accepted") if trouble.is_accepted(store) else ("partial", _cause(made.damage[0], task))
+    if trouble.is_accepted(store):
+        return "done", f"{trouble.kind}, accepted"
+    return "empty" if made.why_empty else "partial", _cause(trouble.lines[0], task)
 
 
 def _why_pending(task: IngestTask, store: Store, known: KnownRuns, failures: Mapping[str, Sequence[Trouble]]) -> str:
@@ -271,6 +334,7 @@ def _summed(
     *,
     sources: Sequence[str],
     jobs: int,
+    more: Sequence[str],
 ) -> Status:
     counts = Counter[State]()
     for group in told:
@@ -278,9 +342,7 @@ def _summed(
     waiting = sum(group.size_bytes for group in told if group.state in TO_DO)
     trouble = any(group.state in TROUBLE for group in told)
     outdated = (f"run {name}: of data model {head.data_model_version}" for name, head in known.runs.outdated.items())
-    bare = (run.facts.run_id for run in known.runs.finished if run.facts.log is None)
-    orphans = (f"run {name}: its run-<n>.json is gone, or not as it was written; ingest its log again" for name in bare)
-    problems = (*chain(*found.problems.values()), *known.runs.damaged.values(), *orphans, *outdated)
+    problems = (*chain(*found.problems.values()), *dict.fromkeys(known.runs.damaged.values()), *outdated, *more)
     return Status(
         store=str(store.root),
         sources=tuple(sources),
@@ -290,6 +352,7 @@ def _summed(
         problems=problems,
         gone=(),
         superseded_runs=len(known.runs.superseded),
+        begun=(),
         history=tuple(calls),
         losses=(),
         exit_code=3 if trouble or problems else 0,

@@ -24,7 +24,7 @@ def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirecto
     here = (entry.name.split("/") for entry in store.runs_place.entries("", but="streams"))
     pages = {(parts[0], parts[1]) for parts in here if len(parts) == 3 and parts[2] == REPORT}
     trouble = known_trouble(store, [run.facts for run in found.finished])
-    accepted = {of.run_id for of in trouble if of.kind == "damaged" and of.run_id and of.is_accepted(store)}
+    accepted = {of.run_id for of in trouble if of.kind != "failed" and of.run_id and of.is_accepted(store)}
     causes = by_cause((run.run_id, run.facts.warnings) for run in found.finished)
     return StoreFacts(
         where=str(store.root),

@@ -27,6 +27,7 @@ from tcpipe.formats.seals import CHECKSUMS, Checksum, broken_checksums, broken_s
 from tcpipe.formats.store_mark import MARK, SPOOL
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.pipeline.dataset.segments import KEPT
+from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.report.overview import shows_map
 from tcpipe.store import Store
 from tcpipe.tables.columns import floats, integers
@@ -58,10 +59,19 @@ def verify_store(store: Store) -> Iterator[Finding]:
     for entry in place.entries("records"):
         yield broken_seal_in(place.read(entry.name), place.where(entry.name)) or ("records", 1)
     yield from _maps(store)
-    for run_id in store.run_ids():
-        yield from verify_run(store, run_id)
+    yield from _runs(store)
     if isinstance(place, DirectoryPlace):
         yield from _left_behind(place.root)
+
+
+def _runs(store: Store) -> Iterator[Finding]:
+    """Yield the same of all runs, and of those that the index knows and of which a document, or all, is gone."""
+    wrong = set[str]()
+    for run_id in store.run_ids():
+        for finding in verify_run(store, run_id):
+            wrong |= {run_id} if isinstance(finding, str) else set()
+            yield finding
+    yield from (line for (run_id, _), line in list_runs(store).damaged.items() if run_id not in wrong)
 
 
 def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator[Finding]:
@@ -82,7 +92,7 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     for name in recipes if recipe is None else [recipe]:
         yield from _isolated(_ingestion(place.below(name)))
     if not recipes:
-        yield f"{place.where()}: holds no finished ingestion; ingest its log again"
+        yield f"{place.where()}: holds no finished run; ingest its log again"
     for name in names:
         if name not in there and name.partition("/")[0] not in recipes:
             yield _stranger(place, name)

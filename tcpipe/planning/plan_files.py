@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
+from annotated_types import Ge, Le
+from numpy.typing import NDArray
 
 from tcpipe.errors import ModelError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import clear_beside
@@ -36,7 +38,7 @@ class PlanRequest:
     start_deg: tuple[float, float]
     goal_deg: tuple[float, float]
     objective: Objective = "energy"
-    step_m: float = 1.0
+    step_m: Annotated[float, Ge(0.05), Le(1000)] = 1.0
     allow_unseen: bool = False
     cost_map: Path | None = None
 
@@ -84,6 +86,11 @@ class PlanResult:
     status: Literal["done", "unchanged"]
     plans: Mapping[Objective, PlanTotals]
     """By objective, the one that was asked for first."""
+
+    @property
+    def lonlat_deg(self) -> NDArray[np.float64]:
+        """Read the points of the path from its file: longitude and latitude [deg], WGS 84, shape (P, 2)."""
+        return np.array(read_as(self.out, PlanFile).features[0].geometry.coordinates)
 
     @property
     def exit_code(self) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -22,7 +22,9 @@ from tcpipe.power.sources import (
     with_sign,
 )
 from tcpipe.power.wrapped import wrap_of
+from tcpipe.recipe.suggestions import RecipeFragment, suggested
 from tcpipe.robots.profiles import CurrentSign, PowerSource
+from tcpipe.tables.findings import NoPower
 
 _LOG_TIME = "log_time_ns"
 _OF_USUAL_VOLTAGE = (0.2, 3.0)
@@ -49,6 +51,8 @@ class PowerReadings:
     """What a drawn current is counted as, and what tells it; None without power."""
     includes: tuple[str, ...] = ()
     """What the currents feed besides the drives."""
+    refusal: NoPower | None = None
+    """Why there are no rails, where there are topics."""
 
 
 def read_power(
@@ -71,6 +75,7 @@ def read_power(
     rails: dict[str, list[RailReadings]] = {}
     sources: list[PowerSource] = []
     refused: list[str] = []
+    mended: dict[str, list[PowerSource]] = {}
     warnings: list[str] = []
     for topic, (type_name, columns) in topics.items():
         if seldom := _too_seldom(topic, np.asarray(columns[_LOG_TIME], np.float64)):
@@ -80,6 +85,7 @@ def read_power(
         found = choices if isinstance(choices, str) else _first_that_holds_power(topic, columns, choices, known)
         if isinstance(found, str):
             refused.append(found)
+            mended[topic] = [] if isinstance(choices, str) else _in_thousandths(topic, columns, choices[0], known)
             continue
         sources += found.sources
         warnings += found.warnings
@@ -87,12 +93,16 @@ def read_power(
     rails = _paired(rails)
     refused = refused or _incomplete([rail for found in rails.values() for rail in found])
     if refused:
-        return PowerReadings(warnings=tuple(f"power refused: {why}; there will be no energy" for why in refused))
+        lines = tuple(f"power refused: {why}; there will be no energy" for why in refused)
+        alone = len(mended) == len(topics) == 1
+        recipe = _propose_recipe(mended, alone=alone) if len(mended) == len(topics) and all(mended.values()) else ""
+        more = "; where its numbers are thousandths, write in a recipe:" if recipe else ""
+        return PowerReadings(warnings=lines, refusal=NoPower("; ".join(lines) + more, recipe))
     rails, odd = _believable(rails)
     log_times = {topic: np.asarray(columns[_LOG_TIME], np.float64) for topic, (_, columns) in topics.items()}
     sign, told, told_by = _sign(rails, log_times, sources, current_sign)
     if sign == 0:
-        return PowerReadings(warnings=tuple(told))
+        return PowerReadings(warnings=tuple(told), refusal=NoPower("; ".join(told)))
     includes = tuple(dict.fromkeys(of.includes for of in sources if of.includes))
     warnings += [*told, *odd, *(f"power: {what} are part of it" for what in includes)]
     signed = {topic: [with_sign(rail, sign) for rail in found] for topic, found in rails.items()}
@@ -135,6 +145,31 @@ def _first_that_holds_power(
         warnings += [f"power: {why}; {instead} is taken instead" for why in why_not]
         return _Told(sources, rails, warnings)
     return "; ".join(why_not)
+
+
+def _in_thousandths(
+    topic: str, columns: Columns, sources: Sequence[PowerSource], known: Sequence[PowerSource]
+) -> list[PowerSource]:
+    """Return the sources in millivolts or milliamperes, as far as their numbers are power then; none where they are not."""
+    for volt, amp in ((1.0, 1e-3), (1e-3, 1.0), (1e-3, 1e-3)):
+        scaled = [
+            replace(of, voltage_scale=volt * of.voltage_scale, current_scale=amp * of.current_scale) for of in sources
+        ]
+        found = read_rails(columns, scaled, topic, known)
+        if not isinstance(found, str) and all(why_refused(rail, columns) is None for rail in found):
+            return scaled
+    return []
+
+
+def _propose_recipe(sources: Mapping[str, Sequence[PowerSource]], *, alone: bool) -> str:
+    """Return the tables of a recipe for the sources of topics; of one topic alone for all of its type."""
+    rows = []
+    for topic, of_topic in sources.items():
+        named = [of if alone and of.type not in FLOAT_TYPES else replace(of, topic=topic) for of in of_topic]
+        rows += [
+            {of.name: value for of in fields(each) if (value := getattr(each, of.name)) != of.default} for each in named
+        ]
+    return RecipeFragment({"power_sources": rows}).toml()
 
 
 def _unwrapped(rail: RailReadings) -> tuple[RailReadings, list[str]]:
@@ -227,11 +262,11 @@ def _sign(
             return 1, [], f"{told} (message type)"
         negative = "negative" if told == "drawn_positive" else "positive"
         why = f"power refused: the current is {negative}, {share} flows back; there will be no energy"
-        cure = f'if this robot counts drawn current so, write in the recipe under [read]: current_sign = "{other}"'
-        return 0, [f'{why}; {cure}; if it truly rolled downhill throughout: "{told}"'], ""
+        cures = {"if this robot counts drawn current so": other, "if it truly rolled downhill throughout": told}
+        return 0, [why + _sign_lines(cures)], ""
     if sign > 0:
         why = f"power: the current counts as positive when drawn, against the ROS convention: {share} is positive"
-        return 1, [f'{why}; settle it with read.current_sign = "drawn_positive"'], "drawn_positive (mean)"
+        return 1, [why + _sign_lines({"to settle it": "drawn_positive"})], "drawn_positive (mean)"
     if sign < 0:
         return -1, [], "drawn_negative (mean, as ROS has it)"
     return _unclear(share, sources)
@@ -241,10 +276,17 @@ def _unclear(share: str, sources: Sequence[PowerSource]) -> tuple[int, list[str]
     """Return what `_sign` does where as much flows one way as the other: ROS' convention counts where it may be meant, else it is asked."""
     if any(of.sign == "auto" and of.type not in (BATTERY_STATE, *FLOAT_TYPES) for of in sources):
         why = f"power refused: which sign a drawn current has is not known of its type, nor clear from the record (net {share})"
-        return 0, [f'{why}; write in the recipe under [read]: current_sign = "drawn_positive" or "drawn_negative"'], ""
+        return 0, [why + _sign_lines(_EITHER)], ""
     why = f"power: the current's sign is unclear (net {share}): taken as negative when drawn, as ROS has it"
-    cure = 'settle it with read.current_sign = "drawn_positive" or "drawn_negative"'
-    return -1, [f"{why}; {cure}"], "drawn_negative (ROS)"
+    return -1, [why + _sign_lines(_EITHER)], "drawn_negative (ROS)"
+
+
+_EITHER = {f"if a drawn current is {word}": f"drawn_{word}" for word in ("negative", "positive")}
+
+
+def _sign_lines(signs: Mapping[str, str]) -> str:
+    """Return what settles the sign of currents, by what speaks for it."""
+    return "".join(suggested(purpose, {"read": {"current_sign": sign}}) for purpose, sign in signs.items())
 
 
 def _weight_s(time_s: Floats) -> Floats:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.power.counters import Counter, counted
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.robots.profiles import FieldPath, PowerSource, fields_of
 
 Columns = Mapping[str, NDArray[Any]]
@@ -67,9 +68,7 @@ def sources_of(
     if platforms:
         which = f"this robot's is {platform or 'not known'}; name the robot with --robot"
         return f"{topic}: {type_name} names its currents by platform ({', '.join(platforms)}), {which}"
-    return (
-        f"{topic}: {type_name} carries no power that is known here; describe it in the recipe under [[power_sources]]"
-    )
+    return f"{topic}: {type_name} carries no power that is known here; describe it ({recipe_key('power_sources')})"
 
 
 def power_lists(type_name: str, known: Sequence[PowerSource]) -> frozenset[str]:
@@ -107,6 +106,11 @@ def bare_unit(type_name: str, topic: str) -> str | None:
 def rail_of(topic: str) -> str:
     """Return the rail's name: the topic's without its quantity, so that a rail's voltage and current share it."""
     return _QUANTITY.sub("", topic.lower().removesuffix(_CORRECTED)).rstrip("/_")
+
+
+def is_of_drives(topic: str) -> bool:
+    """Whether a topic's name says that it is of what drives, rather than of a whole battery."""
+    return re.search(r"drive|motor|traction|wheel|esc(?![a-z])|inverter", topic.lower()) is not None
 
 
 def is_corrected(topic: str) -> bool:
@@ -232,7 +236,7 @@ def _against_voltage(voltage: Floats, current: Floats, every_voltage: Floats, co
         if np.all(np.isclose(charge, every_voltage) | np.isclose(100 * charge, every_voltage)):
             return f"the voltage equals the percentage of charge on all {len(charge)} rows (first {voltage[0]:g})"
     typical_volt = float(np.median(voltage))
-    if typical_volt > _LARGEST_VOLT:
+    if typical_volt > LARGEST_VOLT:
         return f"the median voltage is {typical_volt:g} V (millivolts?)"
     if typical_volt < 1.0:
         return f"the median voltage is {typical_volt:g} V (a share of charge, or reversed?)"
@@ -248,7 +252,7 @@ def _against_current(current: Floats) -> str | None:
     return None
 
 
-_LARGEST_VOLT = 1000.0  # the median of no robot's battery: millivolts
+LARGEST_VOLT = 1000.0  # the median of no robot's battery: millivolts
 LARGEST_AMP = 1000.0  # no drive draws more: milliamperes, or a number that wrapped
 _MIN_ROWS_TO_JUDGE = 20  # fewer may be equal by chance, rounded as they are
 _UNAMBIGUOUS = 0.8  # of the charge moved flows one way

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, asdict, fields, is_dataclass
 from numbers import Integral, Real
@@ -22,6 +23,7 @@ from tcpipe.errors import RecipeError
 T = TypeVar("T")
 
 _SHOWN_CHARACTERS = 80
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 _DECIMAL_BITS = 4096
 """Longer whole numbers Python does not write in decimal."""
 
@@ -92,12 +94,16 @@ def as_toml(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(as_toml(item) for item in value) + "]"
     if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{as_toml(str(key))} = {as_toml(item)}" for key, item in value.items()) + "}"
+        return "{" + ", ".join(f"{_key(str(name))} = {as_toml(item)}" for name, item in value.items()) + "}"
     if is_dataclass(value) and not isinstance(value, type):
         return as_toml(asdict(value))
     if isinstance(value, int) and value.bit_length() > _DECIMAL_BITS:
         return hex(value)
     return repr(value)
+
+
+def _key(name: str) -> str:
+    return name if _BARE_KEY.fullmatch(name) else as_toml(name)
 
 
 def _parts(kind: Any) -> tuple[Any, tuple[Any, ...], bool]:

@@ -8,15 +8,13 @@ A bound is where a value can mean nothing any more, or costs without end: it is 
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from dataclasses import dataclass, field, replace
-from typing import Annotated, Literal, cast, get_args
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 from annotated_types import Ge, Le, Lt
 
-from tcpipe.logs.mapped import topic_of
 from tcpipe.recipe.checking import settle
-from tcpipe.robots.profiles import PowerSource, Robot
+from tcpipe.robots.profiles import PlausibleSpeed, PowerSource, Robot
 from tcpipe.tables.findings import LEFT_OUT
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
@@ -170,6 +168,8 @@ class GateConfig:
     """See `require_full_speed`."""
     max_velocity_mps: Limit | None = None
     """The robot's maximum speed; none takes the profile's [m/s]."""
+    max_plausible_mps: PlausibleSpeed | None = field(default=None, metadata=LEFT_OUT)
+    """No label where the track is faster than this, and no run where most of a minute of driving is; none takes the profile's [m/s]."""
     standing_velocity_mps: Limit = 0.05
     """Slower than this (and not turning) is standing [m/s]."""
     standing_yaw_rate_radps: Limit = 0.05
@@ -376,12 +376,3 @@ class Recipe:
         return IngestSections(
             self.read, self.fuse, self.gate, self.segment, self.label, self.robots, self.power_sources, self.tables
         )
-
-    def read_of(self, topics: Collection[str]) -> ReadConfig:
-        """Return what rules the reading of a log of these topics: of one that holds the mapped tables, they play their roles."""
-        roles: dict[Role, list[str]] = {}
-        for name, table in self.tables.items():
-            role = cast("Role", table.role or name)
-            if role in get_args(Role) and (topic := topic_of(name, role, table.columns)[0]) in topics:
-                roles.setdefault(role, []).append(topic)
-        return replace(self.read, topics={**roles, **self.read.topics}) if roles else self.read

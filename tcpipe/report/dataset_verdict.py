@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from tcpipe.formats.dataset_card import DatasetCard
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.report.page import Verdict
 
 _FEW_SAMPLES = 100
@@ -92,4 +93,6 @@ def _to_do(card: DatasetCard) -> Iterator[Verdict]:
         if card.split.holdout == "sample":
             yield Verdict("do", "Hold out by block or by run (--holdout): single samples lie beside what trains.")
         else:
-            yield Verdict("do", "Larger blocks (split.block_m) or --holdout run leave less of test beside train.")
+            yield Verdict(
+                "do", f"Larger blocks ({recipe_key('split.block_m')}) or --holdout run leave less of test beside train."
+            )

@@ -12,7 +12,13 @@ const page = (() => {
     [views] = await Bokeh.embed.embed_items({ page: first }, [item]);
     plots.push(...[...views].filter((view) => "request_paint" in view));
   }
-  const turn = () => new Promise((next) => setTimeout(next, 0));
+  const state = document.documentElement.dataset;
+  let [printing, goOn] = [false, () => {}];
+  const turn = () => new Promise((next) => {
+    goOn = next;
+    if (printing) next();
+    else setTimeout(next, 0);
+  });
   async function join(root) {
     await turn();
     Bokeh.documents[0].apply_json_patch({ events: [{ kind: "RootAdded", model: root }] });
@@ -27,16 +33,33 @@ const page = (() => {
   document.addEventListener("DOMContentLoaded", async () => {
     await first;
     const joined = await work();
-    document.documentElement.dataset.ready = "yes";
+    state.ready = "yes";
     for (const root of figures?.later ?? []) {
       const view = await join(root);
       joined?.(view);
     }
-    document.documentElement.dataset.whole = "yes";
+    state.whole = "yes";
   });
   const repaint = () => plots.forEach((plot) => plot.request_paint());
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", repaint);
-  matchMedia("print").addEventListener("change", repaint);
+  // Before a page prints, no timer fires and no canvas on the page may change its size, but promises are waited for. So the figures
+  // that are missing join by promises alone (so many at most), and the paper gets a copy of each, in its colours, as wide as it allows.
+  addEventListener("beforeprint", async () => {
+    state.prints = "yes";
+    printing = true;
+    goOn();
+    for (let i = 0; !state.whole && i < 10_000; i++) await null;
+    printing = false;
+    for (const plot of plots) {
+      plot.repaint();  // which gives it its ranges and its layout
+      document.getElementById(plot.model.id).after(plot.export("png").canvas);
+    }
+  });
+  addEventListener("afterprint", () => {
+    delete state.prints;
+    document.querySelectorAll("figure > canvas").forEach((copy) => copy.remove());
+    repaint();
+  });
 
   // What the pages' own scripts share.
   const model = (name) => figures ? Bokeh.documents[0].get_model_by_name(name) : null;

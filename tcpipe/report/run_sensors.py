@@ -116,7 +116,10 @@ def _clocks(facts: RunFacts) -> list[Section]:
 def _mended(offset: ClockOffset) -> str:
     if not (offset.noted or offset.drifts):
         return ""
-    return offset.recipe.replace("\n", " ") if offset.blamed else "none: which of the two is off is not known"
+    if not offset.blamed:
+        return "none: which of the two is off is not known"
+    table, _, line = offset.recipe.partition("\n")
+    return f"under {table}: {line}" if line else "none: its stamps are the recorder's already"
 
 
 def _drift(offset: ClockOffset) -> str:

@@ -10,7 +10,7 @@ from tcpipe.motion.remedies import REMEDIES
 from tcpipe.report.page import Verdict
 from tcpipe.report.quality import QUALITY_WORDS
 from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.findings import RunFacts
+from tcpipe.tables.findings import NoPower, RunFacts
 
 _FEW_SEGMENTS = 30
 _MANY = 0.1
@@ -32,13 +32,20 @@ def verdict(manifest: Manifest, quality: Mapping[str, int], missing: Sequence[st
     facts = manifest.info.findings.facts
     driven_m = sum(manifest.ledger_m.values())
     segments = manifest.counts.segments
+    refused = facts.no_power
     return [
+        *([Verdict("do", _power_remedy(refused))] if refused else []),
         *_used(segments, manifest.ledger_m.get("kept", 0.0), driven_m),
         *_good(facts),
         *_thin(manifest, segments, missing),
         *_doubtful(manifest, facts, quality, segments),
         *_to_do(manifest, facts, driven_m),
     ]
+
+
+def _power_remedy(refused: NoPower) -> str:
+    lines = f"\n{refused.recipe}" if refused.recipe else ""
+    return f"{refused.why[0].upper()}{refused.why[1:]}{lines}"
 
 
 def _used(segments: int, kept_m: float, driven_m: float) -> Iterator[Verdict]:
@@ -66,7 +73,8 @@ def _thin(manifest: Manifest, segments: int, missing: Sequence[str]) -> Iterator
         yield Verdict("thin", f"{segments} segments only.")
     instead = {"gnss"} if manifest.counts.pose_messages else set()
     for role, text in _SENSORS.items():
-        if not getattr(manifest.counts, f"{role}_messages") and role not in instead:
+        said = role == "power" and manifest.info.findings.facts.no_power is not None
+        if not getattr(manifest.counts, f"{role}_messages") and role not in instead and not said:
             yield Verdict("thin", text)
     for text in missing:
         yield Verdict("thin", text)
@@ -123,7 +131,7 @@ def _to_do(manifest: Manifest, facts: RunFacts, driven_m: float) -> Iterator[Ver
         for of in (facts.clock_offsets.offsets if facts.clock_offsets else {}).values()
     ):
         yield Verdict("do", "The table of clocks has the recipe line that corrects it.")
-    if not manifest.counts.power_messages:
+    if not manifest.counts.power_messages and facts.no_power is None:
         yield Verdict("do", "Record voltage and current; 'tcpipe preflight LOG' prints what to record.")
 
 

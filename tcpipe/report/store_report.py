@@ -188,16 +188,16 @@ def _trouble(store: StoreFacts, runs: Sequence[StoredRun]) -> list[Section]:
     """Return the logs without a run, and the runs that are damaged or cannot be read."""
     rows = [(of.log, of.state, of.why) for of in store.failed]
     for run in runs:
-        if run.facts is None or run.state.startswith("damaged"):
+        if run.facts is None or run.state.startswith(("damaged", "empty")):
             line = store.found.damaged.get((run.run_id, run.recipe_id), "ingest its log again")
-            rows.append((run.run_id, run.state, run.facts.damage[0] if run.facts else line))
+            rows.append((run.run_id, run.state, (*run.facts.damage, run.facts.why_empty)[0] if run.facts else line))
     if not rows:
         return []
     text = "'tcpipe accept' sets aside what cannot be mended."
     if len(rows) > _MOST_LISTED:
         text += f" The first {_MOST_LISTED} of {len(rows)}; the table above has every run."
     header = ("log or run", "is", "why")
-    return [Section("Failed and damaged", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)]
+    return [Section("Failed, damaged and empty", text, header=header, rows=rows[:_MOST_LISTED], folded=len(rows) > 20)]
 
 
 def _data(store: StoreFacts, runs: Sequence[StoredRun]) -> Json:

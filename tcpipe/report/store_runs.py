@@ -42,7 +42,7 @@ class StoreFacts:
     where: str
     found: Ingestions
     accepted: frozenset[str]
-    """Runs whose damage a person has accepted."""
+    """Runs whose trouble a person has accepted."""
     pages: frozenset[tuple[str, str]]
     """Ingestions, by run and recipe, that have a page."""
     datasets: tuple[StoredDataset, ...]
@@ -66,7 +66,7 @@ class StoredRun:
     @property
     def is_current(self) -> bool:
         """Tell whether it counts: it is of the ruling recipe, and nothing has taken its place."""
-        return self.state in (GOOD, "damaged", "damaged, accepted")
+        return self.state.removesuffix(", accepted") in (GOOD, "damaged", "empty")
 
     @property
     def begin_ns(self) -> int:
@@ -155,7 +155,8 @@ def _state(facts: RunFacts, ruling: str | None, *, accepted: bool) -> str:
         return f"superseded by {facts.superseded_by}"
     if facts.ingest_key != ruling:
         return "of another recipe"
-    return ("damaged, accepted" if accepted else "damaged") if facts.damage else GOOD
+    wrong = "damaged" if facts.damage else "empty" if facts.why_empty else ""
+    return f"{wrong}{', accepted' * accepted}" if wrong else GOOD
 
 
 def _percent(share: float | None) -> float | None:

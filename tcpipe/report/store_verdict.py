@@ -95,6 +95,8 @@ def _doubtful(store: StoreFacts, runs: Sequence[StoredRun], current: Sequence[St
         yield Verdict("doubtful", f"{_many(bad, 'run')} not as written, or of another data model (listed below).")
     if damaged := sum(run.state == "damaged" for run in current):
         yield Verdict("doubtful", f"{_many(damaged, 'run')} of a damaged log.")
+    if empty := sum(run.state == "empty" for run in current):
+        yield Verdict("doubtful", f"{_many(empty, 'run')} without a segment though the robot drove.")
     if failed := sum(of.state != "accepted" for of in store.failed):
         yield Verdict("doubtful", f"{_many(failed, 'log')} gave no run (listed below).")
     floors = [run.floor for run in current if run.floor is not None]
@@ -143,8 +145,10 @@ def _to_do(store: StoreFacts, runs: Sequence[StoredRun], losses: Sequence[StoreL
         yield Verdict(
             "do", f"Most is to be won of {reason}, {worth.metres:.0f} m ({100 * worth.share:.0f} %): {worth.remedy}."
         )
-    if any(of.state != "accepted" for of in store.failed) or any(run.state == "damaged" for run in runs):
-        yield Verdict("do", "Look at what failed or is damaged; 'tcpipe accept' sets aside what cannot be mended.")
+    if any(of.state != "accepted" for of in store.failed) or any(run.state in ("damaged", "empty") for run in runs):
+        yield Verdict(
+            "do", "Look at what failed, is damaged or empty; 'tcpipe accept' sets aside what cannot be mended."
+        )
     if not any(of.there for of in store.datasets):
         yield Verdict("do", "Build a dataset: 'tcpipe build-dataset'.")
 

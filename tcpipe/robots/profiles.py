@@ -14,11 +14,16 @@ _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan":
 Size = Annotated[float, Ge(0.05), Le(100)]
 """Of a robot [m]: from a toy's to a mining truck's."""
 Speed = Annotated[float, Ge(0.01), Le(100)]
+PlausibleSpeed = Annotated[float, Ge(2), Le(1000)]
+"""A bound that no true track reaches [m/s]: at walking pace it would refuse robots that drive."""
 Volt = Annotated[float, Ge(0.1), Le(1e4)]
 Scale = Annotated[float, Gt(0), Le(1e9)]
 
 GENERIC = "generic"
 """The name of a robot of which nothing is known."""
+
+MAX_PLAUSIBLE_MPS = 15.0
+"""No ground robot that records terrain costs is faster [m/s]: a faster track is an estimate that went astray."""
 
 CurrentSign = Literal["drawn_positive", "drawn_negative", "auto"]
 
@@ -52,6 +57,8 @@ class Robot:
     """Length of its footprint [m]."""
     max_velocity_mps: Speed | None = None
     """Maximum speed [m/s]; a segment that was commanded slower than this is not at the terrain's limit."""
+    max_plausible_mps: PlausibleSpeed = field(default=MAX_PLAUSIBLE_MPS, metadata={"json": (MAX_PLAUSIBLE_MPS,)})
+    """A track of this robot that is faster is wrong [m/s]: it bears no label there."""
     voltage_range_volt: tuple[Volt, Volt] | None = None
     """Lowest and highest voltage that its battery has [V]; a segment beyond is flagged."""
     platform: str | None = None

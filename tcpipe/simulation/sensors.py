@@ -146,6 +146,8 @@ class Power:
     rate_hz: float = 20.0
     averaged: bool = False
     """Over the period that ends at the stamp, rather than sampled at it."""
+    reading_hz: float | None = None
+    """How often the device is read, where each message repeats the last reading; None: for every message."""
     voltage_std_volt: float = 0.02
     current_std_amp: float = 0.08
     voltage_step_volt: float = 0.01
@@ -350,20 +352,26 @@ def read_visual(truth: Truth, sensor: Visual, faults: Faults, noise: Noise) -> R
 def read_power(truth: Truth, sensor: Power, faults: Faults, noise: Noise) -> Reading:
     """Return voltage_volt, left_amp and right_amp (the drivers), electronics_amp (all else); drawn positive."""
     stamp = _sample_times(truth, sensor.rate_hz, noise("power.phase"))
+    read_ns = stamp if sensor.reading_hz is None else _sample_times(truth, sensor.reading_hz, noise("power.reading"))
     right = truth.current_amp * truth.right_share
     series = {"voltage_volt": truth.voltage_volt, "left_amp": truth.current_amp - right, "right_amp": right}
     if sensor.averaged:
-        period_ns = round(1e9 / sensor.rate_hz)
-        values = {name: _mean_before(truth, series_values, stamp, period_ns) for name, series_values in series.items()}
+        period_ns = round(1e9 / (sensor.reading_hz or sensor.rate_hz))
+        values = {
+            name: _mean_before(truth, series_values, read_ns, period_ns) for name, series_values in series.items()
+        }
     else:
-        values = {name: np.interp(stamp, truth.stamp_ns, series_values) for name, series_values in series.items()}
+        values = {name: np.interp(read_ns, truth.stamp_ns, series_values) for name, series_values in series.items()}
     if faults.power_noise:
         for name in values:
             volt = name == "voltage_volt"
             std = sensor.voltage_std_volt if volt else sensor.current_std_amp
             step = sensor.voltage_step_volt if volt else sensor.current_step_amp
-            noisy = values[name] + std * noise(f"power.{name}").standard_normal(stamp.size)
+            noisy = values[name] + std * noise(f"power.{name}").standard_normal(read_ns.size)
             values[name] = np.round(noisy / step) * step
+    if sensor.reading_hz is not None:
+        last = np.maximum(np.searchsorted(read_ns, stamp, side="right") - 1, 0)
+        values = {name: reading[last] for name, reading in values.items()}
     values["electronics_amp"] = sensor.electronics_watt / values["voltage_volt"]
     keep = _but_for(stamp, truth, noise("power.gap"), sensor.gap_s) if faults.power_gap else None
     return _finish(stamp, sensor.delay_s, values, faults, noise, name="power", keep=keep)

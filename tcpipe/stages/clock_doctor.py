@@ -12,9 +12,11 @@ import pyarrow as pa
 from tcpipe.fusion.checks.clock_offsets import ClockOffsets, Pair, PowerSignal, RoleOffset, find_clock_offsets
 from tcpipe.fusion.measurements import GNSS
 from tcpipe.power.rails import power_at
+from tcpipe.recipe.suggestions import RecipeFragment, suggested
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_sanity import longest_epoch
 from tcpipe.stages.power_rails import rails_of
+from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.columns import floats
 from tcpipe.tables.findings import ClockFacts, ClockOffset, ClockPair, Findings
 from tcpipe.tables.levels import Streams
@@ -34,21 +36,18 @@ def clock_findings(streams: Streams, inputs: FusionInputs) -> Findings[ClockFact
     given_s = streams.findings.facts.time_offset_s
     offsets, warnings = {}, []
     for role, offset in found.offsets.items():
-        entry = f"{role} = {given_s.get(role, 0.0) - offset.offset_s:.{3 if offset.std_s < _FINE_S else 2}f}"
-        recipe = f'[read.time]\n{role} = "log"' if offset.drifts else f"[read.time_offset_s]\n{entry}"
-        offsets[role] = ClockOffset(**_told(offset), recipe="" if _is_open(offset) else recipe)
+        name = recipe_role(role, streams)
+        by_log = streams.sensors[role].time_source == "log"
+        remedy_s = round(given_s.get(name, 0.0) - offset.offset_s, 3 if offset.std_s < _FINE_S else 2)
+        tables = {"read.time": {name: "log"}} if offset.drifts else {"read.time_offset_s": {name: remedy_s}}
+        useless = _is_open(offset) or (offset.drifts and by_log)
+        offsets[role] = ClockOffset(**_told(offset), recipe="" if useless else RecipeFragment(tables).toml())
         if offset.drifts or offset.noted:
-            warnings.append(_said(found, role, offset, entry))
+            purpose = "where the recorder's clock is the better one" if offset.drifts else "to correct it"
+            warnings.append(_said(found, role, offset, name) + ("" if useless else suggested(purpose, tables)))
     pairs = tuple(ClockPair(**_told(pair), determined=pair.determined) for pair in found.pairs)
-    facts = ClockFacts(
-        epoch,
-        found.reference,
-        pairs,
-        offsets,
-        position_offset_s=found.position_offset_s or None,
-        heading_offset_s=found.heading_offset_s or None,
-    )
-    return Findings(tuple(warnings), facts)
+    lost = found.position_offset_s or None, found.heading_offset_s or None
+    return Findings(tuple(warnings), ClockFacts(epoch, found.reference, pairs, offsets, *lost))
 
 
 def _is_open(offset: RoleOffset) -> bool:
@@ -56,8 +55,8 @@ def _is_open(offset: RoleOffset) -> bool:
     return (offset.noted or offset.drifts) and not offset.blamed
 
 
-def _said(found: ClockOffsets, role: str, offset: RoleOffset, entry: str) -> str:
-    """Return what a person should know of a clock; a line for the recipe only where two others agree against it."""
+def _said(found: ClockOffsets, role: str, offset: RoleOffset, name: str) -> str:
+    """Return what a person should know of a clock; ``name`` is what the recipe calls the role."""
     change_s, change_std_s = (each * found.span_s / 3600 for each in (offset.drift_s_per_h, offset.drift_std_s_per_h))
     drift = f"over the run (± {2 * change_std_s:.2f} s, by {_means(found, role)})"
     constant = f"(± {2 * offset.std_s:.2f} s, by {_means(found, role)})"
@@ -69,17 +68,14 @@ def _said(found: ClockOffsets, role: str, offset: RoleOffset, entry: str) -> str
         )
         cost = "; the deviations of positions count what is driven in it" if GNSS in {role, found.reference} else ""
         return (
-            f"{role} and {found.reference}: their stamps {by}, and no two other sensors agree on which of them is off: "
+            f"{name} and {found.reference}: their stamps {by}, and no two other sensors agree on which of them is off: "
             f"nothing is corrected or advised{cost}"
         )
     if offset.drifts:
-        return (
-            f"{role}: its stamps drift against {found.reference} by {change_s:+.2f} s {drift}: no constant offset corrects that; "
-            f'where the recorder\'s clock is the better one, write in the recipe under [read.time]: {role} = "log"'
-        )
+        return f"{name}: its stamps drift against {found.reference} by {change_s:+.2f} s {drift}: no constant offset corrects that"
     return (
-        f"{role}: its stamps seem {abs(offset.offset_s):.2f} s {'late' if offset.offset_s > 0 else 'early'} against {found.reference} "
-        f"{constant}; nothing is corrected; to correct it, write in the recipe under [read.time_offset_s]: {entry}"
+        f"{name}: its stamps seem {abs(offset.offset_s):.2f} s {'late' if offset.offset_s > 0 else 'early'} against {found.reference} "
+        f"{constant}; nothing is corrected"
     )
 
 

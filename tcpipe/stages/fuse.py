@@ -8,6 +8,7 @@ import numpy as np
 
 from tcpipe.errors import FusionError
 from tcpipe.recipe import FuseConfig
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
 from tcpipe.stages.fix_lag import with_lag_on_path
 from tcpipe.stages.fuse_agreeing import fuse_agreeing
@@ -17,7 +18,7 @@ from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings
 from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.stages.fuse_mounting_findings import mounting_findings
 from tcpipe.stages.fuse_sanity import sane_inputs
-from tcpipe.stages.read_pose import pose_as_fixes
+from tcpipe.stages.read_pose import GNSS, pose_as_fixes, recipe_role
 from tcpipe.tables.findings import Findings
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
@@ -57,7 +58,10 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
     table = with_offset_cost(table, clocks.facts)
     mounting, audit = mounting_findings(inputs, streams), audit_findings(fused, inputs, streams)
     found = (sanity, mounting, audit, clocks)
-    warnings = (*fuse_warnings(inputs, summary), *(line for each in found for line in each.warnings))
+    warnings = (
+        *fuse_warnings(inputs, summary, fixes=recipe_role(GNSS, streams)),
+        *(line for each in found for line in each.warnings),
+    )
     facts = replace(
         streams.findings.facts,
         fuse=summary,
@@ -76,5 +80,5 @@ def _nothing(streams: Streams, inputs: FusionInputs) -> str:
     unusable = {role: count["invalid"] for role, count in inputs.counts.items() if count["invalid"]}
     return (
         f"fusion: no motion to fuse; rows by role: {rows}, unusable: {unusable}; wanted GNSS, wheel or visual odometry over "
-        "some time: see the topics with tcpipe inspect, and name them in the recipe under [read.topics]"
+        f"some time: see the topics with tcpipe inspect, and name them ({recipe_key('read.topics')})"
     )

@@ -1,17 +1,20 @@
 """The sensors that agree: one that is contradicted in most of the way, or without which the others agree, is left out.
 
 The sensor that stands alone is not always the wrong one: an IMU whose bias has jumped leads the track away from the fixes, and the
-odometries with it. So before any is left out each is, for a trial.
+odometries with it. So before any is left out each is, for a trial. So it is where the track goes astray: it moves otherwise than every
+sensor says that tells the robot's way, since what predicts it, an IMU, is wrong.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-from tcpipe.fusion.checks.audit import alone_in_most, confirmations, consistent, undecided_in_most
+from tcpipe.errors import FusionError
+from tcpipe.fusion.checks.audit import alone_in_most, confirmations, consistent, goes_astray, undecided_in_most
 from tcpipe.fusion.checks.sensors import Refusal, fixes_refused
-from tcpipe.fusion.measurements import GNSS
+from tcpipe.fusion.measurements import GNSS, IMU
 from tcpipe.recipe import FuseConfig
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import fuse_mounted
 from tcpipe.stages.fuse_sanity import left_out
@@ -20,6 +23,7 @@ from tcpipe.tables.findings import Findings, SensorChecks
 from tcpipe.tables.levels import Streams
 
 _WHY = "in most of the way the others contradict it, and not each other (another clock, drive or unit?)"
+_WHY_ASTRAY = "with it the track moves otherwise than every sensor says, without it the track follows them"
 
 Judged = tuple[FusionInputs, Findings[SensorChecks]]
 
@@ -29,42 +33,63 @@ def fuse_agreeing(
 ) -> tuple[FusionInputs, Findings[SensorChecks], Fused]:
     """Fuse each stretch; where sensors contradict each other in most of the way, again without the one that is at fault.
 
-    What a track that they led showed of mountings and scales is forgotten then.
+    So it is where the track goes astray. What a track that they led showed of mountings and scales is forgotten then.
+
+    Raises
+    ------
+    FusionError : the track goes astray whichever sensor is left out.
     """
     found, fused = fuse_mounted(inputs, streams, config)
-    lone = alone_in_most(fused.tallies)
-    if not lone and not undecided_in_most(fused.tallies):
-        return found, sanity, fused
-    lone = _at_fault(inputs, sanity, streams, config) or lone
-    if not lone:
-        return found, sanity, fused
-    inputs, sanity = _without(lone, inputs, sanity, streams)
-    found, fused = fuse_mounted(inputs, streams, config)
+    lone, astray = alone_in_most(fused.tallies), _is_astray(fused)
+    if lone or astray or undecided_in_most(fused.tallies):
+        lone = _at_fault(inputs, sanity, streams, config, astray=astray) or lone
+        if lone:
+            inputs, sanity = _without(lone, _WHY_ASTRAY if astray else _WHY, inputs, sanity, streams)
+            found, fused = fuse_mounted(inputs, streams, config)
+    if _is_astray(fused):
+        raise FusionError(
+            f"fusion: in {fused.astray / fused.windows:.0%} of the run the track moves otherwise than every sensor says, and trials "
+            f"do not tell which sensor errs: nothing of the run is used; look at the streams with tcpipe inspect --full, and leave out "
+            f"the sensors that err ({recipe_key('read.topics')}: an empty list for the role)",
+            *sanity.warnings,
+        )
     return found, sanity, fused
 
 
-def _without(roles: Sequence[str], inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams) -> Judged:
+def _is_astray(fused: Fused) -> bool:
+    return goes_astray(fused.windows, fused.astray)
+
+
+def _without(
+    roles: Sequence[str], why: str, inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams
+) -> Judged:
     odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference(roles)
-    refusals = [fixes_refused(_WHY, odometries) if role == GNSS else Refusal(role, _WHY) for role in roles]
+    refusals = [fixes_refused(why, odometries) if role == GNSS else Refusal(role, why) for role in roles]
     return left_out(inputs, sanity, refusals, streams)
 
 
 def _at_fault(
-    inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams, config: FuseConfig
+    inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams, config: FuseConfig, *, astray: bool
 ) -> tuple[str, ...]:
     """Return the one sensor without which the others agree; of several that whose others confirm each other most, none of two equals.
 
-    Of two sensors either would do: nobody can tell.
+    Of two sensors either would do: nobody can tell. Of a track that goes ``astray`` it is the IMU, of which the process is made, if the
+    track does not without it; else the only sensor without which it does not.
     """
     roles = sorted({role for m in inputs.measurements.values() for role in m.sensors()})
-    if len(roles) <= 2:
+    if len(roles) <= 2 and not astray:
         return ()
     agreeing: dict[str, int] = {}
+    following: list[str] = []
     for role in roles:
-        rest, _ = _without([role], inputs, sanity, streams)
+        rest, _ = _without([role], _WHY, inputs, sanity, streams)
         if any(m.gnss is not None or m.odometries() for m in rest.measurements.values()):
             tried = fuse_stretches(rest, streams, config)
             if tried.tallies and consistent(tried.tallies):
                 agreeing[role] = confirmations(tried.tallies)
+            if tried.found and not _is_astray(tried):
+                following.append(role)
     best = [role for role, confirmed in agreeing.items() if confirmed == max(agreeing.values())]
+    if astray and (len(best) != 1 or best[0] not in following):
+        best = [IMU] if IMU in following else following
     return (best[0],) if len(best) == 1 else ()

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from tcpipe.fusion.checks.audit import undecided_in_most
 from tcpipe.fusion.checks.odometry_scale import over_command
 from tcpipe.fusion.measurements import WHEELS
+from tcpipe.recipe.suggestions import suggested
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.stages.fuse_sanity import command_of, longest_epoch
+from tcpipe.stages.fuse_sanity import command_of, longest_epoch, without_role
 from tcpipe.stages.fuse_stretches import Fused
+from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.findings import AuditFacts, Disagreement, Findings
 from tcpipe.tables.levels import Streams
 
@@ -24,17 +26,26 @@ def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> Find
     if undecided:
         who = " and ".join(f"{what} by {sensor}" for sensor, what in undecided)
         lines.append(
-            f"{who}: in most of the way the track is not what this sensor says, and no third tells which is right: no segments; leave out "
-            "the sensor that is wrong ([read] ignore_topics), or mend its scale, mounting or clock"
+            f"{who}: in most of the way the track is not what this sensor says, and no third tells which is right: no segments; mend "
+            "scale, mounting or clock of the sensor that is wrong"
+            + "".join(
+                without_role(name, f"to leave out {name}")
+                for name in dict.fromkeys(recipe_role(of, streams) for of, _ in undecided)
+            )
         )
     sensors = {sensor for sensor, _ in undecided}
     faster = _over_command(inputs, streams)
     if faster is not None:
         sensors.add(WHEELS)
+        scale = round((streams.findings.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
         lines.append(
             f"{WHEELS}: it goes {faster:.2f} times as fast as commanded, which no robot does, and no fix or camera tells how long a metre "
-            f"is: no segments; state its scale in the recipe, under [read]: odometry_scale = {{ {WHEELS} = {1 / faster:.2f} }} (or "
-            "less: ground slows a robot down), or leave out the command if it is not what drives ([read] ignore_topics)"
+            f"is: no segments"
+            + suggested(
+                "to state its scale, or a smaller one, since ground slows a robot down",
+                {"read.odometry_scale": {WHEELS: scale}},
+            )
+            + without_role("command", "to leave out the command, if it is not what drives")
         )
     return Findings(tuple(lines), AuditFacts(tuple(found), tuple(sorted(sensors))))
 

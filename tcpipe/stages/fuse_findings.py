@@ -12,6 +12,7 @@ from tcpipe.fusion.stretches import Stretch
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.fuse_sanity import without_role
 from tcpipe.tables.findings import FuseFacts, StretchFacts
 
 _MANY_REFUSED = 0.2
@@ -58,8 +59,8 @@ def fuse_facts(inputs: FusionInputs, stretches: Sequence[StretchFacts], *, rows:
     )
 
 
-def fuse_warnings(inputs: FusionInputs, facts: FuseFacts) -> tuple[str, ...]:
-    """Return what a person should know before trusting the track."""
+def fuse_warnings(inputs: FusionInputs, facts: FuseFacts, *, fixes: str = GNSS) -> tuple[str, ...]:
+    """Return what a person should know before trusting the track; ``fixes`` is the role in the recipe of what tells positions."""
     counts = {role: count for role, count in inputs.counts.items() if role not in inputs.refused}
     found = [remark for remark in inputs.remarks if remark.split(":")[0] not in inputs.refused]
     if inputs.datum_deg_m is None and GNSS in inputs.counts:  # a log without any fix was warned of when it was read
@@ -73,16 +74,21 @@ def fuse_warnings(inputs: FusionInputs, facts: FuseFacts) -> tuple[str, ...]:
     found += _reopened(facts)
     common = max((stretch.common_scale_std or 0.0 for stretch in facts.stretches), default=0.0)
     if common > _COMMON:
-        what = "these fixes are too few or too coarse to" if GNSS in facts.sensors else "a GNSS would"
+        what = "these fixes are too few or too coarse to tell it" if GNSS in facts.sensors else "a GNSS would tell it"
+        known = "nothing tells how long a metre of odometry is: its scale stays 1"
+        if inputs.scales:
+            known, what = (
+                "how long a metre of odometry is, these fixes tell but roughly",
+                "finer or more fixes would tell it better",
+            )
         found.append(
-            f"nothing tells how long a metre of odometry is: its scale stays 1, and {common:.0%} are in the deviations of velocity, "
-            f"duration, power and energy as one error of the whole run; {what} tell it"
+            f"{known}, and {common:.0%} are in the deviations of velocity, duration, power and energy as one error of the whole run; {what}"
         )
     if IMU not in facts.sensors:
         found.append("no IMU is used: attitude is inferred from the path; roll and pitch are weak")
     found += [
-        f"{role}: {facts.rejected[role]} of {count} measurements were refused by the gate (rejections.parquet); "
-        f"if it is what errs, leave it out: [read.topics] {role} = []"
+        f"{(name := fixes if role == GNSS else role)}: {facts.rejected[role]} of {count} measurements were refused by the gate "
+        f"(rejections.parquet){without_role(name, 'if it is what errs, to leave it out')}"
         for role, count in facts.measurements.items()
         if facts.rejected[role] > _MANY_REFUSED * count
     ]

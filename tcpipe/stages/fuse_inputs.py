@@ -59,7 +59,7 @@ def prepare_inputs(streams: Streams, config: FuseConfig) -> FusionInputs:
         datum = preparation.find_datum(fixes["lon_deg"], fixes["lat_deg"], fixes["alt_m"])
     inputs = FusionInputs(datum)
     if config.estimator == "ukf" and tables.pop(DOPPLER, None) is not None:
-        inputs.remarks.append(f'{DOPPLER}: the forward filter (fuse.estimator = "ukf") does not use it')
+        inputs.remarks.append(f"{DOPPLER}: the forward filter (ukf) does not use it")
     for epoch in sorted({int(e) for table in tables.values() for e in pc.unique(table["epoch"]).to_pylist()}):
         parts = {role: rows_where(table, "epoch", epoch) for role, table in tables.items()}
         found = {role: _prepare(role, part, streams.sensors[role], config, inputs) for role, part in parts.items()}

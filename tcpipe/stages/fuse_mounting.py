@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.mounting import ARM_STD_M, Arm, Tilt, levelled, rearmed, solve_arm, solve_tilt, unknown_arm
-from tcpipe.fusion.checks.odometry_scale import Scale, rescaled, solve_scales
-from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, BodyVelocities, Measurements
+from tcpipe.fusion.checks.odometry_scale import Scale, rescaled_odometries, solve_scales
+from tcpipe.fusion.measurements import GNSS, Measurements
 from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused, fuse_stretches
@@ -51,6 +51,7 @@ def _mended(inputs: FusionInputs, fused: Fused, streams: Streams) -> FusionInput
     if tilt is not None and inputs.imu_tilt is not None:
         tilt = replace(tilt, rad=tilt.rad + inputs.imu_tilt.rad)
     arm, tilt = arm or inputs.arm, tilt or inputs.imu_tilt
+    scales = {role: scale.after(inputs.scales.get(role)) for role, scale in scales.items()}
     return replace(inputs, measurements=mended, arm=arm, imu_tilt=tilt, scales={**inputs.scales, **scales})
 
 
@@ -108,13 +109,8 @@ def moved_m(inputs: FusionInputs, streams: Streams) -> NDArray[np.float64]:
 def _remounted(
     m: Measurements, turn_rad: NDArray[np.float64], move_m: NDArray[np.float64], scales: Mapping[str, Scale]
 ) -> Measurements:
-    def in_metres(role: str, source: BodyVelocities | None) -> BodyVelocities | None:
-        return source if source is None or role not in scales else rescaled(source, scales[role].factor)
-
     return replace(
-        m,
+        rescaled_odometries(m, scales),
         imu=None if m.imu is None else levelled(m.imu, turn_rad) if turn_rad.any() else m.imu,
         gnss=None if m.gnss is None else rearmed(m.gnss, move_m),
-        wheels=in_metres(WHEELS, m.wheels),
-        visual=in_metres(VISUAL, m.visual),
     )

@@ -8,9 +8,12 @@ from numpy.typing import NDArray
 from tcpipe.fusion.checks.mounting import Arm, Tilt
 from tcpipe.fusion.checks.odometry_scale import Scale
 from tcpipe.fusion.measurements import GNSS, IMU
-from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy, rpy_from_matrix
+from tcpipe.geometry.rotation import matrix_from_quat, quat_from_rpy
+from tcpipe.recipe.suggestions import suggested
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import moved_m
+from tcpipe.stages.fuse_sanity import stated_placement
+from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.findings import Findings, MountingFacts, vector
 from tcpipe.tables.levels import Sensor, Streams
 
@@ -18,7 +21,7 @@ from tcpipe.tables.levels import Sensor, Streams
 def mounting_findings(inputs: FusionInputs, streams: Streams) -> Findings[MountingFacts | None]:
     """Return what was mended, with the recipe lines that would state it."""
     arm, tilt = inputs.arm, inputs.imu_tilt
-    warnings = [] if arm is None else [_arm_warning(arm, streams.sensors[GNSS])]
+    warnings = [] if arm is None else [_arm_warning(arm, streams.sensors[GNSS], recipe_role(GNSS, streams))]
     warnings += [] if tilt is None else [_tilt_warning(tilt, streams.sensors[IMU])]
     given = streams.findings.facts.odometry_scale or {}
     warnings += [_scale_warning(role, scale, given.get(role, 1.0)) for role, scale in inputs.scales.items()]
@@ -32,38 +35,37 @@ def mounting_findings(inputs: FusionInputs, streams: Streams) -> Findings[Mounti
 
 
 def _scale_warning(role: str, scale: Scale, given: float) -> str:
+    by_speed = scale.driven_m
+    ways = "" if by_speed is None else f" ({by_speed:.0f} m by its speed, {by_speed / scale.factor:.0f} m by the fixes)"
     return (
-        f"{role}: it goes {scale.factor:.3f} (± {scale.std:.3f}) times as far as the track, in all of the run: that is its scale, not "
-        f"slip, and is taken out; to state it, under [read]: odometry_scale = {{ {role} = {given / scale.factor:.4f} }}"
-    )
+        f"{role}: it goes {scale.factor:.3f} (± {scale.std:.3f}) times as far as the track, in all of the run{ways}: that is its scale, "
+        f"not slip, and is taken out"
+    ) + suggested("to state it", {"read.odometry_scale": {role: round(given / scale.factor, 4)}})
 
 
-def _arm_warning(arm: Arm, sensor: Sensor) -> str:
+def _arm_warning(arm: Arm, sensor: Sensor, name: str) -> str:
     place = np.asarray(sensor.xyz_m) + arm.error[:3]
     std_m = np.sqrt(np.diag(arm.covariance)[:3])
     found = f"({_list(place)}) m ± ({_list(std_m)}) m"
-    entry = f"under [read.placement]: gnss = {{ xyz_m = [{_list(place)}], rpy_rad = [0, 0, 0] }}"
+    turn = matrix_from_quat(sensor.quat_xyzw)
     if sensor.placed_by == "assumed":
         return (
-            f"gnss: nobody states where its antenna sits; by the turns it is at {found}, which is used, and what they do not show is "
-            f"in the positions' deviations; to state it, {entry}"
-        )
+            f"{name}: nobody states where its antenna sits; by the turns it is at {found}, which is used, and what they do not show is "
+            "in the positions' deviations"
+        ) + stated_placement(name, np.round(place, 2).tolist(), turn, "to state it")
     return (
-        f"gnss: the turns contradict that its antenna sits at ({_list(np.asarray(sensor.xyz_m))}) m ({sensor.placed_by}): it is taken to "
-        f"sit at {found}; if that is so, {entry}"
-    )
+        f"{name}: the turns contradict that its antenna sits at ({_list(np.asarray(sensor.xyz_m))}) m ({sensor.placed_by}): it is taken to "
+        f"sit at {found}"
+    ) + stated_placement(name, np.round(place, 2).tolist(), turn, "if that is so")
 
 
 def _tilt_warning(tilt: Tilt, sensor: Sensor) -> str:
     roll_rad, pitch_rad = tilt.rad.tolist()
     turned = matrix_from_quat(quat_from_rpy(roll_rad, pitch_rad, 0.0))
-    angles = ", ".join(f"{value:.4f}" for value in rpy_from_matrix(turned @ matrix_from_quat(sensor.quat_xyzw)))
-    place = ", ".join(f"{value:g}" for value in sensor.xyz_m)
     return (
         f"imu: it sits rolled by {np.degrees(roll_rad):.1f}° and pitched by {np.degrees(pitch_rad):.1f}° against its mounting "
-        f"({sensor.placed_by}), by the slope of the track and by its own turns; that is taken out; to state it, under [read.placement]: "
-        f"imu = {{ xyz_m = [{place}], rpy_rad = [{angles}] }}"
-    )
+        f"({sensor.placed_by}), by the slope of the track and by its own turns; that is taken out"
+    ) + stated_placement(IMU, sensor.xyz_m, turned @ matrix_from_quat(sensor.quat_xyzw), "to state it")
 
 
 def _list(values: NDArray[np.float64]) -> str:

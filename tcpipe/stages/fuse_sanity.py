@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tcpipe.fusion.checks.doppler import doubt_of_velocity
+from tcpipe.fusion.checks.odometry_scale import rescaled_odometries
 from tcpipe.fusion.checks.sensors import CommandedSpeed, Refusal, check_sensors
 from tcpipe.fusion.measurements import DOPPLER, GNSS, IMU, VISUAL, WHEELS, Measurements
 from tcpipe.geometry.rotation import matrix_from_quat, rpy_from_matrix
+from tcpipe.recipe.suggestions import suggested
 from tcpipe.stages.fuse_inputs import FusionInputs
+from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.findings import Findings, SensorChecks
-from tcpipe.tables.levels import Sensor, Streams
+from tcpipe.tables.levels import Streams
 
 _STATED = ("recipe", "tf_static", "same frame")
 
@@ -29,16 +33,19 @@ def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, F
     checks = check_sensors(
         inputs.measurements[epoch], command=command_of(streams, epoch), stated=stated, felt=_felt(streams)
     )
+    if checks.scales:
+        measured = {number: rescaled_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
+        inputs = replace(inputs, measurements=measured, scales=checks.scales)
     sane, found = left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
     doubt = doubt_of_velocity(sane.measurements[epoch])
     if doubt is None:
         return sane, found
     sane, found = left_out(sane, found, [Refusal(DOPPLER, doubt.why)], streams)
+    if doubt.late_s is None:
+        return sane, found
     given_s = streams.findings.facts.time_offset_s.get(DOPPLER, 0.0)
-    mend = f"; its clock is set by the recipe, under [read.time_offset_s]: {DOPPLER} = {given_s - (doubt.late_s or 0.0):.2f}"
-    return sane, found if doubt.late_s is None else replace(
-        found, warnings=(*found.warnings[:-1], found.warnings[-1] + mend)
-    )
+    mend = suggested("to correct its clock", {"read.time_offset_s": {DOPPLER: round(given_s - doubt.late_s, 2)}})
+    return sane, replace(found, warnings=(*found.warnings[:-1], found.warnings[-1] + mend))
 
 
 def left_out(
@@ -48,7 +55,7 @@ def left_out(
     refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
     reasons = {**before.facts.refused, **{refusal.role: refusal.why for refusal in refusals}}
-    warnings = (*before.warnings, *(_warning(refusal, streams.sensors) for refusal in refusals))
+    warnings = (*before.warnings, *(_warning(refusal, streams) for refusal in refusals))
     datum = None if GNSS in refused else inputs.datum_deg_m
     inputs = replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused)
     return inputs, Findings(warnings, replace(before.facts, refused=reasons))
@@ -90,18 +97,25 @@ def _felt(streams: Streams) -> float:
     return float(np.median(np.linalg.norm(force, axis=1)))
 
 
-def _warning(refusal: Refusal, sensors: Mapping[str, Sensor]) -> str:
-    sensor = sensors[refusal.role]
-    what = f"{refusal.role}: {sensor.topic} is not fused: {refusal.why}"
+def _warning(refusal: Refusal, streams: Streams) -> str:
+    sensor, name = streams.sensors[refusal.role], recipe_role(refusal.role, streams)
+    what = f"{name}: {sensor.topic} is not fused: {refusal.why}"
     if refusal.units is not None:
-        return f'{what}; if that is so, declare it in the recipe under [read]: imu_units = "{refusal.units}"'
+        return what + suggested("if that is so", {"read": {"imu_units": refusal.units}})
     if refusal.instead is not None:
-        topic = sensors[refusal.instead].topic
-        return f'{what}; to leave {refusal.instead} out instead, write in the recipe under [read]: ignore_topics = ["{topic}"]'
+        return what + without_role(recipe_role(refusal.instead, streams), f"to leave {refusal.instead} out instead")
     if refusal.turned_by is None:
-        return f'{what}; to leave it out by name, write in the recipe under [read]: ignore_topics = ["{sensor.topic}"]'
-    rpy_rad = rpy_from_matrix(refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw))
-    place = ", ".join(f"{value:g}" for value in sensor.xyz_m)
-    turn = ", ".join(f"{value:.4f}" for value in np.where(np.abs(rpy_rad) < 5e-5, 0.0, rpy_rad))
-    entry = f"{refusal.role} = {{ xyz_m = [{place}], rpy_rad = [{turn}] }}"
-    return f"{what} (its mounting: {sensor.placed_by}); what would fit, under [read.placement]: {entry}"
+        return what + without_role(name, "to leave it out by name")
+    turned = refusal.turned_by @ matrix_from_quat(sensor.quat_xyzw)
+    return f"{what} (its mounting: {sensor.placed_by})" + stated_placement(name, sensor.xyz_m, turned, "what would fit")
+
+
+def without_role(name: str, purpose: str) -> str:
+    """Return what leaves a role out, whichever topic plays it and whoever chose that."""
+    return suggested(purpose, {"read.topics": {name: []}})
+
+
+def stated_placement(name: str, xyz_m: Sequence[float], turn: NDArray[np.float64], purpose: str) -> str:
+    """Return what states a sensor's place [m] and its rotation to base_link, shape (3, 3)."""
+    place, rpy_rad = (np.round(values, digits) + 0.0 for values, digits in ((xyz_m, 3), (rpy_from_matrix(turn), 4)))
+    return suggested(purpose, {"read.placement": {name: {"xyz_m": place.tolist(), "rpy_rad": rpy_rad.tolist()}}})

@@ -42,6 +42,8 @@ class Fused:
     columns: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
     disagreements: list[Disagreement] = field(default_factory=list)
     tallies: list[Tally] = field(default_factory=list)
+    windows: int = 0
+    astray: int = 0
     arms: list[ArmEvidence | None] = field(default_factory=list)
     tilts: list[TiltEvidence | None] = field(default_factory=list)
     ratios: list[Mapping[str, NDArray[np.float64]]] = field(default_factory=list)
@@ -70,6 +72,7 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
         trajectory, audit = audited(trajectory, stretch.measurements)
         fused.disagreements += (replace(each, epoch=stretch.epoch) for each in audit.disagreements)
         fused.tallies += audit.tallies
+        fused.windows, fused.astray = fused.windows + audit.windows, fused.astray + audit.astray
         fused.found.append(trajectory)
         fused.facts.append(stretch_facts(stretch, initial, trajectory))
         # 5. What else is known at the track's stamps.
@@ -80,15 +83,13 @@ def fuse_stretches(inputs: FusionInputs, streams: Streams, config: FuseConfig) -
 def _doubted(found: Trajectory, stretch: Stretch, inputs: FusionInputs) -> Trajectory:
     """Return the trajectory with what is not known of a mended or unstated mounting."""
     gnss = stretch.measurements.gnss
-    if gnss is None:
-        return found
-    covariance = antenna_doubt(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
-    return found if covariance is None else with_antenna_doubt(found, covariance, gnss)
+    covariance = None if gnss is None else antenna_doubt(inputs.arm, inputs.imu_tilt, gnss.lever_arm_m)
+    return found if gnss is None or covariance is None else with_antenna_doubt(found, covariance, gnss)
 
 
 def _initial(stretch: Stretch, last: Trajectory | None) -> InitialState:
-    standing = standing_intervals(stretch.measurements)
-    initial = find_initial_state(stretch.measurements, standing, stretch.start_ns)
+    m = stretch.measurements
+    initial = find_initial_state(m, standing_intervals(m), stretch.start_ns)
     if last is None:
         return initial
     return replace(initial, position_enu_m=last.position_enu_m[-1], quat_xyzw=last.quat_xyzw[-1])
@@ -108,8 +109,7 @@ def _estimate(stretch: Stretch, initial: InitialState, output_ns: NDArray[np.int
 def _columns(
     stretch: Stretch, trajectory: Trajectory, inputs: FusionInputs, streams: Streams, config: FuseConfig
 ) -> dict[str, NDArray[Any]]:
-    stamp_ns = trajectory.stamp_ns
-    gap_ns, power_gap_ns = int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
+    stamp_ns, gap_ns, power_gap_ns = trajectory.stamp_ns, int(config.max_gap_s * 1e9), int(config.max_power_gap_s * 1e9)
     return {
         "stamp_ns": stamp_ns,
         "epoch": np.full(stamp_ns.size, stretch.epoch, np.int16),

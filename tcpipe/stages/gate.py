@@ -9,6 +9,7 @@ import numpy as np
 from tcpipe.motion import masks
 from tcpipe.motion.pieces import Mask, MotionRows, piece_of_rows
 from tcpipe.recipe import GateConfig
+from tcpipe.robots.profiles import MAX_PLAUSIBLE_MPS
 from tcpipe.stages.gate_gaps import find_gaps
 from tcpipe.stages.gate_limit import limit_warnings, speed_limit
 from tcpipe.tables.bits import DropReason, name_of
@@ -17,13 +18,25 @@ from tcpipe.tables.findings import GateFacts
 from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, with_findings
 
 
-def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | None, chord_m: float) -> GatedTrack:
+def gate_track(
+    track: Track,
+    config: GateConfig,
+    *,
+    max_velocity_mps: float | None,
+    chord_m: float,
+    max_plausible_mps: float = MAX_PLAUSIBLE_MPS,
+) -> GatedTrack:
     """Return the track with ``dropped_by``: every reason why a row is not steady driving at the terrain's limit.
 
     Parameters
     ----------
     max_velocity_mps : [m/s], the robot profile's maximum; the recipe's goes first. With neither, no row is dropped as below the limit.
     chord_m : [m], length of a segment, over which the relative position error counts.
+    max_plausible_mps : [m/s], the robot profile's; the recipe's goes first.
+
+    Raises
+    ------
+    FusionError : for most of a minute of driving the track is faster than plausible.
     """
     table, period_s = track.table, 1.0 / track.info.rate_hz
     rows = MotionRows(
@@ -34,7 +47,9 @@ def gate_track(track: Track, config: GateConfig, *, max_velocity_mps: float | No
         piece=piece_of_rows(integers(table, "stamp_ns"), integers(table, "epoch"), period_ns=1e9 * period_s),
         period_s=period_s,
     )
-    gaps = find_gaps(track, rows, chord_m=chord_m, config=config)
+    gaps = find_gaps(
+        track, rows, chord_m=chord_m, config=config, max_plausible_mps=config.max_plausible_mps or max_plausible_mps
+    )
     found = {DropReason.GAP: gaps.rows, **_motion(rows, config)}
     limit = speed_limit(rows, config, max_velocity_mps=max_velocity_mps)
     limit_mps = limit.limit_mps

@@ -1,4 +1,4 @@
-"""Where a track bears no segment: without power, where the next metre is not known well enough or jumps, and between contradictions."""
+"""Where a track bears no segment: without power, where the next metre is uncertain or jumps, too fast, and between contradictions."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from tcpipe.motion.ledger import JUMP_M, unexplained_m
 from tcpipe.motion.pieces import Floats, Mask, MotionRows
 from tcpipe.motion.uncertainty import along_std_m, chord_ahead_std_m
 from tcpipe.recipe import GateConfig
+from tcpipe.recipe.suggestions import recipe_key
+from tcpipe.stages.gate_plausible import find_implausible
 from tcpipe.tables.columns import floats, integers
 from tcpipe.tables.levels import TRACK, Track
 
@@ -26,25 +28,26 @@ class Gaps:
     uncertain: Mask
     jumps: Mask
     contradicted: Mask
+    implausible: Mask
     warnings: tuple[str, ...]
 
     @property
     def rows(self) -> Mask:
         """All of them."""
-        return self.without_power | self.uncertain | self.jumps | self.contradicted
+        return self.without_power | self.uncertain | self.jumps | self.contradicted | self.implausible
 
     def counts(self) -> dict[str, int]:
         """Return the number of rows by cause; a row may have several."""
-        return {
-            name: int(getattr(self, name).sum()) for name in ("without_power", "uncertain", "jumps", "contradicted")
-        }
+        causes = ("without_power", "uncertain", "jumps", "contradicted", "implausible")
+        return {name: int(getattr(self, name).sum()) for name in causes}
 
 
-def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig) -> Gaps:
+def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateConfig, max_plausible_mps: float) -> Gaps:
     """Return the rows that bear no segment, by cause: no power in a run that has power, a moving row whose next chord is uncertain, a jump.
 
     An error of scale that all of a run has in common makes no segment worse than the next: it is left out of a chord's own uncertainty.
-    Where its sensors contradict each other in most of the way undecided, they are all rows of the run.
+    Where its sensors contradict each other in most of the way undecided, they are all rows of the run. Rows faster than
+    ``max_plausible_mps`` [m/s] are no driving; see `find_implausible`.
     """
     power = floats(track.table, "power_watt")
     without_power = np.isnan(power) & bool(np.isfinite(power).any())
@@ -58,7 +61,7 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
     if moving.any() and (share := without_power[moving].mean()) > _WORTH_SAYING:
         warnings.append(f"power: there is none on {share:.0%} of the moving track, which therefore has no segments")
     if moving.any() and (share := uncertain[moving].mean()) > _WORTH_SAYING:
-        limit = f"{config.max_relative_position_std_m} m (gate.max_relative_position_std_m)"
+        limit = f"{config.max_relative_position_std_m} m ({recipe_key('gate.max_relative_position_std_m')})"
         warnings.append(
             f"on {share:.0%} of the moving track the distance over {chord_m:g} m is not known to {limit}: no segments there"
         )
@@ -70,7 +73,9 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
         )
     audit = track.info.findings.facts.audit
     contradicted = np.full(len(moving), bool(audit and audit.undecided))
-    return Gaps(without_power, uncertain, jumps, contradicted, tuple(warnings))
+    implausible, fast_lines = find_implausible(track, rows, jumps, max_plausible_mps)
+    warnings += fast_lines
+    return Gaps(without_power, uncertain, jumps, contradicted, implausible, tuple(warnings))
 
 
 def _chord_std_m(track: Track, rows: MotionRows, chord_m: float, config: GateConfig) -> Floats:

@@ -9,10 +9,14 @@ import numpy as np
 from tcpipe.motion import masks
 from tcpipe.motion.pieces import Mask, MotionRows
 from tcpipe.recipe import GateConfig
+from tcpipe.recipe.suggestions import suggested
 from tcpipe.tables.bits import DropReason
 
 _MOST = 0.5
 """More than this share of the moving track at one top command makes that the limit of the run."""
+
+
+_WITHOUT = suggested("to keep rows whatever was commanded", {"gate": {"require_full_speed": False}})
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +42,7 @@ def speed_limit(rows: MotionRows, config: GateConfig, *, max_velocity_mps: float
     if held <= _MOST or top >= config.full_speed_fraction * max_velocity_mps:
         return SpeedLimit(max_velocity_mps, top, held)
     text = f"{held:.0%} of the moving track was commanded at {top:.2f} m/s, not at the robot's {max_velocity_mps} m/s"
-    said = f"{text}: that is taken for the limit of this run; gate.max_velocity_mps settles it"
+    said = f"{text}: that is taken for the limit of this run{_suggest_limit('to settle it', top)}"
     return SpeedLimit(top, top, held, (said,))
 
 
@@ -48,15 +52,17 @@ def limit_warnings(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config
     if not commanded.any():
         return ("no command topic: it cannot be known whether the robot was driven at its maximum speed",)
     if limit.limit_mps is None and config.require_full_speed:
-        text = "the robot's maximum speed is not known, so no row is dropped as commanded below it: set gate.max_velocity_mps"
+        text = "the robot's maximum speed is not known, so no row is dropped as commanded below it"
         return (
-            f"{text} (largest command {np.nanmax(rows.commanded_mps):.2f} m/s), or gate.require_full_speed = false",
+            f"{text}{_suggest_limit('if its largest command was the limit', np.nanmax(rows.commanded_mps))}{_WITHOUT}",
         )
     slow = (dropped_by & DropReason.BELOW_LIMIT) != 0
     if slow[moving].sum() > 0.5 * moving.sum():
         text = f"{slow[moving].mean():.0%} of the moving track was commanded below {config.full_speed_fraction} of {limit.limit_mps} m/s"
-        own = f"its top command, {limit.top_mps:.2f} m/s, was held for {limit.held:.0%} of it"
-        return (
-            f"{text}: set gate.max_velocity_mps if this robot is slower ({own}), or gate.require_full_speed = false",
-        )
+        own = f"if this robot is slower (its top command, {limit.top_mps:.2f} m/s, was held for {limit.held:.0%} of it)"
+        return (f"{text}{_suggest_limit(own, limit.top_mps)}{_WITHOUT}",)
     return limit.warnings
+
+
+def _suggest_limit(purpose: str, speed_mps: float) -> str:
+    return suggested(purpose, {"gate": {"max_velocity_mps": round(float(speed_mps), 2)}})

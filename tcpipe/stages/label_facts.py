@@ -9,6 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.cost.budget import energy_budget
+from tcpipe.cost.quality import wanted_rate_hz
 from tcpipe.power.energy import Rule
 from tcpipe.power.rails import Rail
 from tcpipe.stages.power_rails import rail_facts
@@ -57,7 +58,7 @@ def label_facts(
         segments_without_power=int(np.isnan(energy).sum()),
         median_power_watt=_median(floats(table, "power_watt")),
         relative_std_median={
-            name: _median(floats(table, f"{name}_std_{unit}") / floats(table, f"{name}_{unit}"))
+            name: _median(_share(floats(table, f"{name}_std_{unit}"), floats(table, f"{name}_{unit}")))
             for name, unit in (("duration", "s"), ("velocity", "mps"), ("power", "watt"), ("energy", "joule"))
         },
         energy_budget=_budget(energy, energy_variance_j2),
@@ -80,10 +81,15 @@ def label_warnings(facts: LabelFacts) -> tuple[str, ...]:
     """Return what a person should look at."""
     warnings = []
     if facts.quality["low_power_rate"] and facts.segments_without_power < facts.segments:
-        signals = [each for rails in facts.rails.values() for rail in rails for each in (rail.voltage, rail.current)]
-        rate = min((each.rate_hz for each in signals if each.rate_hz), default=0.0)
+        rails = [rail for each in facts.rails.values() for rail in each]
+        current, voltage = (
+            min((each.rate_hz for each in signals if each.rate_hz), default=0.0)
+            for signals in ([rail.current for rail in rails], [rail.voltage for rail in rails])
+        )
+        wanted_hz = wanted_rate_hz(averaged=facts.integration == "averaged")
+        what, rate = ("current", current) if current < wanted_hz else ("voltage", voltage)
         warnings.append(
-            f"power comes at {rate:.1f} Hz only: see energy_std_joule (instantaneous power wants 10 Hz, averaged 2 Hz)"
+            f"power: the {what} is measured at {rate:.1f} Hz only, {wanted_hz:g} Hz are wanted: energy_std_joule holds what that costs"
         )
     if facts.energy_joule is not None and facts.segments and facts.segments_without_power:
         count = f"{facts.segments_without_power} of {facts.segments} segments"
@@ -101,6 +107,11 @@ def label_warnings(facts: LabelFacts) -> tuple[str, ...]:
             "than propulsion; labels hold all of it"
         )
     return tuple(warnings)
+
+
+def _share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a part of each value; NaN where the value is zero (no current, no energy)."""
+    return np.divide(part, whole, out=np.full_like(part, np.nan), where=whole != 0.0)
 
 
 def _median(values: NDArray[np.float64]) -> float | None:

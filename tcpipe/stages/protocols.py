@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol
 
 import pyarrow as pa
@@ -22,3 +22,6 @@ class LogReader(Protocol):
 
         A topic that cannot be decoded is missing from the result.
         """
+
+    def batches(self, topics: Sequence[str]) -> Iterator[Mapping[str, pa.Table]]:
+        """Yield the same piece by piece: each the next rows of some topics; a message that lies far behind its time comes later."""

@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pyarrow as pa
 
 from tcpipe.errors import RoleError
 from tcpipe.logs.clocks import TopicTimes, settle_clocks
 from tcpipe.logs.roles import MOTION_ROLES
 from tcpipe.logs.simulated_clock import CLOCK
+from tcpipe.power.sources import power_lists
 from tcpipe.recipe import ReadConfig
 from tcpipe.robots.profiles import Profiles
+from tcpipe.stages.gathered_messages import gather_messages
 from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_averaging import with_averaging
+from tcpipe.stages.read_candidates import power_candidates
 from tcpipe.stages.read_findings import read_findings
 from tcpipe.stages.read_pose import placed_pose
+from tcpipe.stages.read_repeats import repeats_warnings, without_repeats
 from tcpipe.stages.read_roles import roles_by
 from tcpipe.stages.read_sensors import place_sensors
 from tcpipe.stages.read_sources import TopicReadings, read_sources
@@ -45,8 +48,9 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
         raise RoleError(*assignment.problems)
     # 2. Messages to SI columns; what cannot be used is counted.
     played = dict.fromkeys(topic for role in assignment.roles.values() for topic in role.topics)
-    tables = log.tables([*played, *assignment.static_transforms])
-    every, power, unread = read_sources(tables, log.topics, assignment, config, known=known)
+    lists = {topic: power_lists(log.topics[topic].type_name, known.power_sources) for topic in played}
+    messages, tables = gather_messages(log.batches([*played, *assignment.static_transforms]), lists)
+    every, power, unread = read_sources(messages, log.topics, assignment, config, known=known)
     # 3. Every stamp on one clock, every epoch common to all.
     clocks = settle_clocks(
         {source.key: _times(source, config) for source in every if len(source.readings.row)},
@@ -58,14 +62,20 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     streams: dict[str, pa.Table] = {
         role: role_table(role, sources, timelines, power) for role in dict.fromkeys(source.role for source in sources)
     }
+    streams, repeats = without_repeats(streams)
     streams, crs, of_pose = placed_pose(streams, assignment, config)
     sensors, unplaced = place_sensors(log, tables, assignment, sources, timelines, config=config)
     power, asked = with_averaging(power, streams, config)
+    repeated = repeats_warnings(repeats, averaged=power.averaged)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
+    no_power = power.refusal or power_candidates(log, assignment, config)
     findings = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
-    facts = replace(findings.facts, odometry_scale=scale)
-    findings = replace(findings, warnings=(*findings.warnings, *unread, *unplaced, *asked, *of_pose), facts=facts)
+    facts = replace(findings.facts, odometry_scale=scale, no_power=no_power)
+    first = (no_power.why,) if no_power and no_power.why not in findings.warnings else ()
+    findings = replace(
+        findings, warnings=(*first, *findings.warnings, *unread, *unplaced, *repeated, *asked, *of_pose), facts=facts
+    )
     if not any(role in streams for role in MOTION_ROLES):
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry, gnss and pose have no usable row"
         raise RoleError(what, *findings.warnings)
@@ -79,7 +89,7 @@ def _times(source: TopicReadings, config: ReadConfig) -> TopicTimes:
     return TopicTimes(
         readings.log_time_ns,
         stamps,
-        np.stack([values.astype(np.float64) for values in readings.columns.values()], -1),
+        tuple(readings.columns.values()),
         prefer,
         round(config.time_offset_s.get(source.role, 0.0) * 1e9),
     )

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tcpipe.power.averaging import told_averaged
 from tcpipe.power.readings import PowerReadings
 from tcpipe.recipe import ReadConfig
+from tcpipe.recipe.suggestions import suggested
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
 
@@ -27,14 +28,12 @@ def with_averaging(
         return power, []
     table = rows_where(streams["power"], "epoch", 0)
     rail = rows_where(table, "rail", table["rail"][0].as_py())
-    watt = floats(rail, "voltage_volt") * floats(rail, "current_amp")
-    known = np.isfinite(watt)
-    power_ns = integers(rail, "stamp_ns")[known]
+    power_ns, watt = _power_at_current(rail)
     period_s = float(np.median(np.diff(power_ns))) / 1e9 if len(power_ns) > 1 else np.inf
     if period_s < _FAST_S:
         return power, []
     motion = next((streams[role] for role in ("wheel_odometry", "visual_odometry") if role in streams), None)
-    told = None if motion is None else _by_motion(power_ns, watt[known], rows_where(motion, "epoch", 0))
+    told = None if motion is None else _by_motion(power_ns, watt, rows_where(motion, "epoch", 0))
     averaged = power.averaged if told is None else told
     how = "the mean since the one before it" if averaged else "sampled at its stamp"
     why = (
@@ -42,7 +41,9 @@ def with_averaging(
         if told is None
         else "the motion tells"
     )
-    said = f'power: {why}: each is taken as {how}; settle it with read.power_averaged = "yes" or "no"'
+    settled = {"to settle it": "yes" if averaged else "no", "if that is wrong": "no" if averaged else "yes"}
+    lines = "".join(suggested(purpose, {"read": {"power_averaged": value}}) for purpose, value in settled.items())
+    said = f"power: {why}: each is taken as {how}{lines}"
     return replace(power, averaged=averaged), [] if told is None and period_s < _SLOW_S else [said]
 
 
@@ -50,6 +51,18 @@ _FAST_S = 0.04
 """Of what comes as often it makes no difference."""
 _SLOW_S = 0.11
 """Of what comes as often half a period is no question worth asking."""
+
+
+def _power_at_current(rail: pa.Table) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return the stamps [ns] of a rail's currents and its power there [W]: its voltage may come at other times."""
+    stamp_ns, voltage, current = integers(rail, "stamp_ns"), floats(rail, "voltage_volt"), floats(rail, "current_amp")
+    at_ns = (stamp_ns - stamp_ns[0]).astype(np.float64)
+    of_voltage, of_current = np.isfinite(voltage), np.isfinite(current)
+    if not of_voltage.any():
+        return stamp_ns[:0], current[:0]
+    return stamp_ns[of_current], current[of_current] * np.interp(
+        at_ns[of_current], at_ns[of_voltage], voltage[of_voltage]
+    )
 
 
 def _by_motion(power_ns: NDArray[np.int64], watt: NDArray[np.float64], motion: pa.Table) -> bool | None:

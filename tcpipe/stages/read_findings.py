@@ -50,7 +50,7 @@ def read_findings(
 
 def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]:
     name = f"{source.role}: {source.topic}"
-    rows = len(source.columns["log_time_ns"])
+    rows = source.messages
     yield from (f"{name}: {text}" for text in source.readings.warnings)
     dropped = source.readings.dropped | (timeline.dropped if timeline is not None else {})
     unexpected = {reason: count for reason, count in dropped.items() if reason not in {"not_gga", "no_velocity"}}
@@ -70,8 +70,7 @@ def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]
     for epoch, moved_s in enumerate(timeline.moved_s):
         if moved_s and not simulated:
             yield (
-                f"{name}: its clock is not the other topics': its stamps were moved by {moved_s:+.3f} s in epoch {epoch}; "
-                f"what is left of its delay can be set with read.time_offset_s"
+                f"{name}: its clock is not the other topics': its stamps were moved by {moved_s:+.3f} s in epoch {epoch}"
             )
 
 
@@ -90,7 +89,7 @@ def _role_facts(
 def _topic_facts(source: TopicReadings, timeline: Timeline) -> TopicFacts:
     return TopicFacts(
         type=source.type_name,
-        messages=len(source.columns["log_time_ns"]),
+        messages=source.messages,
         rows=len(timeline.row),
         rate_hz=_rate_hz(timeline),
         dropped=source.readings.dropped | timeline.dropped,

@@ -12,12 +12,19 @@ from tcpipe.errors import MapError, RecipeError
 from tcpipe.geometry.datum import geodetic_from_enu
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.recipe import ReadConfig
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.tables.columns import floats
 from tcpipe.tables.levels import STREAMS, Streams
 
 POSE, GNSS = "pose", "gnss"
 _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
 """Where a frame that is nowhere on the earth is taken to lie while its positions are fused: east, north and up stay what they are."""
+
+
+def recipe_role(role: str, streams: Streams) -> str:
+    """Return the role by which the recipe knows what is fused as ``role``: a pose that stands in for GNSS is a pose there."""
+    roles = streams.findings.facts.roles
+    return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
 
 
 def placed_pose(
@@ -34,7 +41,7 @@ def placed_pose(
     (topic,) = assignment.roles[POSE].topics
     said = f"pose: {topic} stands in for GNSS: what is said of gnss is said of it"
     if config.pose_crs is None:
-        where = 'it lies in a frame of its own, which no map has: segments, but no samples (read.pose_crs = "EPSG:n" places it)'
+        where = f"it lies in a frame of its own, which no map has: segments, but no samples ({recipe_key('read.pose_crs')} places it)"
         return dict(streams), config.gnss_crs, (f"{said}; {where}",)
     from pyproj import Transformer  # noqa: PLC0415  only where a pose is placed
 

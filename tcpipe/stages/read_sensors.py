@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import get_args
 
 import pyarrow as pa
 
 from tcpipe.geometry.rotation import quat_from_rpy
 from tcpipe.logs.clocks import Timeline
-from tcpipe.logs.messages import frames
 from tcpipe.logs.placements import IDENTITY, Pose, Tree, base_link_from, is_base, static_tree
 from tcpipe.logs.roles import RoleAssignment
-from tcpipe.recipe import ReadConfig, Role
+from tcpipe.recipe import Placement, ReadConfig, Role
+from tcpipe.recipe.suggestions import suggested
 from tcpipe.stages.message_arrays import transforms
 from tcpipe.stages.protocols import LogReader
 from tcpipe.stages.read_sources import TopicReadings
@@ -46,15 +47,15 @@ def place_sensors(
     sensors, warnings = {}, []
     for role, frame in frame_of.items():
         pose, placed_by = _place(role, frame, tree, config)
-        several = frames(of_role[role][0].columns, of_role[role][0].type_name)
+        several = of_role[role][0].frames
         if role not in _WITHOUT_PLACE and len(several) > 1:
             warnings.append(
                 f"{role}: its messages name {len(several)} frames ({', '.join(several)}); {frame!r} is taken"
             )
         if placed_by == "assumed":
             warnings.append(
-                f"{role}: nothing places frame {frame!r} of {of_role[role][0].topic}, it is assumed at base_link; place it in the "
-                f"recipe under [read.placement]: {role} = {{ xyz_m = [0.0, 0.0, 0.0], rpy_rad = [0.0, 0.0, 0.0] }}"
+                f"{role}: nothing places frame {frame!r} of {of_role[role][0].topic}, it is assumed at base_link"
+                + suggested("to place it there or elsewhere", {"read.placement": {role: asdict(Placement())}})
             )
         sensors[role] = Sensor(
             topic=" + ".join(source.topic for source in of_role[role]),
@@ -70,7 +71,7 @@ def place_sensors(
 
 
 def _frame(sources: Sequence[TopicReadings]) -> str:
-    return next(iter(frames(sources[0].columns, sources[0].type_name)), "")
+    return next(iter(sources[0].frames), "")
 
 
 def _tree(log: LogReader, tables: Mapping[str, pa.Table], assignment: RoleAssignment, open_frames: set[str]) -> Tree:

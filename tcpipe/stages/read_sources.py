@@ -3,36 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import RoleError
 from tcpipe.logs.imu_units import imu_in_si
 from tcpipe.logs.mapped import MAPPED_TYPES, mapped_message
-from tcpipe.logs.messages import Readings, frames, needed_fields, read_messages
+from tcpipe.logs.messages import LOG_TIME, Readings, apart_from_header, frames, needed_fields, read_messages
 from tcpipe.logs.odometry_scale import scaled
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.logs.topics import Topic
 from tcpipe.logs.velocity_frame import over_ground
 from tcpipe.power.readings import PowerReadings
-from tcpipe.power.sources import power_lists
 from tcpipe.recipe import ReadConfig, Role
 from tcpipe.robots.profiles import Profiles
-from tcpipe.stages.message_arrays import message_arrays
 from tcpipe.stages.read_power import power_of_topics, power_rows
 
 
 @dataclass(frozen=True, slots=True)
 class TopicReadings:
-    """A topic that plays a role: its messages' fields by dotted name, and what of them is usable."""
+    """A topic that plays a role: how many messages it has and what frames they name, and what of them is usable."""
 
     topic: str
     role: Role
     type_name: str
-    columns: Mapping[str, NDArray[Any]]
+    messages: int
+    frames: Mapping[str, int]
     readings: Readings
 
     @property
@@ -42,74 +40,78 @@ class TopicReadings:
 
 
 def read_sources(
-    tables: Mapping[str, pa.Table],
+    messages: dict[str, dict[str, NDArray[Any]]],
     topics: Mapping[str, Topic],
     assignment: RoleAssignment,
     config: ReadConfig,
     *,
     known: Profiles,
 ) -> tuple[list[TopicReadings], PowerReadings, list[str]]:
-    """Read the tables of every topic that plays a role.
-
-    Raises
-    ------
-    RoleError : ``read.fields`` names what the messages do not hold.
+    """Read the messages of every topic that plays a role; they are taken out of ``messages``, so that no log is held twice.
 
     Returns
     -------
     sources : one a topic, in the order of the roles.
     power : the rails, empty where there is no power or it was refused.
     warnings : topics that play a role but cannot be decoded.
+
+    Raises
+    ------
+    RoleError : ``read.fields`` names what the messages do not hold.
     """
     played = [(cast("Role", role.name), topic) for role in assignment.roles.values() for topic in role.topics]
     warnings: list[str] = []
     arrays: dict[tuple[Role, str], Mapping[str, NDArray[Any]]] = {}
     for role, topic in played:
-        if topic not in tables:
+        if topic not in messages:
             warnings.append(f"{role}: {topic} cannot be decoded and plays no part (see the log's damage)")
             continue
-        found = _fields(tables[topic], topics[topic].type_name, role, config, known)
+        found = _fields(messages[topic], role, config)
         needed = () if role == "power" else needed_fields(_type_of(topics[topic], role, config))
         if missing := [name for name in needed if name not in found]:
             warnings.append(f"{role}: {topic} plays no part, its messages have no field {', '.join(missing)}")
         else:
             arrays[role, topic] = found
     types = {topic: topics[topic].type_name for _, topic in arrays}
-    power = power_of_topics(
-        {topic: (types[topic], columns) for (role, topic), columns in arrays.items() if role == "power"},
-        assignment,
-        config,
-        known=known,
-    )
+    of_power = {topic: (types[topic], columns) for (role, topic), columns in arrays.items() if role == "power"}
+    power = power_of_topics(of_power, assignment, config, known=known)
     sources = []
-    for (role, topic), columns in arrays.items():
+    messages.clear()
+    for role, topic in list(arrays):
+        columns = arrays.pop((role, topic))
         if role != "power":
             readings = read_messages(columns, role, _type_of(topics[topic], role, config))
-            if role == "imu":
-                readings = imu_in_si(readings, config.imu_units)
-            elif role == "gnss_velocity" and role not in config.topics:
-                readings = over_ground(readings, next(iter(frames(columns, types[topic])), ""))
-            elif role in config.odometry_scale:
-                readings = scaled(readings, config.odometry_scale[role])
-            sources.append(TopicReadings(topic, role, types[topic], columns, readings))
         elif topic in power.rails:
-            sources.append(TopicReadings(topic, role, types[topic], columns, power_rows(columns, power.rails[topic])))
+            readings = power_rows(columns, power.rails[topic])
+        else:
+            continue
+        seen_frames = frames(columns, types[topic])
+        source = TopicReadings(topic, role, types[topic], len(columns[LOG_TIME]), seen_frames, readings)
+        sources.append(replace(source, readings=_as_the_recipe_says(source, config)))
     return sources, power, warnings
 
 
+def _as_the_recipe_says(source: TopicReadings, config: ReadConfig) -> Readings:
+    """Return a topic's readings in the units and scale that the recipe states."""
+    readings, role = source.readings, source.role
+    if role == "gnss" and config.time.get(role) != "header":
+        return replace(readings, warnings=(*readings.warnings, *apart_from_header(readings)))
+    if role == "imu":
+        return imu_in_si(readings, config.imu_units)
+    if role == "gnss_velocity" and role not in config.topics:
+        return over_ground(readings, next(iter(source.frames), ""), source.topic)
+    return scaled(readings, config.odometry_scale[role]) if role in config.odometry_scale else readings
+
+
 def _type_of(topic: Topic, role: Role, config: ReadConfig) -> str:
-    """Return the message type as which a topic is read: its own, or that to which the recipe maps it."""
     return MAPPED_TYPES[role] if role in config.fields else topic.type_name
 
 
-def _fields(
-    table: pa.Table, type_name: str, role: Role, config: ReadConfig, known: Profiles
-) -> dict[str, NDArray[Any]]:
+def _fields(columns: dict[str, NDArray[Any]], role: Role, config: ReadConfig) -> dict[str, NDArray[Any]]:
     """Return the fields of a topic's messages, those of a message type of the user's own as the recipe maps them."""
-    found = message_arrays(table, power_lists(type_name, known.power_sources) if role == "power" else ())
     if role not in config.fields:
-        return found
-    mapped = mapped_message(role, found, config.fields[role])
+        return columns
+    mapped = mapped_message(role, columns, config.fields[role])
     if isinstance(mapped, list):
         raise RoleError(*mapped)
     return mapped

@@ -19,19 +19,22 @@ from tcpipe.tables.levels import STREAMS
 def role_table(
     role: str, sources: Sequence[TopicReadings], timelines: Mapping[str, Timeline], power: PowerReadings
 ) -> pa.Table:
-    """Return a role's table, sorted by epoch and stamp."""
+    """Return a role's table, sorted by epoch and stamp; the columns of its sources' readings are taken out."""
     parts = []
     for source in sources:
         if source.role == role:
             parts += list(_parts(source, timelines[source.key], power))
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if len(parts) == 1:  # in order already
+        return STREAMS[role].table(**parts[0])
+    columns = {name: np.concatenate([part.pop(name) for part in parts]) for name in list(parts[0])}
     order = np.lexsort((columns["stamp_ns"], columns["epoch"]))
-    return STREAMS[role].table(**{name: values[order] for name, values in columns.items()})
+    return STREAMS[role].table(**{name: columns.pop(name)[order] for name in list(columns)})
 
 
 def _parts(source: TopicReadings, timeline: Timeline, power: PowerReadings) -> list[dict[str, NDArray[Any]]]:
     """Return a topic's columns; one part a rail where it plays power."""
-    columns = {name: values[timeline.row] for name, values in source.readings.columns.items()}
+    readings = source.readings.columns
+    columns = {name: readings.pop(name)[timeline.row] for name in list(readings)}
     times: dict[str, NDArray[Any]] = {
         "stamp_ns": timeline.stamp_ns,
         "log_time_ns": source.readings.log_time_ns[timeline.row],

@@ -9,6 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.recipe import SampleConfig
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.tables.bits import Loss
 from tcpipe.tables.columns import floats, lonlat_deg
 from tcpipe.tables.levels import PLACED_SEGMENTS
@@ -99,6 +100,6 @@ def metres_lost(arc_length_m: NDArray[np.float64], lost_by: NDArray[np.uint32]) 
 
 def _warnings(source: MapReader, config: SampleConfig, projection: Projection) -> tuple[str, ...]:
     doubt, pitch_m = projection.doubt(), config.patch_m / config.patch_px
-    datum = f"{doubt}; say which datum the GNSS is in (recipe key read.gnss_crs)" if doubt else None
+    datum = f"{doubt}; say which datum the GNSS is in ({recipe_key('read.gnss_crs')})" if doubt else None
     pitch = pitch_note(pitch_m, level_for(source, pitch_m).grid.pitch_m)
     return tuple(f"map {source.name}: {note}" for note in (datum, pitch) if note)

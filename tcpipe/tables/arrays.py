@@ -81,7 +81,7 @@ def _ends(rows: Sequence[Sequence[Any]]) -> pa.Buffer:
 
 
 def rows_where(table: pa.Table, name: str, value: str | int) -> pa.Table:
-    """Return the rows whose column ``name`` holds ``value``."""
+    """Return the rows whose column ``name`` holds ``value``; the table itself where all do."""
     column = table.column(name)
-    held = texts(column) if isinstance(value, str) else numbers(column)
-    return table.filter(number_column(held == value))
+    chosen = (texts(column) if isinstance(value, str) else numbers(column)) == value
+    return table if chosen.all() else table.filter(number_column(chosen))

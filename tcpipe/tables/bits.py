@@ -41,7 +41,7 @@ class Quality(IntFlag):
     """What a user may want to know of a label; 0 means clean."""
 
     LOW_POWER_RATE = 1 << 0
-    """Power sampled below 10 Hz (instantaneous) or 2 Hz (averaged by the source)."""
+    """Current sampled below 10 Hz (instantaneous) or 2 Hz (averaged by the source), or a voltage that varies by 2 %."""
     NEAR_GAP = 1 << 1
     """A gap begins or ends within one chord of the segment."""
     HIGH_SLIP = 1 << 2

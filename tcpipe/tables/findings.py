@@ -105,6 +105,14 @@ class PowerSign:
 
 
 @dataclass(frozen=True, slots=True)
+class NoPower:
+    """Why a run has no power though its log may tell some, and the recipe (TOML) that would read it; "" where none is known."""
+
+    why: str
+    recipe: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class Reopening:
     """A sensor that its gate had refused since ``start_ns`` was heard again at ``end_ns``: it was off by ``size`` [m] or [m/s]."""
 
@@ -435,6 +443,7 @@ class RunFacts:
     odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
     """What the recipe multiplies a role's ways and velocities with."""
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
+    no_power: NoPower | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
     mounting: MountingFacts | None = field(default=None, metadata=LEFT_OUT)

@@ -31,10 +31,10 @@ from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
 from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, POINT_COLUMN, STANDING_COLUMNS
 
-DATA_MODEL_VERSION = "2.1"
+DATA_MODEL_VERSION = "2.2"
 """Version of every manifest and card that is written; its history stands in docs/reference/data-model.md."""
 
-READ_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "1.4", "2.0", DATA_MODEL_VERSION)
+READ_VERSIONS = ("1.0", "1.1", "1.2", "1.3", "1.4", "2.0", "2.1", DATA_MODEL_VERSION)
 """Versions that are read as they are; `tcpipe migrate` brings the older ones to the last."""
 
 TABLES_VERSION = "2.1"  # in which a table last changed

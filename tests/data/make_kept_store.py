@@ -1,7 +1,7 @@
 """Make ``store-1.0.tar.xz``: a site, its store and two datasets as data model 1.0 wrote them.
 
-It was run once with tcpipe 0.2.0 at commit 755ebd5, the last that wrote data model 1.0, and later with the last ones that wrote 1.4 and 2.0
-(456dda6); what it made is kept and never made again:
+It was run once with tcpipe 0.2.0 at commit 755ebd5, the last that wrote data model 1.0, and later with the last ones that wrote 1.4, 2.0
+(456dda6) and 2.1 (36f6e15); what it made is kept and never made again:
 
     git worktree add /tmp/tcpipe-1.0 755ebd5
     cp tests/data/make_kept_store.py /tmp/tcpipe-1.0

@@ -1,62 +1,27 @@
 """Sensors gone wrong, from a log to labels: nothing crashes, what is wrong is named with its cure, and no label is confidently wrong."""
 
 import tomllib
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from changed_drives import NAMES, Columns, Drive, make
+from suggested_recipes import merged, recipe_that_follows, suggestions_in
 
 from tcpipe.errors import FusionError, RoleError
 from tcpipe.formats.logs.log_file import open_log
 from tcpipe.formats.logs.writing import MessageStream, write_mcap
+from tcpipe.formats.recipe_toml import parse_recipe
 from tcpipe.formats.robot_files import shipped_profiles
+from tcpipe.pipeline.preflight import preflight
 from tcpipe.pipeline.run_stages import run_stages
-from tcpipe.recipe import Placement, ReadConfig, Recipe
-from tcpipe.simulation import Faults, Truth, scenario, simulated_drive, true_cost
-from tcpipe.simulation.messages import TOPICS, streams
-from tcpipe.simulation.route import Pause, Wander
+from tcpipe.recipe import FuseConfig, ReadConfig, Recipe
+from tcpipe.simulation import Truth, true_cost
+from tcpipe.simulation.route import Pause
 from tcpipe.stages.read import read_run
 from tcpipe.tables.levels import LabelledSegments, Streams
-
-NAMES = TOPICS["ros2"]
-Columns = dict[str, np.ndarray]
-
-
-@dataclass(frozen=True)
-class Drive:
-    truth: Truth
-    messages: tuple[MessageStream, ...]
-
-    def without(self, *sensors: str) -> "Drive":
-        return Drive(self.truth, tuple(m for m in self.messages if m.topic not in {NAMES[s] for s in sensors}))
-
-    def changed(self, sensor: str, change: Callable[[Columns], Mapping[str, np.ndarray]]) -> "Drive":
-        """Every column of a sensor's messages may be replaced; ``change`` gets copies of all, constants as columns too."""
-
-        def apply(m: MessageStream) -> MessageStream:
-            if m.topic != NAMES[sensor]:
-                return m
-            columns = {name: np.array(values) for name, values in m.columns.items()}
-            return replace(m, columns={**columns, **change(columns)})
-
-        return Drive(self.truth, tuple(apply(m) for m in self.messages))
-
-
-def make(plan=None, *, placements: bool = True) -> Drive:
-    demo = scenario("demo")
-    spec = demo.drives[0]
-    spec = replace(
-        spec,
-        plan=plan or Wander(60.0, (110.0, 30.0)),
-        recorder=replace(spec.recorder, placements=placements),
-        faults=replace(Faults.every(), gnss_outage=False, visual_dropouts=False, power_gap=False),
-    )
-    demo = replace(demo, drives=(spec,))
-    truth, readings = simulated_drive(demo, seed=5)
-    made = streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=demo.world.site.geoid_m)
-    return Drive(truth, tuple(made))
 
 
 @pytest.fixture(scope="module")
@@ -70,8 +35,32 @@ def read(drive: Drive, out: Path, config: ReadConfig | None = None) -> Streams:
         return read_run(log, config or ReadConfig(), robot=None, known=shipped_profiles())
 
 
-def run(drive: Drive, out: Path, config: ReadConfig | None = None) -> LabelledSegments:
-    return run_stages(read(drive, out, config), Recipe().ingest, run_id="run")[2]
+def run(
+    drive: Drive,
+    out: Path,
+    config: ReadConfig | None = None,
+    *,
+    recipe: Recipe = Recipe(),  # noqa: B008
+) -> LabelledSegments:
+    return run_stages(read(drive, out, config), recipe.ingest, run_id="run")[2]
+
+
+def heard(drive: Drive, sensor: str, when: Callable[[np.ndarray], np.ndarray]) -> Drive:
+    """Keep the messages of a sensor at some times since its first [s]."""
+
+    def kept(m: MessageStream) -> MessageStream:
+        if m.topic != NAMES[sensor]:
+            return m
+        rows = when((m.log_time_ns - m.log_time_ns[0]) * 1e-9)
+        columns = {name: np.asarray(values)[rows] for name, values in m.columns.items()}
+        published = None if m.publish_time_ns is None else m.publish_time_ns[rows]
+        return replace(m, log_time_ns=m.log_time_ns[rows], columns=columns, publish_time_ns=published)
+
+    return Drive(drive.truth, tuple(kept(m) for m in drive.messages))
+
+
+def every(period_s: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda at_s: np.diff(np.floor(at_s / period_s), prepend=-1.0) > 0
 
 
 def assert_labels_hold(labelled: LabelledSegments, truth: Truth, *, at_least: int = 30, within: float = 0.03) -> None:
@@ -99,14 +88,7 @@ def refused(labelled: LabelledSegments) -> set[str]:
 def cure(labelled: LabelledSegments, role: str) -> ReadConfig:
     """Read the recipe line out of the warning, as a person would."""
     (warning,) = [w for w in labelled.info.findings.warnings if w.startswith(f"{role}: ") and "is not fused" in w]
-    table, line = warning.rsplit("under [", 1)[1].split("]: ", 1)
-    keys = tomllib.loads(f"[{table}]\n{line}")["read"]
-    if "placement" in keys:
-        keys["placement"] = {
-            name: Placement(**{key: tuple(map(float, triple)) for key, triple in place.items()})
-            for name, place in keys["placement"].items()
-        }
-    return ReadConfig(**keys)
+    return recipe_that_follows(warning).read
 
 
 def test_the_drive_as_it_is_raises_no_doubt(drive, tmp_path):
@@ -141,6 +123,62 @@ def test_an_imu_that_feels_nothing_is_not_used_and_said(drive, tmp_path):
     assert refused(labelled) == {"imu"}
     assert any("its specific force is zero throughout" in line for line in labelled.info.findings.warnings)
     assert_labels_hold(labelled, drive.truth)
+
+
+UKF = Recipe(fuse=FuseConfig(estimator="ukf"))
+FIXES = ("wheels", "visual", "doppler")
+
+
+@pytest.mark.parametrize("without", [("visual", "doppler"), FIXES])
+@pytest.mark.parametrize(
+    "when", [every(1.0), every(0.5), every(0.2), lambda at_s: at_s % 1.0 < 0.3], ids=["1 Hz", "2 Hz", "5 Hz", "bursts"]
+)
+def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path, when, without):
+    few = drive.without(*without)
+    slow, none = run(heard(few, "imu", when), tmp_path), run(few.without("imu"), tmp_path)
+    assert refused(slow) == {"imu"}
+    assert "too far apart to be integrated" in slow.info.findings.facts.sensor_checks.refused["imu"]
+    assert_labels_hold(slow, drive.truth)
+    for name in ("start_ns", "duration_s", "energy_joule", "duration_std_s"):
+        np.testing.assert_array_equal(slow.table[name].to_numpy(), none.table[name].to_numpy())
+
+
+@pytest.mark.parametrize("recipe", [Recipe(), UKF], ids=["smoother", "ukf"])
+@pytest.mark.parametrize("without", [("visual", "doppler"), FIXES])
+@pytest.mark.parametrize("period_s", [0.08, 0.01])
+def test_gaps_of_an_imu_are_driven_as_without_it(drive, tmp_path, recipe, without, period_s):
+    """What it felt last is not held for seconds: the forward filter made 272 m of these 63."""
+    gaps = ((20.0, 23.0), (40.0, 45.0), (60.0, 70.0))
+
+    def when(at_s):
+        return every(period_s)(at_s) & ~np.any([(at_s > first) & (at_s < last) for first, last in gaps], axis=0)
+
+    labelled = run(heard(drive.without(*without), "imu", when), tmp_path, recipe=recipe)
+    assert "imu" in fused(labelled)
+    assert sum(labelled.ledger_m.values()) == pytest.approx(63.0, rel=0.06)
+    assert_labels_hold(labelled, drive.truth, within=0.04)
+
+
+@pytest.mark.parametrize("recipe", [Recipe(), UKF], ids=["smoother", "ukf"])
+@pytest.mark.parametrize("without", [("visual", "doppler"), FIXES])
+def test_an_imu_that_leads_the_track_astray_is_left_out(drive, tmp_path, recipe, without):
+    """Its x and y axes change places halfway: with fixes alone that made 6.8 km and 4,132 labels of 63 m."""
+
+    def loosened(c):
+        half = np.arange(len(c["angular_velocity.x"])) > len(c["angular_velocity.x"]) // 2
+        return {
+            f"{what}.{axis}": np.where(half, sign * c[f"{what}.{other}"], c[f"{what}.{axis}"])
+            for what in ("angular_velocity", "linear_acceleration")
+            for axis, other, sign in (("x", "y", 1.0), ("y", "x", -1.0))
+        }
+
+    labelled = run(drive.without(*without).changed("imu", loosened), tmp_path, recipe=recipe)
+    assert refused(labelled) == {"imu"}
+    assert (
+        "the track moves otherwise than every sensor says" in labelled.info.findings.facts.sensor_checks.refused["imu"]
+    )
+    assert sum(labelled.ledger_m.values()) == pytest.approx(63.0, rel=0.08)
+    assert_labels_hold(labelled, drive.truth, within=0.04)
 
 
 def test_degrees_are_seen_without_any_odometry(drive, tmp_path):
@@ -235,7 +273,9 @@ def test_a_sensor_that_is_unlike_the_rest_is_refused(drive, tmp_path, what):
     assert refused(labelled) == {role}
     (why,) = [w for w in labelled.info.findings.warnings if "is not fused" in w]
     assert word in why
-    assert "ignore_topics" in why
+    without = run(other, tmp_path, recipe_that_follows(why).read)
+    assert not refused(without)
+    assert role not in fused(without)
     assert (labelled.info.datum is None) == (sensor == "gnss")
     assert_labels_hold(labelled, drive.truth, within=0.06 if sensor == "gnss" else 0.03)
 
@@ -389,3 +429,112 @@ def test_a_log_that_never_moves_has_no_segments_and_says_why(tmp_path, without):
     assert labelled.table.num_rows == 0
     assert any(warning.startswith("no segments: ") for warning in labelled.info.findings.warnings)
     assert labelled.info.findings.facts.segment.odometer_m < 2.0
+
+
+def test_power_that_repeats_slow_readings_is_labelled_as_the_readings_are(drive, tmp_path):
+    measured = ("measured_voltages", "measured_currents")
+    held = drive.changed("power", lambda c: {name: c[name][np.arange(len(c[name])) // 5 * 5] for name in measured})
+    labelled = run(held, tmp_path)
+    (rail,) = labelled.info.findings.facts.label.rails["0"]
+    assert rail.current.rate_hz == rail.voltage.rate_hz == pytest.approx(4.0)
+    assert_labels_hold(labelled, drive.truth)
+    assert labelled.info.findings.facts.label.quality["low_power_rate"] == labelled.table.num_rows
+    found = preflight(tmp_path / "run.mcap", recipe=Recipe())
+    assert any("messages at 20 Hz repeat readings at 4 Hz" in line for line in found.mend)
+
+
+def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_coarse_fixes(drive, tmp_path):
+    rng = np.random.default_rng(1)
+
+    def coarse(c: Columns) -> Columns:
+        metre_deg = {"latitude": 9e-6, "longitude": 1.3e-5}
+        noisy = {name: c[name] + 1.5 * per_m * rng.standard_normal(c[name].shape) for name, per_m in metre_deg.items()}
+        return {
+            **noisy,
+            "position_covariance": np.broadcast_to(np.diag([2.2, 2.2, 9.0]).ravel(), (len(c["latitude"]), 9)),
+        }
+
+    names = ("twist.twist.linear.x", "twist.twist.angular.z")
+    other = drive.without("imu", "visual", "command").changed("gnss", coarse)
+    other = other.changed("wheels", lambda c: {names[0]: 0.43 * c[names[0]], names[1]: 0.0 * c[names[1]]})
+    labelled = run(other, tmp_path)
+    found = labelled.info.findings
+    assert fused(labelled) == {"gnss", "wheel_odometry"}
+    assert found.facts.mounting.odometry_scale["wheel_odometry"] == pytest.approx(0.43, rel=0.2)
+    assert sum(labelled.ledger_m.values()) == pytest.approx(drive.truth.distance_m[-1], rel=0.15)
+    (line,) = [w for w in found.warnings if "times as far as the track" in w]
+    assert "m by its speed" in line
+    assert any("that of the orientation is used" in w for w in found.warnings)
+
+
+LATE_S = 0.3
+
+
+def late(columns: Columns) -> Columns:
+    stamp_ns = columns["header.stamp.sec"] * 10**9 + columns["header.stamp.nanosec"] + round(LATE_S * 1e9)
+    return {"header.stamp.sec": stamp_ns // 10**9, "header.stamp.nanosec": stamp_ns % 10**9}
+
+
+def with_pose(drive: Drive) -> Drive:
+    """The drive without GNSS, with poses of a SLAM of another name: centimetres of noise, of base_link."""
+    every = slice(None, None, 20)
+    truth, random = drive.truth, np.random.default_rng(4)
+    stamp_ns, place = truth.stamp_ns[every], truth.enu_m[every]
+    place = place + random.normal(0.0, 0.01, place.shape)
+    columns = {f"pose.position.{axis}": place[:, i] for i, axis in enumerate("xyz")}
+    columns |= {f"pose.orientation.{part}": truth.quat_xyzw[every, i] for i, part in enumerate("xyzw")}
+    stamps = {"header.stamp.sec": stamp_ns // 10**9, "header.stamp.nanosec": stamp_ns % 10**9}
+    pose = MessageStream(POSE_TOPIC, "geometry_msgs/msg/PoseStamped", stamp_ns, columns | stamps)
+    return Drive(truth, (*drive.without("gnss").messages, pose))
+
+
+POSE_TOPIC = "/tracker/pose"
+
+
+def clock_warnings(labelled: LabelledSegments) -> list[str]:
+    return [line for line in labelled.info.findings.warnings if "its stamps seem" in line]
+
+
+@pytest.mark.parametrize("sensor", ["gnss", "imu", "wheels", "visual", "power", "pose"])
+def test_a_late_clock_is_cured_by_the_line_as_it_is_printed(drive, tmp_path, sensor):
+    config = {"read": {"topics": {"pose": [POSE_TOPIC]}}} if sensor == "pose" else {}
+    other = with_pose(drive) if sensor == "pose" else drive
+    topic = POSE_TOPIC if sensor == "pose" else NAMES[sensor]
+    messages = tuple(
+        replace(m, columns={**m.columns, **late(m.columns)}) if m.topic == topic else m for m in other.messages
+    )
+    off = Drive(drive.truth, messages)
+    (line,) = clock_warnings(run(off, tmp_path, parse_recipe(config, where="test").read))
+    role = {"wheels": "wheel_odometry", "visual": "visual_odometry"}.get(sensor, sensor)
+    ((role_said, offset_s),) = suggestions_in(line)[0]["read"]["time_offset_s"].items()
+    assert (line.split(":")[0], role_said) == (role, role)
+    assert offset_s == pytest.approx(-LATE_S, abs=0.03)
+    assert not clock_warnings(run(off, tmp_path, recipe_that_follows(line, before=config).read))
+
+
+def test_a_pose_that_nobody_names_is_offered_as_what_it_can_be(drive, tmp_path):
+    other = with_pose(drive).without("wheels", "visual")
+    with pytest.raises(RoleError) as error:
+        read(other, tmp_path)
+    (line,) = [line for line in error.value.problems if "to use one all the same" in line]
+    assert suggestions_in(line) == [{"read": {"topics": {"pose": [POSE_TOPIC]}}}]
+    assert "pose" in read(other, tmp_path, recipe_that_follows(line).read).tables
+
+
+def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_warning(drive, tmp_path):
+    topics = {"read": {"topics": {"pose": [POSE_TOPIC]}}}
+    other = with_pose(drive)
+    with pytest.raises(RoleError, match=r"read.time_offset_s.gnss: no topic of this log plays gnss.*are there: .*pose"):
+        read(other, tmp_path, parse_recipe(merged(topics, {"read": {"time_offset_s": {"gnss": -0.3}}}), where="").read)
+    placed = {"read": {"placement": {"gnss": {"xyz_m": [0.1, 0.0, 0.5]}}}}
+    found = read(other, tmp_path, parse_recipe(merged(topics, placed), where="").read)
+    assert any("read.placement.gnss: no topic of this log plays gnss" in line for line in found.findings.warnings)
+
+
+def test_currents_of_the_other_sign_are_cured_by_the_line_as_it_is_printed(drive, tmp_path):
+    other = drive.changed("power", lambda c: {name: -values for name, values in c.items() if "current" in name})
+    labelled = run(other, tmp_path)
+    (line,) = [line for line in labelled.info.findings.warnings if line.startswith("power refused")]
+    cured = run(other, tmp_path, recipe_that_follows(line).read)
+    assert not [line for line in cured.info.findings.warnings if line.startswith("power refused")]
+    assert_labels_hold(cured, drive.truth)

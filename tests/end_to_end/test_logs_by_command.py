@@ -122,7 +122,7 @@ def test_a_night_with_known_trouble_is_no_red_night(tmp_path):
     assert again.stdout.splitlines()[-3:] == [
         "nothing to do: 2 of 3 logs are in tcpipe-store already",
         "1 known failure, not tried again; --retry-failed tries it",
-        "1 with known damage; 'tcpipe accept RUN' when it has been looked at",
+        "1 known to be damaged or empty; 'tcpipe accept RUN' when it has been looked at",
     ]
     (run_id,) = {path.name for path in (tmp_path / "tcpipe-store" / "runs").glob("cut-*")}
     refused = plain_lines(tcpipe("accept", run_id, "nosuch", cwd=tmp_path), 2, most=1)
@@ -245,3 +245,38 @@ def test_export_says_what_it_did_and_that_nothing_is_left_to_do(tmp_path):
     assert (as_json["status"], as_json["exit_code"], as_json["topics"][0]["messages"]) == ("unchanged", 0, 1500)
     refused = tcpipe("export", "run.mcap", "out", "--topics", "/a,/b", "--json", cwd=tmp_path)
     assert len(json.loads(refused.stdout)["problems"]) == 2
+
+
+def test_fixes_of_no_ground_robot_make_no_run_and_no_promise(tmp_path):
+    """RTK of up to 30 m/s with power: labels of nobody's drive, until the recipe or the robot says that it is so fast."""
+    at_s = np.arange(0.0, 120.0, 0.1)
+    way_m = np.cumsum(0.1 * np.minimum(0.5 * at_s, 30.0))
+    rows = "".join(
+        f"{1.7e9 + t:.1f},{47.0 + way / 111_200:.9f},15.0,400.0,0.02\n" for t, way in zip(at_s, way_m, strict=True)
+    )
+    (tmp_path / "log").mkdir()
+    (tmp_path / "log" / "gnss.csv").write_text(f"t,lat,lon,alt,std\n{rows}")
+    (tmp_path / "log" / "power.csv").write_text("t,v,i\n" + "".join(f"{1.7e9 + t:.1f},24.0,5.0\n" for t in at_s))
+    tables = """
+[read.placement]
+gnss = { xyz_m = [0.0, 0.0, 0.0] }
+[tables.gnss]
+file = "gnss.csv"
+columns = { latitude = "lat", longitude = "lon", altitude = "alt", east_std = "std", north_std = "std", up_std = "std" }
+[tables.power]
+file = "power.csv"
+columns = { voltage = "v", current = "i" }
+"""
+    (tmp_path / "fast.toml").write_text(tables)
+    (tmp_path / "recipe.toml").write_text(tables + "[gate]\nmax_plausible_mps = 50.0\n")
+    (tmp_path / "robot.toml").write_text(tables + "[robots.racer]\nmax_plausible_mps = 50.0\n")
+    refused = tcpipe("ingest", "log", "--recipe", "fast.toml", "--robot", "generic", cwd=tmp_path)
+    assert refused.returncode == 1
+    assert "drives faster than 15 m/s" in refused.stderr
+    assert "set recipe key gate.max_plausible_mps" in refused.stderr
+    promise = tcpipe("preflight", "log", "--recipe", "fast.toml", "--robot", "generic", cwd=tmp_path)
+    assert (promise.returncode, "promises" in promise.stdout) == (1, False)
+    assert "drives faster than 15 m/s" in promise.stdout
+    for recipe, robot in (("recipe", "generic"), ("robot", "racer")):
+        done = tcpipe("ingest", "log", "--recipe", f"{recipe}.toml", "--robot", robot, "--store", recipe, cwd=tmp_path)
+        assert done.returncode == 0, done.stdout + done.stderr

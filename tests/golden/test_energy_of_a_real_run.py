@@ -11,10 +11,18 @@ from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.power.energy import recorded_energy_joule
 from tcpipe.power.rails import rail, samples
 from tcpipe.recipe import ReadConfig
+from tcpipe.stages import read
 from tcpipe.stages.power_rails import rails_of
 from tcpipe.stages.read import read_run
 
 
+@pytest.fixture
+def every_message(monkeypatch):
+    """Its messages repeat readings of 1 Hz twenty times each; the published sum counts each."""
+    monkeypatch.setattr(read, "without_repeats", lambda streams: (streams, []))
+
+
+@pytest.mark.usefixtures("every_message")
 def test_exact_and_trapezoid_energy_of_the_warthog():
     log_path = shared_data("warthog_grass_a/run.mcap")
     reference = json.loads(shared_data("warthog_grass_a/reference.json").read_text())["E_trapezoid_joule"]
@@ -36,6 +44,18 @@ def test_exact_and_trapezoid_energy_of_the_warthog():
     assert exact == pytest.approx(reference, rel=2e-5)
 
 
+def test_the_readings_alone_hold_the_same_energy():
+    reference = json.loads(shared_data("warthog_grass_a/reference.json").read_text())["E_trapezoid_joule"]
+    with open_log(shared_data("warthog_grass_a/run.mcap")) as log:
+        streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())
+    rails = rails_of(streams, 0)
+    for each in rails:
+        assert np.median(np.diff(each.current.stamp_ns)) == pytest.approx(1e9, rel=0.01)
+    begin, end = (np.array([pick(each.stamp_ns[k] for each in rails)]) for pick, k in ((min, 0), (max, -1)))
+    assert recorded_energy_joule(rails, begin, end, rule="exact")[0] == pytest.approx(reference, rel=2e-3)
+
+
+@pytest.mark.usefixtures("every_message")
 def test_reading_half_the_samples_changes_the_run_little():
     with open_log(shared_data("warthog_grass_a/run.mcap")) as log:
         streams = read_run(log, ReadConfig(), robot=None, known=shipped_profiles())

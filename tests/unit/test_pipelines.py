@@ -1,6 +1,7 @@
 """The shipped recipes parse and say what their comments claim; schedulers call what there is."""
 
 import re
+import runpy
 import shutil
 import subprocess
 from pathlib import Path
@@ -13,7 +14,7 @@ from tcpipe.formats.recipe_toml import ingest_key, load_recipe
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.logs.topics import Topic
 from tcpipe.recipe import Recipe
-from tcpipe.stages.read_roles import roles_by
+from tcpipe.stages.read_roles import find_read_config, roles_by
 
 PIPELINES = Path(__file__).parents[2] / "pipelines"
 VI, SIDES = ("voltage", "current"), ("left", "right")
@@ -21,7 +22,7 @@ VI, SIDES = ("voltage", "current"), ("left", "right")
 
 def played(recipe: Recipe, log: TableLog) -> set[str]:
     """The roles that are played, all that the recipe says settled."""
-    found = roles_by(recipe.read_of(log.topics), log.topics.values(), recipe.robot, known=profiles_of(recipe))
+    found = roles_by(find_read_config(recipe, log.topics), log.topics.values(), recipe.robot, known=profiles_of(recipe))
     assert found.problems == ()
     return set(found.roles)
 
@@ -106,3 +107,19 @@ def test_schedulers_call_commands_and_options_that_exist() -> None:
             what = "*-*-* 02:15:00" if checker[1] == "calendar" else PIPELINES / name
             assert subprocess.run([*checker, what], capture_output=True, check=False).returncode == 0
     assert "OnCalendar=*-*-* 02:15:00\n" in (PIPELINES / "systemd/tcpipe-night.timer").read_text()
+
+
+def test_fau_makes_its_tables_of_the_published_columns(tmp_path: Path) -> None:
+    script = runpy.run_path(str(PIPELINES / "fau_tables.py"))
+    fixes, seconds = (tmp_path / file for file in script["FILES"])
+    for path, head, row in (
+        (fixes, "timestamp (ns),latitude (deg),longitude (deg),alt_msl (m),fix_quality", "26.37,-80.1,2.6,{quality}"),
+        (seconds, ",".join(("timestamp (ns)", "Power (w)", *script["INERTIAL"].values())), "53.4" + ",0.1" * 10),
+    ):
+        path.parent.mkdir(parents=True)
+        rows = (f"{1763501392569776384 + k * 10**8},{row.format(quality=(4, 5, 2)[k % 3])}\n" for k in range(30))
+        path.write_text(f"{head}\n{''.join(rows)}", encoding="utf-8")
+    script["main"](tmp_path, tmp_path / "fau")
+    recipe, gnss = load_recipe(PIPELINES / "fau.toml"), pl.read_csv(tmp_path / "fau" / "gnss.csv")
+    assert played(recipe, TableLog(tmp_path / "fau", recipe.tables)) == {"gnss", "imu", "power"}
+    assert gnss["std"].to_list()[:3] == [0.02, 0.3, 0.8]

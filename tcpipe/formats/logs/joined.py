@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -90,6 +90,18 @@ class JoinedLog:
         of_earlier = self._earlier.tables(lent) if self._earlier and lent else {}
         return {name: _joined(name, tables) for name, tables in parts.items()} | of_earlier
 
+    def batches(self, topics: Sequence[str]) -> Iterator[dict[str, pa.Table]]:
+        """Yield each topic's tables piece by piece, file after file."""
+        schemas: dict[str, pa.Schema] = {}
+        for log in self._logs:
+            for tables in log.batches([topic for topic in topics if topic in log.topics]):
+                for name, table in tables.items():
+                    _require_same_fields(name, schemas.setdefault(name, table.schema), table.schema)
+                yield tables
+        lent = [topic for topic in topics if not any(topic in log.topics for log in self._logs)]
+        if self._earlier and lent:
+            yield from self._earlier.batches(lent)
+
     def __enter__(self) -> Self:
         """Return self; the files are open already."""
         return self
@@ -107,15 +119,19 @@ class JoinedLog:
 def _joined(topic: str, tables: Sequence[pa.Table]) -> pa.Table:
     if len(tables) == 1:  # in order already
         return tables[0]
-    try:
-        return pa.concat_tables(tables).sort_by("log_time_ns")
-    except pa.ArrowInvalid:
-        columns = [set(table.schema) for table in tables]
-        odd = sorted({field.name for fields in columns for field in fields ^ columns[0]})
+    for table in tables[1:]:
+        _require_same_fields(topic, tables[0].schema, table.schema)
+    return pa.concat_tables(tables).sort_by("log_time_ns")
+
+
+def _require_same_fields(topic: str, first: pa.Schema, other: pa.Schema) -> None:
+    """Raise `LogError` where the messages of a topic have other fields in another file."""
+    if first != other:
+        odd = sorted({field.name for field in set(first) ^ set(other)})
         raise LogError(
             f"topic {topic}: its messages have other fields in one of the files given with --as-one ({', '.join(odd)}); "
             "ingest them apart"
-        ) from None
+        )
 
 
 AnyLog: TypeAlias = "Log | JoinedLog | TableLog"

@@ -1,7 +1,7 @@
-"""GeoTIFF, JPEG 2000, ERDAS Imagine and VRT, as windows of numbers with their validity: the one home of rasterio.
+"""GeoTIFF, JPEG 2000 and ERDAS Imagine, as windows of numbers with their validity: the one home of rasterio.
 
 GDAL opens whatever a file's content says, also what is on another disk or another continent. So a user's file is looked at first: its
-beginning names its one driver, what lies beside it must be plain too, and of a VRT GDAL sees only what `vrt` lets through.
+beginning names its one driver, and what lies beside it must be plain too. A virtual raster (VRT), which names other files, is refused.
 
 A raster is opened *for a role* (height, ortho, terrain, or a layer of the user's) and refused at once, in one line, if it cannot play
 it: no place on the earth, placed by control points only, wrong bands, wrong numbers.
@@ -13,6 +13,7 @@ class values, each with a mask.
 from __future__ import annotations
 
 import logging
+import shlex
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -34,7 +35,6 @@ from rasterio.windows import Window
 from tcpipe.errors import MapError
 from tcpipe.formats.atomic import atomic_file
 from tcpipe.formats.maps.value_names import value_names
-from tcpipe.formats.maps.vrt import checked_vrt, is_vrt, root_name
 from tcpipe.terrain.layers import LUMA_RGB
 
 Use = Literal["metres", "grey", "red", "green", "blue", "classes", "numbers"]
@@ -78,7 +78,12 @@ _OTHERS = {
     b"ncols": "an ASCII grid",
     b"NCOLS": "an ASCII grid",
     b"{": "JSON",
+    b"<": "XML",
 }
+"""What a file is, by how it begins; GDAL reads most of these as rasters."""
+
+_VRT = b"<VRTDataset"
+"""By which GDAL knows a virtual raster, in the first bytes of a file of any name."""
 
 _REDIRECTIONS = ("OVERVIEWS", "ProxyOverviewRequest")
 """Domains of tags, in a GeoTIFF or in the statistics beside a raster, that tell GDAL to open another file, or an address."""
@@ -97,11 +102,10 @@ _OPAQUE = 1
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """How a file is opened: by its one driver, and as the document that stands for it if it is a VRT; the files it is made of."""
+    """How a file is opened: by its one driver; the files it is made of."""
 
     path: Path
     driver: str
-    document: str | None
     files: tuple[Path, ...]
 
 
@@ -241,7 +245,7 @@ def read_tile(path: Path, role: str, use: Use | None = None) -> Tile:
 
 
 def raster_files(path: Path) -> tuple[Path, ...]:
-    """Return every file that a raster is made of: itself, what lies beside it (masks, world files, statistics), what a VRT names.
+    """Return every file that a raster is made of: itself, and what lies beside it (masks, world files, statistics).
 
     Raises
     ------
@@ -251,42 +255,29 @@ def raster_files(path: Path) -> tuple[Path, ...]:
         return _checked(path).files
 
 
-def _checked(path: Path, nesting: int = 0, met: dict[Path, Source] | None = None) -> Source:
-    """Return how a user's file is opened, once neither it nor what lies beside it nor what it names reaches elsewhere."""
-    met = {} if met is None else met
-    if path in met:
-        return met[path]
-    driver = _driver(path)
-    if driver != "VRT":
-        met[path] = Source(path, driver, None, _plain_files(path, driver))
-        return met[path]
-    named: list[Path] = []
-
-    def source(place: Path, depth: int) -> str | None:
-        found = _checked(place, depth, met)
-        named.extend(found.files)
-        return found.document
-
-    for mask in (path.with_name(f"{path.name}.msk"), path.with_name(f"{path.name}.MSK")):
-        if mask.is_file():
-            raise MapError(f"{mask}: the mask beside a VRT is not followed; write both out: {_rewrite(path)}")
-    document = checked_vrt(path, source, nesting=nesting)
-    met[path] = Source(path, driver, document, tuple(dict.fromkeys((path, *named))))
-    return met[path]
+def _checked(path: Path) -> Source:
+    """Return how a user's file is opened, once neither it nor what lies beside it reaches elsewhere."""
+    driver = _driver(path, raster=path)
+    return Source(path, driver, _plain_files(path, driver))
 
 
-def _driver(path: Path) -> str:
-    """Return the driver of a file by what it begins with: that, not its name, is what GDAL goes by."""
+def _driver(path: Path, *, raster: Path) -> str:
+    """Return the driver of a file by what it begins with, which GDAL goes by; ``raster`` is the one that it is or lies beside."""
     head = _begins(path)
-    driver = next(
-        (driver for start, driver in _DRIVERS.items() if head.startswith(start)), "VRT" if is_vrt(head) else None
-    )
-    if driver is None:
+    for start, driver in _DRIVERS.items():
+        if head.startswith(start):
+            return driver
+    if _VRT in head:
         raise MapError(
-            f"{path}: is {_what(head)}, not a raster that is read; wanted GeoTIFF, JPEG 2000, ERDAS Imagine or VRT "
-            f"({_rewrite(path)}){_or_polygons(path)}"
+            f"{path}: is a GDAL virtual raster (VRT), which names other files; write it out as a GeoTIFF: {_rewrite(raster)}"
         )
-    return driver
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    known = next((name for start, name in _OTHERS.items() if text.startswith(start)), None)
+    what = known or ("something else" if head else "empty")
+    rewrite = f" ({_rewrite(raster)})" if known else ""
+    raise MapError(
+        f"{path}: is {what}, not a raster that is read; wanted GeoTIFF, JPEG 2000 or ERDAS Imagine{rewrite}{_or_polygons(path)}"
+    )
 
 
 def _begins(path: Path) -> bytes:
@@ -299,17 +290,10 @@ def _begins(path: Path) -> bytes:
         raise MapError(f"{path}: cannot be read ({error.strerror})") from None
 
 
-def _what(head: bytes) -> str:
-    """Return what a file is, for whoever gave it."""
-    known = next((name for start, name in _OTHERS.items() if head.startswith(start)), None)
-    root = root_name(head)
-    return known or (f"XML ({root[:40]})" if root else "something else" if head else "empty")
-
-
 def _plain_files(path: Path, driver: str) -> tuple[Path, ...]:
     """Return a raster's files, itself first; refuse one that names others elsewhere, has such beside it, or does not fit into memory."""
     _refuse_beside(path)
-    with _open_as(Source(path, driver, None, ())) as dataset:
+    with _open_as(Source(path, driver, ())) as dataset:
         if any(dataset.tags(ns=domain) for domain in _REDIRECTIONS):
             raise MapError(
                 f"{path}: names another file for its overviews, which is not followed; write it anew: {_rewrite(path)}"
@@ -322,7 +306,7 @@ def _plain_files(path: Path, driver: str) -> tuple[Path, ...]:
         if block > _MAX_BLOCK_BYTES:
             raise MapError(
                 f"{path}: kept in blocks of {block / 1e6:.0f} MB, at most {_MAX_BLOCK_BYTES // 10**6}; "
-                f"write it in tiles: gdal_translate -co TILED=YES -co BIGTIFF=IF_SAFER {path.name} out.tif"
+                f"write it in tiles: {_rewrite(path)} -co TILED=YES -co BIGTIFF=IF_SAFER"
             )
         files = {Path(name) for name in dataset.files}
     strangers = sorted(str(file) for file in files if file.parent != _absolute(path).parent)
@@ -338,12 +322,7 @@ def _refuse_beside(path: Path) -> None:
     for beside in (path.with_name(name) for name in names if name != path.name):
         if not beside.is_file() or (beside.suffix.lower() == ".aux" and not _begins(beside).startswith(_HFA)):
             continue
-        driver = _driver(beside)
-        if driver == "VRT":
-            raise MapError(
-                f"{beside}: GDAL takes it for the mask or overview of {path.name}; wanted a GeoTIFF, got a VRT"
-            )
-        _plain_files(beside, driver)
+        _plain_files(beside, _driver(beside, raster=path))
     statistics = path.with_name(f"{path.name}.aux.xml")
     if statistics.is_file() and statistics.stat().st_size > _MAX_STATISTICS_BYTES:
         size = f"{statistics.stat().st_size / 1e6:.0f} MB"
@@ -353,7 +332,7 @@ def _refuse_beside(path: Path) -> None:
 
 
 def _rewrite(path: Path) -> str:
-    return f"gdal_translate {path.name} out.tif"
+    return f"gdal_translate {shlex.quote(path.name)} out.tif"
 
 
 def _open_as(source: Source) -> Any:
@@ -361,7 +340,7 @@ def _open_as(source: Source) -> Any:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         try:
-            return rasterio.open(source.document or _absolute(source.path), driver=source.driver)
+            return rasterio.open(_absolute(source.path), driver=source.driver)
         except RasterioError as error:
             raise MapError(
                 f"{source.path}: not a raster that GDAL can read; the file is damaged: {_reason(error)}"

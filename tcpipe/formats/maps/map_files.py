@@ -31,17 +31,18 @@ from numpy.typing import NDArray
 from pyproj import CRS
 
 from tcpipe.errors import MapError, StoreError
-from tcpipe.formats.json_files import plain, recast, typed
+from tcpipe.formats.json_files import plain, read_json, recast, typed
 from tcpipe.formats.layer_descriptions import Description, described, flags, layers_described
 from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
 from tcpipe.formats.seals import prove_files, read_checksums
 from tcpipe.formats.shards import DESCRIPTION, Fetched, ShardedArray, open_sharded
-from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group, open_group
+from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group
 from tcpipe.tables.findings import LEFT_OUT
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, missing
 from tcpipe.terrain.overviews import coarser_levels, overview_factors, overview_grid
+from tcpipe.terrain.placement import MAX_PIXELS, MAX_SIDE_PX
 
 TILE_PX = 512
 """Side of a tile: the unit that is decoded."""
@@ -148,11 +149,13 @@ def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True)
     MapError : there is none, it is not a map of this program, or, where that is to be ``proved``, its descriptions are not as they were
         written or a file is gone: lost tiles would read as ground without data.
     """
+    if not (path / DESCRIPTION).is_file():
+        raise MapError(f"{path}: not a map, it has no {DESCRIPTION}; add one with: tcpipe add-map")
     try:
-        group = open_group(path)
+        attributes = read_json(path / DESCRIPTION).get("attributes")
     except StoreError as error:
-        raise MapError(f"{path}: not a map ({error}); add one with: tcpipe add-map") from error
-    found = group.attrs.asdict().get("tcpipe_map")
+        raise MapError(f"{path}: not a map ({error.problems[0]}); add one with: tcpipe add-map") from None
+    found = attributes.get("tcpipe_map") if isinstance(attributes, dict) else None
     if not isinstance(found, dict) or found.get("version") not in {PAPER_VERSION, MAP_VERSION}:
         version = found.get("version") if isinstance(found, dict) else None
         raise MapError(f"{path}: not a map of this version (got {version}, wanted {MAP_VERSION}); add it again")
@@ -160,27 +163,54 @@ def open_map(path: Path, fetched: Fetched | None = None, *, proved: bool = True)
         kept = typed(found, _Attributes, path)
         described = {name: kept.described.get(name, {}) for name in kept.layers}
         layers = layers_described(described, kept.class_table, path)
+        _refuse_sizes(kept, path)
     except StoreError as error:
         raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
     wanted = [f"{_level_path(factor)}{layer}" for factor in kept.factors for layer in kept.layers]
-    missing = [array for array in wanted if not (path / array / "zarr.json").is_file()]
+    missing = [array for array in wanted if not (path / array / DESCRIPTION).is_file()]
     if missing:
         raise MapError(f"{path}: the map's {', '.join(missing)} is gone; add the map again")
     if proved:
         _prove(path, fetched)
-    return recast(
-        kept,
-        MapFile,
-        classes=ClassTable(kept.class_table),
-        layers=layers,
-        _levels={
-            factor: {
-                layer: open_sharded(path / f"{_level_path(factor)}{layer}", sparse=True, fetched=fetched)
-                for layer in kept.layers
-            }
+    try:
+        levels = {
+            factor: {name: _array(path, layer, kept.grid, factor, fetched) for name, layer in layers.items()}
             for factor in kept.factors
-        },
+        }
+    except StoreError as error:
+        raise MapError(*(f"{problem}; add the map again" for problem in error.problems)) from None
+    return recast(kept, MapFile, classes=ClassTable(kept.class_table), layers=layers, _levels=levels)
+
+
+def _refuse_sizes(kept: _Attributes, path: Path) -> None:
+    """Raise `StoreError` where a map says that it is larger than any, or cut otherwise than every map is."""
+    rows, cols, pitch_m = kept.grid.rows, kept.grid.cols, kept.grid.pitch_m
+    if not (0 < rows <= MAX_SIDE_PX and 0 < cols <= MAX_SIDE_PX and rows * cols <= MAX_PIXELS and pitch_m > 0):
+        raise StoreError(
+            f"{path}: says that it has {rows} x {cols} pixels of {pitch_m} m, at most {MAX_SIDE_PX} a side"
+        )
+    wanted = (TILE_PX, overview_factors(kept.grid))
+    if (kept.tile_px, kept.factors) != wanted:
+        raise StoreError(f"{path}: tiles and overviews are {(kept.tile_px, kept.factors)}, wanted {wanted}")
+
+
+def _array(path: Path, layer: Layer, whole: MapGrid, factor: int, fetched: Fetched | None) -> ShardedArray:
+    grid, shard_px = overview_grid(whole, factor), _shard_px(factor)
+    return open_sharded(
+        path / f"{_level_path(factor)}{layer.name}",
+        shape=(grid.rows, grid.cols),
+        chunk_shape=(TILE_PX, TILE_PX),
+        shard_shape=(shard_px, shard_px),
+        dtype=np.dtype(layer.mapped),
+        fill=missing(layer.mapped),
+        sparse=True,
+        fetched=fetched,
     )
+
+
+def _shard_px(factor: int) -> int:
+    """Return the side of a shard at a level."""
+    return max(SHARD_PX // factor, TILE_PX)
 
 
 def _prove(path: Path, fetched: Fetched | None) -> None:
@@ -230,8 +260,7 @@ class MapWriter:
     def _add_level(self, factor: int) -> dict[str, Any]:
         group = self._group if factor == 1 else self._group.create_group(_level_path(factor).rstrip("/"))
         grid = overview_grid(self._grid, factor)
-        shard_px = max(SHARD_PX // factor, TILE_PX)
-        return {name: _add_layer(group, layer, grid, shard_px) for name, layer in self._layers.items()}
+        return {name: _add_layer(group, layer, grid, _shard_px(factor)) for name, layer in self._layers.items()}
 
     def write(self, layer: str, row0: int, col0: int, values: Pixels) -> None:
         """Write a shard whose corner is at a multiple of `SHARD_PX`; floats with NaN, bytes with 0, as no data."""

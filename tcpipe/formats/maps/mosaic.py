@@ -1,7 +1,7 @@
 """A layer's raster: one file, or many tiles laid side by side on one grid of pixels, and read as if they were one file.
 
 Tiles share CRS, type, bands and grid (to a twentieth of a pixel). Where they overlap, the later file lies on top wherever it has data, as
-with gdalbuildvrt; what no tile covers has no data. A few files are open at one time, however many there are.
+with gdalwarp; what no tile covers has no data. A few files are open at one time, however many there are.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def open_raster(paths: Sequence[Path], role: str, use: Use | None = None) -> Ite
     """
     if len(paths) > MAX_FILES:
         raise MapError(
-            f"{_label(paths)}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: gdalbuildvrt part.vrt …"
+            f"{_label(paths)}: {len(paths)} files for {role}, at most {MAX_FILES}; join some: gdalwarp part*.tif joined.tif"
         )
     tiles: list[Tile] = []
     problems: list[str] = []
@@ -178,7 +178,7 @@ def _laid(tiles: Sequence[Tile]) -> tuple[tuple[float, float, float, float, floa
         raise MapError(
             f"{tiles[0].role}: {len(odd)} of {len(tiles)} files do not lie on the pixels of the rest "
             f"({got}, the rest {wanted}): {', '.join(_few([str(tile.path) for tile in odd]))}; "
-            "put all on one grid: gdalbuildvrt -resolution highest -r bilinear all.vrt …"
+            "put all on one grid: gdalwarp -r bilinear *.tif joined.tif"
         )
     a, b, x, d, e, y = tiles[base].affine
     col, row = at.min(axis=0).tolist()

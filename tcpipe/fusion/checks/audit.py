@@ -56,6 +56,9 @@ _LITTLE = 0.1
 _NO_ARM_M = 1.0
 _FEWEST_WINDOWS = 4
 _SCALES = (0.5, 2.0)
+_ASTRAY_M = 1.0
+_SURELY = 4.0
+_MEDIAN_OF_SQUARES = 0.4549  # of a normal variable of variance 1
 _LASTING_MPS = 0.02
 _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 _TURN_SCALE_STD = {WHEELS: 0.3, VISUAL: 0.03, IMU: 0.01}
@@ -121,10 +124,16 @@ class Tally:
 
 @dataclass(frozen=True, slots=True)
 class Audit:
-    """What the audit of one stretch found: disagreements in order of time, and how much of the way each sensor disagrees."""
+    """What the audit of one stretch found: disagreements in order of time, and how much of the way each sensor disagrees.
+
+    ``windows``: those in which a sensor tells the robot's way; ``astray``: those in which the track's is far from what every such sensor
+    says.
+    """
 
     disagreements: tuple[Disagreement, ...]
     tallies: tuple[Tally, ...]
+    windows: int = 0
+    astray: int = 0
 
 
 def audited(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, Audit]:
@@ -152,10 +161,22 @@ def audited(found: Trajectory, measurements: Measurements) -> tuple[Trajectory, 
         for one in compared
     )
     told = [each for one in compared for each in _told(one, alone[id(one)], found.stamp_ns, windows)]
+    way_m = _astray_m(compared, _all_fixes(found, measurements.gnss, windows), windows.shape[0])
     for what in UNITS:
-        same = [(one, one.disagrees & ~alone[id(one)]) for one in compared if one.what == what]
+        same = [(one.size, one.disagrees & ~alone[id(one)]) for one in compared if one.what == what]
+        same += [(way_m, way_m > 0.0)] if what == "displacement" else []
         found = _raised(found, what, _largest(same, windows, found.stamp_ns.size))
-    return found, Audit(tuple(sorted(told, key=lambda each: each.start_ns)), tallies)
+    return found, Audit(
+        tuple(sorted(told, key=lambda each: each.start_ns)),
+        tallies,
+        int(np.isfinite(way_m).sum()),
+        int((way_m > 0.0).sum()),
+    )
+
+
+def goes_astray(windows: int, astray: int) -> bool:
+    """Return whether the track is astray in more than a little of the windows in which a sensor tells the robot's way."""
+    return astray > max(1.0, _LITTLE * windows)
 
 
 def alone_in_most(tallies: Iterable[Tally]) -> tuple[str, ...]:
@@ -320,27 +341,41 @@ def _fixes(
     found: Trajectory, rotation: Floats, gnss: Positions, windows: NDArray[np.int64], way_std: Floats
 ) -> Iterable[Comparison]:
     """Yield where the fixes are, and how those that the gate took move along and aside, against the antenna on the track."""
-    inside = (gnss.stamp_ns >= found.stamp_ns[0]) & (gnss.stamp_ns <= found.stamp_ns[-1])
+    inside, off = _off_fixes(found, rotation, gnss)
     stamp_ns, zero = gnss.stamp_ns[inside], int(found.stamp_ns[0])
-    antenna = (found.position_enu_m + rotation @ np.asarray(gnss.lever_arm_m))[:, :2]
     fix_s, at_s = seconds(stamp_ns, zero), seconds(found.stamp_ns, zero)
-    off = gnss.position_enu_m[inside, :2] - np.column_stack([np.interp(fix_s, at_s, axis) for axis in antenna.T])
     claim = np.sqrt(gnss.variance_m2[inside, :2].mean(1))
     begin, end = at_s[windows].T
-    middle = (begin + end) / 2.0
     more_s = max(0.0, _FEWEST_FIXES * 1e-9 * median_period_ns(stamp_ns) - _WINDOW_S) / 2.0
     place, std = _medians(fix_s, off, claim, begin - more_s, end + more_s)
     place_std = found.position_std_m[windows[:, 0], :2].max(1)
     yield Comparison(GNSS, "position", place, std, place_std)
     refused = found.rejections.stamp_ns[found.rejections.role == GNSS]
     fed = ~np.isin(stamp_ns, refused)
-    (first, first_std), (last, last_std) = (
-        _medians(fix_s[fed], off[fed], claim[fed], *half) for half in ((begin, middle), (middle, end))
+    moved = _moved(fix_s[fed], off[fed], claim[fed], begin, end)
+    difference = _ahead_and_aside(moved.difference, rotation[windows.sum(1) // 2])
+    yield replace(moved, difference=difference, track_std=way_std)
+
+
+def _off_fixes(found: Trajectory, rotation: Floats, gnss: Positions) -> tuple[Mask, Floats]:
+    """Return which fixes lie inside the track's time, and how far those are off its antenna, east and north [m], shape (F, 2)."""
+    inside = (gnss.stamp_ns >= found.stamp_ns[0]) & (gnss.stamp_ns <= found.stamp_ns[-1])
+    antenna = (found.position_enu_m + rotation @ np.asarray(gnss.lever_arm_m))[:, :2]
+    zero = int(found.stamp_ns[0])
+    fix_s, at_s = seconds(gnss.stamp_ns[inside], zero), seconds(found.stamp_ns, zero)
+    return inside, gnss.position_enu_m[inside, :2] - np.column_stack(
+        [np.interp(fix_s, at_s, axis) for axis in antenna.T]
     )
-    moved = 2.0 * (last - first)
+
+
+def _moved(fix_s: Floats, off_m: Floats, claim_m: Floats, begin_s: Floats, end_s: Floats) -> Comparison:
+    """Return by how much fixes move otherwise than the track in each window, east and north: the later half against the earlier."""
+    middle_s = (begin_s + end_s) / 2.0
+    (first, first_std), (last, last_std) = (
+        _medians(fix_s, off_m, claim_m, *half) for half in ((begin_s, middle_s), (middle_s, end_s))
+    )
     claimed = 2.0 * np.hypot(first_std, last_std)
-    difference = _ahead_and_aside(moved, rotation[windows.sum(1) // 2])
-    yield Comparison(GNSS, "displacement", difference, claimed, way_std)
+    return Comparison(GNSS, "displacement", 2.0 * (last - first), claimed, np.zeros_like(claimed))
 
 
 def _ahead_and_aside(moved: Floats, rotation: Floats) -> Floats:
@@ -400,11 +435,38 @@ def _told(
             )
 
 
-def _largest(disputed: Iterable[tuple[Comparison, Mask]], windows: NDArray[np.int64], rows: int) -> Floats:
+def _astray_m(compared: Sequence[Comparison], fixes: Iterable[Comparison], windows: int) -> Floats:
+    """Return how far the track's way in each window is off what every sensor says of it [m], shape (W,).
+
+    0 where one holds with it, NaN where none tells. What the track claims and what the gate refused does not count: an estimate that has
+    lost the robot refuses what is right, and believes itself.
+    """
+    ways = [one for one in compared if one.what == "displacement" and one.sensor != GNSS]
+    off_m = np.full(windows, np.nan)
+    for one in (*ways, *fixes):
+        off = np.where(one.size > np.maximum(_ASTRAY_M, _SURELY * one.std), one.size, 0.0)
+        off_m = np.where(one.told, np.fmin(off_m, off), off_m)
+    return off_m
+
+
+def _all_fixes(found: Trajectory, gnss: Positions | None, windows: NDArray[np.int64]) -> Iterable[Comparison]:
+    """Yield how all fixes move, refused or not, against the antenna on the track; their scatter counts where they claim less."""
+    if gnss is None:
+        return
+    inside, off = _off_fixes(found, matrix_from_quat(found.quat_xyzw), gnss)
+    zero = int(found.stamp_ns[0])
+    begin, end = seconds(found.stamp_ns, zero)[windows].T
+    second = np.diff(gnss.position_enu_m[inside, :2], n=2, axis=0)
+    scatter = np.sqrt(np.median(second**2) / (6 * _MEDIAN_OF_SQUARES)) if second.size else 0.0
+    claim = np.maximum(np.sqrt(gnss.variance_m2[inside, :2].mean(1)), scatter)
+    yield _moved(seconds(gnss.stamp_ns[inside], zero), off, claim, begin, end)
+
+
+def _largest(disputed: Iterable[tuple[Floats, Mask]], windows: NDArray[np.int64], rows: int) -> Floats:
     """Return the largest difference by any sensor at each of the track's rows, in the windows that are disputed; 0 elsewhere."""
     size = np.zeros(rows)
-    for one, where in disputed:
-        for (first, last), of_window in zip(windows[where].tolist(), one.size[where].tolist(), strict=True):
+    for off, where in disputed:
+        for (first, last), of_window in zip(windows[where].tolist(), off[where].tolist(), strict=True):
             np.maximum(size[first : last + 1], of_window, out=size[first : last + 1])
     return size
 

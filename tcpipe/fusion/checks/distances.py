@@ -1,7 +1,8 @@
 """How far each sensor says that the robot went: one that counts in other units, or stands still, tells another distance than the rest.
 
-Distances are chords over ten seconds, so that the noise of fixes does not count as driving: of fixes their difference, of an odometry
-what its own velocity and yaw rate add up to. A command is a voice where two sensors differ, though a robot may be slower than it is told.
+Distances are chords over ten seconds, or thirty where fixes are coarse, so that the noise of fixes does not count as driving: of fixes
+their difference, of an odometry what its own velocity and yaw rate add up to. A command is a voice where two sensors differ, though a
+robot may be slower than it is told.
 """
 
 from __future__ import annotations
@@ -22,6 +23,8 @@ COMMAND = "command"
 """The command's name among the distances; it is never refused."""
 
 _WINDOW = round(10.0 / GRID_S)
+_LONG_WINDOW = 3 * _WINDOW
+"""Where the fixes' noise hides what is driven in the shorter one."""
 _STEP = round(5.0 / GRID_S)
 _FAR_M = 3.0
 _SURE = 6.0  # standard deviations
@@ -33,6 +36,10 @@ _UNLIKE_M = 1.0
 _UNLIKE_SHARE = 0.3
 _UNLIKE_WINDOWS = 0.3
 _CLEARLY = 3.0
+_NEAR_ONE = (0.7, 1.4)
+"""What lies between is told by the track (`odometry_scale`)."""
+_MOST = 5.0
+_ALIKE = 0.25
 _KMH = (3.2, 4.0)
 _RADIANS = (1 / 75, 1 / 30)
 
@@ -76,12 +83,15 @@ def find_distances(gnss: Positions | None, twists: Mapping[str, Floats], at_ns: 
     twists : by name, forward velocity [m/s] and yaw rate [rad/s] on the grid, shape (M, 2).
     at_ns : the grid's stamps, shape (M,).
     """
-    chords = {name: _chords_m(_dead_reckoned(twist)) for name, twist in twists.items()}
+    places = {name: _dead_reckoned(twist) for name, twist in twists.items()}
     least_m = _FAR_M
     if gnss is not None:
-        chords[GNSS] = _chords_m(fix_places(gnss, at_ns))
+        places[GNSS] = fix_places(gnss, at_ns)
         least_m += _SURE * float(np.sqrt(np.median(gnss.variance_m2[:, :2])))
-    return Distances(chords, least_m)
+    found = Distances({name: _chords_m(place, _WINDOW) for name, place in places.items()}, least_m)
+    if any(found.ratio(*pair) is not None for pair in combinations(places, 2)):
+        return found
+    return Distances({name: _chords_m(place, _LONG_WINDOW) for name, place in places.items()}, least_m)
 
 
 def contradictions(found: Distances, *, turning: frozenset[str]) -> dict[str, str]:
@@ -117,15 +127,11 @@ def path_of_fixes(
     In every window the fixes are laid on the odometry's path by rotation and scale, and again on its mirror image. Unlike is what fits
     neither way, by more than the fixes' noise, what slip bends, and a metre.
     """
-    fixes, path = fix_places(gnss, at_ns), _dead_reckoned(twist)
     left, bound = [], []
     noise_m2 = _SURE**2 * float(np.median(gnss.variance_m2[:, :2]))
-    for first in range(0, at_ns.size - 2 * _WINDOW, _WINDOW):
-        rows = slice(first, first + 2 * _WINDOW)
-        if np.isfinite(fixes[rows] + path[rows]).all():
-            a, b = fixes[rows] - fixes[rows].mean(), path[rows] - path[rows].mean()
-            left.append((_unlike_m2(a, b), _unlike_m2(a, np.conj(b))))
-            bound.append(_UNLIKE_M**2 + noise_m2 + _UNLIKE_SHARE**2 * float(np.mean(np.abs(b) ** 2)))
+    for a, b in _both_paths(gnss, twist, at_ns):
+        left.append((_unlike_m2(a, b), _unlike_m2(a, np.conj(b))))
+        bound.append(_UNLIKE_M**2 + noise_m2 + _UNLIKE_SHARE**2 * float(np.mean(np.abs(b) ** 2)))
     if len(left) < _FEWEST_WINDOWS:
         return None
     as_it_is, as_mirrored = np.array(left).T
@@ -135,6 +141,41 @@ def path_of_fixes(
     if most / len(left) < _BEND_M**2 + noise_m2 or most < _CLEARLY * least:
         return None
     return "alike" if as_it_is.sum() < as_mirrored.sum() else "mirrored"
+
+
+def far_scale(gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]) -> tuple[float, float] | None:
+    """Return how many times as far as the fixes an odometry goes, and its standard deviation, where that is far from 1 throughout.
+
+    In every window the odometry's path is laid on the fixes by rotation and scale. The scale is the odometry's where the paths are alike
+    and the windows agree; fixes that are metres off tell it as well, once a window is longer than that.
+    """
+    noise_m2 = 2.0 * float(np.median(gnss.variance_m2[:, :2]))
+    ratios, windows = [], 0
+    for a, b in _both_paths(gnss, twist, at_ns):
+        energy, own = float(np.mean(np.abs(a) ** 2)), float(np.mean(np.abs(b) ** 2))
+        if energy > max(noise_m2, _UNLIKE_M**2) and own > 0.0:
+            windows += 1
+            if _unlike_m2(a, b) < noise_m2 + _UNLIKE_SHARE**2 * energy:
+                ratios.append(own / float(np.abs(np.mean(a * np.conj(b)))))
+    if len(ratios) < max(_FEWEST_WINDOWS, (1.0 - _UNLIKE_WINDOWS) * windows):
+        return None
+    factor = float(np.median(ratios))
+    spread = 1.4826 * float(np.median(np.abs(np.array(ratios) - factor)))
+    low, high = _NEAR_ONE
+    if low < factor < high or not 1 / _MOST < factor < _MOST or spread > _ALIKE * abs(factor - 1.0):
+        return None
+    return factor, spread / float(np.sqrt(len(ratios) / 2))  # windows overlap by half
+
+
+def _both_paths(
+    gnss: Positions, twist: Floats, at_ns: NDArray[np.int64]
+) -> Iterable[tuple[NDArray[np.complex128], NDArray[np.complex128]]]:
+    """Yield the fixes and what an odometry adds up to in every window of twice the length, each about its mean."""
+    fixes, path = fix_places(gnss, at_ns), _dead_reckoned(twist)
+    for first in range(0, at_ns.size - 2 * _WINDOW, _WINDOW):
+        rows = slice(first, first + 2 * _WINDOW)
+        if np.isfinite(fixes[rows] + path[rows]).all():
+            yield fixes[rows] - fixes[rows].mean(), path[rows] - path[rows].mean()
 
 
 def _unlike_m2(a: NDArray[np.complex128], b: NDArray[np.complex128]) -> float:
@@ -171,9 +212,9 @@ def _dead_reckoned(twist: Floats) -> NDArray[np.complex128]:
     return np.where(known, place, np.nan)
 
 
-def _chords_m(place_m: NDArray[np.complex128]) -> Floats:
-    """Return the distance over every window [m]; NaN where a place in it is unknown."""
+def _chords_m(place_m: NDArray[np.complex128], window: int) -> Floats:
+    """Return the distance over every window of so many rows [m]; NaN where a place in it is unknown."""
     lost = np.concatenate(([0], np.cumsum(np.isnan(place_m))))
-    first = np.arange(0, place_m.size - _WINDOW, _STEP)
-    whole = lost[first + _WINDOW + 1] == lost[first]
-    return np.where(whole, np.abs(place_m[first + _WINDOW] - place_m[first]), np.nan)
+    first = np.arange(0, place_m.size - window, _STEP)
+    whole = lost[first + window + 1] == lost[first]
+    return np.where(whole, np.abs(place_m[first + window] - place_m[first]), np.nan)

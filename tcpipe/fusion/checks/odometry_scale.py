@@ -36,10 +36,18 @@ _SCALE_STD = {WHEELS: WHEEL_SCALE_STD, VISUAL: VISUAL_SCALE_STD}
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """How many times as far as the track an odometry goes, and its standard deviation by how windows scatter."""
+    """How many times as far as the track an odometry goes, and its standard deviation by how windows scatter.
+
+    ``driven_m`` [m] is how far it goes by its own speed, where the fixes alone told a scale that is far off.
+    """
 
     factor: float
     std: float
+    driven_m: float | None = None
+
+    def after(self, before: Scale | None) -> Scale:
+        """Return this scale together with one that was taken out before it was found."""
+        return self if before is None else Scale(before.factor * self.factor, before.factor * self.std, before.driven_m)
 
 
 def way_ratios(found: Trajectory, m: Measurements) -> Mapping[str, Floats]:
@@ -94,6 +102,15 @@ def rescaled(source: BodyVelocities, factor: float) -> BodyVelocities:
     """Return an odometry that goes ``factor`` times too far with its velocities as they should be; its claim does not become better."""
     variance = source.variance_m2ps2 * max(1.0, factor**-2.0)
     return replace(source, velocity_mps=source.velocity_mps / factor, variance_m2ps2=variance)
+
+
+def rescaled_odometries(m: Measurements, scales: Mapping[str, Scale]) -> Measurements:
+    """Return measurements with the odometries of which a scale is known `rescaled`."""
+
+    def in_metres(role: str, source: BodyVelocities | None) -> BodyVelocities | None:
+        return source if source is None or role not in scales else rescaled(source, scales[role].factor)
+
+    return replace(m, wheels=in_metres(WHEELS, m.wheels), visual=in_metres(VISUAL, m.visual))
 
 
 def over_command(wheels: BodyVelocities, command_ns: NDArray[np.int64], commanded_mps: Floats) -> float | None:

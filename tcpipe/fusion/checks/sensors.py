@@ -1,8 +1,8 @@
 """Sensors that contradict physics or each other, and what would set each right; such a sensor is not to be fused.
 
 An IMU in degrees or in g, one that does not stand upright, one that looks elsewhere; an odometry that drives or turns the other way;
-fixes on a mirrored path; a sensor that is frozen, or goes another distance than the rest. Where two disagree a third decides: the command,
-the camera, the course of the fixes. Mountings that somebody stated weigh more than assumed ones.
+an IMU too slow to be integrated; fixes on a mirrored path; a sensor that is frozen, or goes another distance than the rest. Where two
+disagree a third decides: the command, the camera, the course of the fixes. Mountings that somebody stated weigh more than assumed ones.
 """
 
 from __future__ import annotations
@@ -13,10 +13,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.fusion.checks.distances import COMMAND, Distances, contradictions, find_distances, path_of_fixes
+from tcpipe.fusion.checks.distances import COMMAND, Distances, contradictions, far_scale, find_distances, path_of_fixes
 from tcpipe.fusion.checks.frozen import frozen_sensors
 from tcpipe.fusion.checks.gridded_motion import course_rate, fix_velocity, on_grid, twist_on_grid
-from tcpipe.fusion.checks.lags import Floats, averaged
+from tcpipe.fusion.checks.lags import GRID_S, Floats, averaged
+from tcpipe.fusion.checks.odometry_scale import Scale
 from tcpipe.fusion.checks.plausibility import (
     YawAxis,
     agreement,
@@ -40,6 +41,8 @@ _TILTED_RAD = np.radians(30.0)  # slopes average out; the steepest that is drive
 _LOOKS_ELSEWHERE_RAD = np.radians(60.0)
 _BACKWARDS_RAD = np.radians(120.0)
 _OTHER_WAY = -0.5
+_LONGEST_IMU_STEP_S = 0.11  # 10 Hz, with the jitter of its driver
+_MOSTLY = 0.5
 
 FORWARD = np.diag([-1.0, -1.0, 1.0])
 """Turns a body's x axis round and leaves its yaw rate."""
@@ -72,9 +75,10 @@ def fixes_refused(why: str, odometries: Collection[str]) -> Refusal:
 
 @dataclass(slots=True)
 class Checks:
-    """What was found: refusals in order, and the figures they rest on."""
+    """What was found: refusals in order, the scale of an odometry that is far off throughout, and the figures they rest on."""
 
     refusals: list[Refusal] = field(default_factory=list)
+    scales: dict[str, Scale] = field(default_factory=dict)
     facts: SensorChecks = field(default_factory=SensorChecks)
 
     @property
@@ -104,10 +108,17 @@ def check_sensors(
     felt : median size of the specific force as the IMU told it, before its lever arm was taken out; NaN without an IMU.
     """
     checks = Checks()
+    slow = None if measurements.imu is None else _why_too_slow(measurements.imu)
+    if slow is not None:
+        checks.refusals.append(Refusal(IMU, slow))
+        measurements = replace(measurements, imu=None)
     at_ns = liveliest_ns(measurements)
     if at_ns is None:
         return checks
     twists = {role: twist_on_grid(source, at_ns) for role, source in measurements.odometries().items()}
+    if measurements.gnss is not None:
+        checks.scales = _far_scale(measurements.gnss, twists, command, at_ns)
+        twists |= {role: twists[role] / [scale.factor, 1.0] for role, scale in checks.scales.items()}
     found = find_distances(measurements.gnss, _with_command(twists, command, at_ns), at_ns)
     frozen = frozen_sensors(measurements, found)
     checks.refusals += [Refusal(role, why) for role, why in frozen.items()]
@@ -124,6 +135,41 @@ def check_sensors(
     if gnss is not None:
         _check_path(checks, gnss, _turning_as_felt(checks, twists, measurements.imu, at_ns), at_ns)
     return checks
+
+
+def _why_too_slow(imu: InertialMeasurements) -> str | None:
+    """Return why an IMU cannot be integrated: for most of its time its samples are too far apart to tell the motion between them."""
+    step_s = np.diff(imu.stamp_ns) * 1e-9
+    span_s = float(step_s.sum())
+    if span_s > 0 and float(step_s[step_s < _LONGEST_IMU_STEP_S].sum()) >= _MOSTLY * span_s:
+        return None
+    return (
+        f"it has {step_s.size / max(span_s, 1.0):.1f} samples a second, in most of its time too far apart to be integrated: "
+        "record it at 10 Hz or more (100 Hz is usual), without gaps"
+    )
+
+
+def _far_scale(
+    gnss: Positions, twists: Mapping[str, Floats], command: CommandedSpeed | None, at_ns: NDArray[np.int64]
+) -> dict[str, Scale]:
+    """Return the scale of the only odometry, by role, where its path is that of the fixes but far longer or shorter.
+
+    A second odometry decides which of them errs (`contradictions`); a command at which the robot goes by the odometry confirms that.
+    """
+    if len(twists) != 1:
+        return {}
+    (role,) = twists
+    scale = far_scale(gnss, twists[role], at_ns)
+    if scale is None:
+        return {}
+    driven_m = {
+        name: float(np.nansum(np.abs(twist[:, 0]))) * GRID_S
+        for name, twist in _with_command(twists, command, at_ns).items()
+    }
+    told_m = driven_m.get(COMMAND, 0.0)
+    if told_m and abs(np.log(told_m / driven_m[role])) < abs(np.log(scale[0])) / 2:
+        return {}
+    return {role: Scale(*scale, driven_m=driven_m[role])}
 
 
 def _with_command(

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import Covariate, RunSource
 from tcpipe.recipe import CovariateConfig
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.robots.profiles import Robot
 from tcpipe.tables.columns import integers
 from tcpipe.tables.levels import SAMPLES
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 TAG = "tag_"
 """What the column of a tag is called before the tag's name."""
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?")
+_NUMBER = re.compile(r"[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d{1,3})?")
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +112,8 @@ def _unreached(
         more = f" and {len(runs) - 3} more" if len(runs) > 3 else ""
         said.append(
             f"{told.name}: no row reaches {rows.size} of {samples} samples (run {', '.join(runs[:3])}{more}): its rows are of "
-            f"{told.first} to {told.last}, and none is taken that is older than {config.max_age_s:g} s ([covariates] max_age_s)"
+            f"{told.first} to {told.last}, and none is taken that is older than {config.max_age_s:g} s "
+            f"({recipe_key('covariates.max_age_s')})"
         )
     holes = [f"{name} {count - rows.size}" for name, count in told.samples_without.items() if count > rows.size]
     if holes:
@@ -161,11 +163,11 @@ def narrow_patches(robots: Sequence[str], known: Mapping[str, Robot], *, patch_m
         if width_m is None:
             said.append(
                 f"robot {robot}: its width is not known, so nobody can say whether patches of {patch_m:g} m hold its wheels; "
-                f"tell it: [robots.{robot}] width_m"
+                f"tell it (width_m of {robot}, {recipe_key('robots')})"
             )
         elif width_m > patch_m:
             said.append(
                 f"robot {robot}: is {width_m:g} m wide, patches {patch_m:g} m: its wheels run outside of them; "
-                f"take wider ones: [sample] patch_m (segments stay as long as they are)"
+                f"take wider ones, segments stay as long as they are ({recipe_key('sample.patch_m')})"
             )
     return said

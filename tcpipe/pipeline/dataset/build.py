@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import shlex
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -48,6 +48,7 @@ from tcpipe.formats.recipe_toml import recipe_of
 from tcpipe.formats.record_files import Call, DatasetMade, DatasetReplaced
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
+from tcpipe.pipeline.begun_calls import begun_call
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
@@ -63,6 +64,7 @@ from tcpipe.pipeline.dataset.redaction import (
     redacted_inputs,
     redaction_of,
 )
+from tcpipe.pipeline.dataset.replacing import BuildOptions, find_other_options
 from tcpipe.pipeline.dataset.runs import gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
@@ -151,6 +153,7 @@ def build_dataset(
     covariates: str | Path | Sequence[str | Path] = (),
     min_runs: int | None = None,
     redact: bool = False,
+    force: bool = False,
     dry_run: bool = False,
 ) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
@@ -161,8 +164,8 @@ def build_dataset(
     Parameters
     ----------
     out
-        Directory of the dataset: new, empty, or a dataset, which is replaced unless it is made from the same inputs; or the URL of one
-        in a bucket (``s3://…``), where nothing is replaced.
+        Directory of the dataset: new, empty, or a dataset of the same options, which is replaced unless it is made from the same inputs;
+        or the URL of one in a bucket (``s3://…``), where nothing is replaced.
     store
         Where runs and maps are kept.
     split
@@ -191,12 +194,14 @@ def build_dataset(
         Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
     redact
         For the public: everything is moved by one offset that is kept nowhere, and no log, topic, path, host or user is named.
+    force
+        Replace a dataset that was made with other options: another recipe, region, map, robot, format or other tags.
     dry_run
         Choose the runs, look whether there is something to do, and estimate what it takes; write nothing.
 
     Raises
     ------
-    DatasetError, RegionError, MapError, StoreError, RecipeError
+    DatasetError, RegionError, MapError, StoreError, RecipeError, UsageError
         Nothing is written then.
     """
     watch, ruling = started(), _ruling(recipe, holdout=holdout, seed=seed)
@@ -222,6 +227,8 @@ def build_dataset(
         covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
     )
     inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if redact else inputs
+    keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
+    options = BuildOptions(ruling, regions, tags or {}, file_format, redact, keep_split is not None, keeps_own)
     problems, warnings = _left_out(
         inputs,
         None if known is not None and known.redaction else known,
@@ -233,15 +240,31 @@ def build_dataset(
     if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
         card, result = known, _result(place, "unchanged", known, problems)
     elif dry_run:
+        _refuse_other_options(place, known, options, inputs, force=force)
         if isinstance(place, str):
             refuse_others(open_place(place), CARD)
         return _planned(place, opened, inputs, jobs=jobs)
     else:
+        _refuse_other_options(place, known, options, inputs, force=force)
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
-        with whole as directory, _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers:
+        begun = begun_call(opened, BUILD, [_absolute(place)])
+        with (
+            begun,
+            whole as directory,
+            _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers,
+        ):
             card = _build(
-                directory, inputs, ruling, regions, earlier, file_format=file_format, workers=workers, redact=redact
+                directory,
+                inputs,
+                ruling,
+                regions,
+                earlier,
+                file_format=file_format,
+                workers=workers,
+                redact=redact,
+                tags=options.tags,
             )
+            _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
         for entry in workers.waiting.entries():
             workers.waiting.delete(entry.name)
         result = _result(place, "done", card, problems)
@@ -250,6 +273,27 @@ def build_dataset(
         if known is not None and known.inputs != inputs.digest:
             _note(opened, "replaced", DatasetReplaced(_lasting(result), known.inputs))
     return result
+
+
+def _refuse_other_options(
+    place: Path | str, known: DatasetCard | None, options: BuildOptions, inputs: Inputs, *, force: bool
+) -> None:
+    """Raise `UsageError`, a line for each difference, where a dataset of other options would be replaced unasked."""
+    if known is None or known.inputs == inputs.digest or (force and isinstance(place, Path)):
+        return
+    if others := find_other_options(known, options, inputs):
+        what = "it was made with other options, and stays; give another OUT, or replace it with --force"
+        if isinstance(place, str):
+            what = "is there already; what lies in a bucket is not replaced: give another place. It was made with other options"
+        raise UsageError(f"{place}: {what}", *(f"{place}: {line}" for line in others))
+
+
+def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> None:
+    """Raise `StoreError` where another call has put a dataset in this place since; in a bucket the first wins anyway."""
+    if isinstance(place, Path) and (place / CARD).is_file() and read_card(place, proved=False).inputs not in expected:
+        raise StoreError(
+            f"{place}: another call has built a dataset here meanwhile, which stays; run the command again"
+        )
 
 
 def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> BuildResult:
@@ -280,7 +324,11 @@ def _note(store: Store, kind: str, fact: DatasetMade | DatasetReplaced) -> None:
 
 def _lasting(result: BuildResult) -> str:
     """Return where a dataset lies, wherever that is asked from."""
-    return result.path if is_url(result.path) else str(Path(result.path).absolute())
+    return _absolute(result.path)
+
+
+def _absolute(place: Path | str) -> str:
+    return str(place).rstrip("/") if is_url(place) else str(Path(place).absolute())
 
 
 def _left_out(
@@ -358,7 +406,11 @@ def _card_in_place(place: Path) -> tuple[DatasetCard | None, bool]:
         raise UsageError(f"{place}: is a file, wanted a directory for the dataset; give another OUT")
     if not (place / CARD).is_file():
         raise UsageError(f"{place}: exists and is no dataset (it has no {CARD}); it is left alone; give another OUT")
-    card, proved = read_card(place, proved=False), True
+    try:
+        card, proved = read_card(place, proved=False), True
+    except DatasetError as error:
+        left = f"{place}: is left alone, since nobody can tell what it was made of; move it away or give another OUT"
+        raise DatasetError(*error.problems, left) from None
     try:
         read_current_card(place)
     except DatasetError as error:
@@ -399,6 +451,7 @@ def _build(
     file_format: FileFormat,
     workers: Workers,
     redact: bool,
+    tags: Mapping[str, str],
 ) -> DatasetCard:
     """Write the dataset into ``directory`` and return its card."""
     waiting = directory / SPOOL
@@ -433,6 +486,7 @@ def _build(
         regions=regions,
         balance=balance,
         shards=shards,
+        tags=tags,
     )
     card = card if redaction is None else redacted_card(card, redaction)
     spool, schema = content.spool, content.samples.schema

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypedDict
@@ -70,6 +70,7 @@ def dataset_card(
     regions: Regions | None,
     balance: Balance,
     shards: Sequence[Shard],
+    tags: Mapping[str, str],
 ) -> DatasetCard:
     """Return the card without checksums; ``samples`` has the `CARD_COLUMNS` of every sample, and `physics.PHYSICS_COLUMNS`."""
     about, drawn, classes = recipe.dataset, content.drawn, content.sources[0].classes
@@ -104,6 +105,7 @@ def dataset_card(
         removal=content.removal,
         balance=balance,
         runs=runs,
+        run_tags=tags,
         maps=tuple(map(_map_source, content.sources, inputs.map_sha256, content.registrations)),
         problems=inputs.problems,
         warnings=content.warnings,

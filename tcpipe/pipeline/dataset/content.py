@@ -27,6 +27,7 @@ from tcpipe.pipeline.dataset.sampling import Spool, Workers, sample_all_segments
 from tcpipe.pipeline.dataset.segments import move_out, pool_segments
 from tcpipe.pipeline.dataset.splitting import Drawn, draw_splits
 from tcpipe.recipe import Recipe
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment
 from tcpipe.splits.ranking import order_ranks
 from tcpipe.splits.regions import Regions
@@ -271,7 +272,7 @@ def _why_uncertain(segments: pa.Table, lost_m: Mapping[Loss, float], inputs: Inp
     known_m = float(np.median(floats(segments, "position_std_m")))
     how_sure = (
         f"positions are known to {known_m:.2f} m (median standard deviation), wanted {recipe.sample.max_position_std_m:g} m: mend what "
-        "follows, or accept patches that lie so far off: [sample] max_position_std_m in the recipe"
+        f"follows, or accept patches that lie so far off ({recipe_key('sample.max_position_std_m')})"
     )
     return [how_sure, *findings_in_words(findings_of_runs(inputs.sources))]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
@@ -17,9 +17,11 @@ from pyproj import Transformer
 from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard, MapSource, Redacted
 from tcpipe.formats.geojson import FeatureCollection, PolygonGeometry
-from tcpipe.pipeline.dataset.content import Content
+from tcpipe.formats.parquet import ROWS_PER_GROUP
+from tcpipe.pipeline.dataset.content import Content, SampleTable
 from tcpipe.pipeline.dataset.inputs import Inputs
 from tcpipe.recipe import Recipe
+from tcpipe.splits.audit import HeldOut
 from tcpipe.tables.columns import floats, lonlat_deg
 
 PLANE = "+proj=tmerc +lat_0=0 +lon_0=0 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +type=crs"
@@ -34,10 +36,15 @@ _PLACE_M, _PLACE_DIGITS_DEG = 0.01, 7
 _REDACTED_WITHIN_M = 0.1
 """Of lon and lat lie x and y of a redacted dataset."""
 
+_SCALE_VARIES = 2e-5
+"""With height and place, about the mean that all are divided by."""
+
+_MOST_SCALE = 0.005
+"""Of a metre of the maps' plane to one of the ground, from 1: beyond, the maps' own pixels would tell it."""
+
 _ENDS, _AXES = ("start", "end"), ("lon", "lat")
-_PLACES = re.compile(r"\b[\w.+-]+@[\w.-]+|(?<![\w/])(?:[A-Za-z]:(?=\\)|[a-z]\w*:/)?[~.]{0,2}[/\\][\w./\\~@%+-]+")
-"""Users at hosts; paths, topics and URLs."""
-_HIDDEN = "…"
+_NOT_COPIED = "not copied into the redacted dataset"
+_COUNT = re.compile(rf"(\d+ texts? )?{_NOT_COPIED}")
 
 Floats = NDArray[np.float64]
 
@@ -50,15 +57,16 @@ class Redaction:
     map_crs: str
     origin_xy_m: tuple[float, float]
     """Of the maps' plane: it becomes 0, 0."""
+    scale: float
+    """Metres of the maps' plane to a metre of ``chord_m``, which has none of its plane."""
     height_m: float
     """What is taken from heights of the maps."""
     runs: Mapping[str, str]
     maps: Mapping[str, str]
 
     def in_plane(self, lonlat_deg: Floats) -> Floats:
-        """Return where places (lon, lat) [deg], shape (..., 2), lie in the maps' plane, from its new origin [m]."""
-        to_map = _between(self.gnss_crs, self.map_crs)
-        return np.stack(to_map.transform(lonlat_deg[..., 0], lonlat_deg[..., 1]), axis=-1) - self.origin_xy_m
+        """Return where places (lon, lat) [deg], shape (..., 2), lie from the new origin, along the maps' grid, in metres of ground."""
+        return (_in_map_plane(lonlat_deg, self.gnss_crs, self.map_crs) - self.origin_xy_m) / self.scale
 
     def placed(self, lonlat_deg: Floats) -> Floats:
         """Return where places (lon, lat) [deg], shape (..., 2), are said to lie."""
@@ -95,16 +103,37 @@ class Redaction:
             samples = samples.set_column(samples.schema.get_field_index(name), field, pa.array(values, field.type))
         return samples
 
-    def text(self, line: str) -> str:
-        """Return a line without names of runs and maps, paths, topics, hosts and users."""
-        for name, told in sorted({**self.runs, **self.maps}.items(), key=lambda of: -len(of[0])):
-            line = re.sub(rf"(?<!\w){re.escape(name)}(?!\w)", lambda _, told=told: told, line)  # type: ignore[misc]
-        return _PLACES.sub(_HIDDEN, line)
-
 
 @cache
 def _between(source: str, target: str) -> Transformer:
     return Transformer.from_crs(source, target, always_xy=True)
+
+
+def _in_map_plane(lonlat_deg: Floats, gnss_crs: str, map_crs: str) -> Floats:
+    to_map = _between(gnss_crs, map_crs)
+    return np.stack(to_map.transform(lonlat_deg[..., 0], lonlat_deg[..., 1]), axis=-1)
+
+
+def _scale(samples: SampleTable, gnss_crs: str, map_crs: str) -> float:
+    """Return how long a metre of chords is in the maps' plane, by least squares over all samples.
+
+    Raises
+    ------
+    DatasetError : so far from 1 that the extent of the maps in pixels would tell it.
+    """
+    plane_chord = chord_chord = 0.0
+    for piece in samples.pieces(ROWS_PER_GROUP):
+        start, end = (_in_map_plane(lonlat_deg(piece, end), gnss_crs, map_crs) for end in _ENDS)
+        chord_m = floats(piece, "chord_m")
+        plane_chord += float(np.hypot(*(end - start).T) @ chord_m)
+        chord_chord += float(chord_m @ chord_m)
+    scale = plane_chord / chord_chord if chord_chord else 1.0
+    if abs(scale - 1.0) > _MOST_SCALE:
+        raise DatasetError(
+            f"a metre of ground is {scale:.4f} m in the maps' CRS, which would tell the latitude; add the maps in a CRS whose metres are "
+            "those of the ground, such as UTM (gdalwarp -t_srs), and build the redacted dataset with them"
+        )
+    return scale
 
 
 def _laid_down(xy_m: Floats) -> Floats:
@@ -121,9 +150,11 @@ def redaction_of(content: Content, inputs: Inputs, recipe: Recipe) -> Redaction:
             f"maps in {len(planes)} CRS cannot be redacted together; build with those of one CRS (--map)"
         )
     heights_m = content.samples.sampled.patches.columns()["height_min_m"]
+    gnss_crs, map_crs = recipe.read.gnss_crs, content.sources[0].grid.crs
     return Redaction(
-        gnss_crs=recipe.read.gnss_crs,
-        map_crs=content.sources[0].grid.crs,
+        gnss_crs=gnss_crs,
+        map_crs=map_crs,
+        scale=_scale(content.samples, gnss_crs, map_crs),
         origin_xy_m=tuple(content.samples.centres_xy_m().mean(axis=0).tolist()),
         height_m=float(math.floor(np.min(heights_m))),
         runs={run.run_id: f"run{number:04}-{run.sha256[:8]}" for number, run in enumerate(inputs.sources, 1)},
@@ -140,18 +171,14 @@ def redacted_content(content: Content, redaction: Redaction) -> Content:
 
 
 def redacted_inputs(inputs: Inputs, redaction: Redaction) -> Inputs:
-    """Return inputs whose runs are called as is told, without what their logs are called and ingest said of them."""
-    runs = tuple(
-        replace(
-            run,
-            run_id=redaction.runs[run.run_id],
-            logs=(),
-            tags=None,
-            warnings=tuple(map(redaction.text, run.warnings)),
-        )
-        for run in inputs.sources
-    )
+    """Return inputs whose runs are called as is told, without what their logs are called."""
+    runs = tuple(replace(run, run_id=redaction.runs[run.run_id], logs=(), tags=None) for run in inputs.sources)
     return replace(inputs, sources=runs)
+
+
+def _count(texts: Sequence[str]) -> tuple[str, ...]:
+    """Return how many texts there are instead of them: each may name topics, frames, hosts, users and places, in any form."""
+    return (f"{len(texts)} text{'' if len(texts) == 1 else 's'} {_NOT_COPIED}",) if texts else ()
 
 
 def redacted_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
@@ -162,18 +189,28 @@ def redacted_card(card: DatasetCard, redaction: Redaction) -> DatasetCard:
     return replace(
         card,
         recipe=bare,
-        split=replace(card.split, region=told),
+        run_tags=None,
+        split=replace(card.split, region=told, audit=tuple(_of_ground(of, redaction.scale) for of in card.split.audit)),
+        label=replace(card.label, includes=_count(card.label.includes)),
+        runs=tuple(replace(run, warnings=_count(run.warnings)) for run in card.runs),
         maps=tuple(_map(source, redaction) for source in card.maps),
-        problems=tuple(map(redaction.text, card.problems)),
-        warnings=tuple(map(redaction.text, card.warnings)),
+        problems=_count(card.problems),
+        warnings=_count(card.warnings),
+        findings=tuple(replace(finding, example=_NOT_COPIED) for finding in card.findings),
         covariates=tuple(replace(of, name=f"covariates{n}") for n, of in enumerate(card.covariates, 1)),
-        added_columns={name: redaction.text(about) for name, about in card.added_columns.items()},
+        added_columns=dict.fromkeys(card.added_columns, _NOT_COPIED),
         redaction=Redacted(),
     )
 
 
 _KEPT_SECTIONS = ("fuse", "gate", "segment", "label", "sample", "split", "covariates", "dataset")
 """Of the recipe: the others tell topics, files and robots by name."""
+
+
+def _of_ground(held: HeldOut, scale: float) -> HeldOut:
+    """Return what the audit found with its distances in metres of ground."""
+    names = [of.name for of in fields(held) if of.name.endswith("_m") and getattr(held, of.name) is not None]
+    return replace(held, **{name: getattr(held, name) / scale for name in names})
 
 
 def _map(source: MapSource, redaction: Redaction) -> MapSource:
@@ -190,7 +227,7 @@ def _map(source: MapSource, redaction: Redaction) -> MapSource:
         inputs=None,
         height_min_m=None if low is None else low - redaction.height_m,
         height_max_m=None if high is None else high - redaction.height_m,
-        warnings=tuple(map(redaction.text, source.warnings)),
+        warnings=_count(source.warnings),
     )
 
 
@@ -200,7 +237,8 @@ def _moved(polygon: PolygonGeometry, redaction: Redaction) -> PolygonGeometry:
 
 
 def redacted_features(collection: FeatureCollection, redaction: Redaction) -> FeatureCollection:
-    """Return polygons (WGS84) where they are said to lie."""
+    """Return polygons (WGS84) where they are said to lie: whole cells of the maps' plane, which divided would tell its scale."""
+    redaction = replace(redaction, scale=1.0)
     features = (replace(of, geometry=_moved(of.geometry, redaction)) for of in collection.features)
     return replace(collection, features=tuple(features))
 
@@ -229,7 +267,44 @@ def what_is_told(card: DatasetCard, samples: pa.Table) -> Iterator[str]:
     yield from (f"it is said to be redacted, but map {source.name} has the CRS {source.crs}" for source in elsewhere)
     named = [run.run_id for run in card.runs if run.logs or not re.fullmatch(r"run\d{4,}-[0-9a-f]+", run.run_id)]
     yield from (f"it is said to be redacted, but tells what the log of run {name} is called" for name in named)
-    texts = [*card.problems, *card.warnings, *(line for run in card.runs for line in run.warnings)]
-    yield from (
-        f"it is said to be redacted, but tells {found[0]!r}" for line in texts if (found := _PLACES.search(line))
-    )
+    yield from _find_revealed_scale(samples)
+    yield from (f"it is said to be redacted, but tells {text!r}" for text in _texts(card) if not _COUNT.fullmatch(text))
+
+
+def _texts(card: DatasetCard) -> Iterator[str]:
+    """Yield every text of a card that is made from texts of logs, recipes and maps."""
+    yield from (*card.problems, *card.warnings, *card.label.includes, *card.added_columns.values())
+    yield from (finding.example for finding in card.findings)
+    yield from (text for run in card.runs for text in run.warnings)
+    yield from (text for source in card.maps for text in source.warnings)
+
+
+def _find_revealed_scale(samples: pa.Table) -> Iterator[str]:
+    """Yield a line where distances of ends are not those of the chords, beyond what rounding places leaves."""
+    ratio, _, most = plane_per_chord(samples)
+    if abs(ratio - 1.0) > max(most, _SCALE_VARIES):
+        yield (
+            f"it is said to be redacted, but distances are {ratio:.6f} of chord_m: the scale of the maps' plane tells the place; "
+            "build it again"
+        )
+
+
+def plane_per_chord(samples: pa.Table) -> tuple[float, float, float]:
+    """Return how long a metre of ``chord_m`` is in x and y, the standard deviation that rounding leaves, and the most; without samples inf.
+
+    Segments that follow one another are added up: only their two outer ends are rounded.
+    """
+    samples = samples.sort_by([("run_id", "ascending"), ("start_ns", "ascending")])
+    if not samples.num_rows:
+        return 1.0, math.inf, math.inf
+    start_m, end_m = (np.stack([floats(samples, f"{end}_{axis}_m") for axis in "xy"], axis=-1) for end in _ENDS)
+    course_rad = floats(samples, "course_rad")
+    chord_m = floats(samples, "chord_m")[:, None] * np.stack([np.cos(course_rad), np.sin(course_rad)], axis=-1)
+    follows = np.hypot(*(start_m[1:] - end_m[:-1]).T) < _PLACE_M / 2
+    first = np.flatnonzero(np.concatenate([[True], ~follows]))
+    last = np.append(first[1:], len(start_m)) - 1
+    chained_m = np.add.reduceat(chord_m, first)
+    squares = float((chained_m**2).sum())
+    ratio = float(((end_m[last] - start_m[first]) * chained_m).sum()) / squares
+    most_m = math.sqrt(2.0) * _PLACE_M * float(np.hypot(*chained_m.T).sum())
+    return ratio, _PLACE_M / math.sqrt(6.0 * squares), most_m / squares

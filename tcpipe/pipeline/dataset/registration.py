@@ -13,6 +13,7 @@ from tcpipe.formats.json_files import recast
 from tcpipe.formats.maps.map_files import MapFile
 from tcpipe.formats.stored_runs import RunDirectory
 from tcpipe.recipe import Recipe
+from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.tables.columns import floats
 from tcpipe.terrain.projection import Projection
 from tcpipe.terrain.registration import Registration, register_track
@@ -117,5 +118,5 @@ def _said(registration: Registration, name: str) -> str:
     return (
         f"its ground lies {registration.shift_m:.1f} m{most} off on map {name} ({' and '.join(parts)}, ± {registration.shift_std_m:.2f} m; "
         f"shifted so, heights fit to {registration.shifted_misfit_m:.2f} m instead of {registration.misfit_m:.2f} m): check the CRS and "
-        "pixel convention of the map's rasters, and read.gnss_crs"
+        f"pixel convention of the map's rasters, and the {recipe_key('read.gnss_crs')}"
     )

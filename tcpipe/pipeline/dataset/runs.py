@@ -14,6 +14,7 @@ from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
 from tcpipe.formats.run_documents import LogOrigin, ManifestHead, RunJson
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
+from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
@@ -39,16 +40,18 @@ class Chosen:
 
 def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
-    found, key = store.ingestions(), ingest_key(recipe)
+    found, key = list_runs(store), ingest_key(recipe)
     store.keep_index(found)
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_nothing_to_pool(store, found))
     runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
     known = {run.run_id for run in mine}
+    there, lost = set(store.run_ids()), {run_id: row for (run_id, _), row in found.lost.items()}
+    gone = dict[str, str]()
     for (run_id, _), line in found.damaged.items():
-        if run_id not in known and _belongs(_known(store, run_id), robot, tags):
-            damaged.setdefault(run_id, line)
+        if run_id not in known and _belongs(_known(store, run_id) or lost.get(run_id), robot, tags):
+            (damaged if run_id in there else gone).setdefault(run_id, line)
     lines = tuple(
         f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items()
     )
@@ -56,22 +59,21 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
         raise DatasetError(*lines)
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
-    settled = {*known, *damaged}
+    settled = {*known, *damaged, *gone}
     others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.facts, robot, tags)}
     older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
     others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
-    left_out = {*damaged, *others, *older}
+    left_out = {*damaged, *gone, *others, *older}
     total = len({run.run_id for run in runs} | left_out)
-    missing, warnings = tuple(_missing(store, others, older, total)), tuple(_remarks(store, found))
+    missing = (*dict.fromkeys(gone.values()), *_missing(store, others, older, total))
+    warnings = tuple(_remarks(found))
     return Chosen(tuple(runs), logs, missing, lines, frozenset(left_out | found.superseded.keys()), warnings)
 
 
-def _remarks(store: Store, found: Ingestions) -> Iterator[str]:
+def _remarks(found: Ingestions) -> Iterator[str]:
     """Yield a line about runs that have not finished, and about those that others have taken the place of."""
-    seen = {*found.outdated, *(run.run_id for run in found.finished)}
-    unfinished = set(store.run_ids()) - seen - found.superseded.keys() - {run_id for run_id, _ in found.damaged}
-    if unfinished:
-        yield f"no ingestion of {_named(unfinished)} has finished; ingest again"
+    if found.unfinished:
+        yield f"no ingestion of {_named(found.unfinished)} has finished: it is being ingested, or its log failed"
     if found.superseded:
         yield f"superseded, since their logs were completed or repaired: {_named(found.superseded)}; left out"
 
@@ -123,7 +125,7 @@ def _nothing_to_pool(store: Store, found: Ingestions) -> list[str]:
             f"{len(found.outdated)} runs in the store, all of data model {versions}, wanted {DATA_MODEL_VERSION}; "
             "ingest their logs again"
         )
-    return [*([f"{store.root}: {head}"] if head else []), *found.damaged.values()]
+    return [*([f"{store.root}: {head}"] if head else []), *dict.fromkeys(found.damaged.values())]
 
 
 def _proved(
@@ -133,19 +135,9 @@ def _proved(
     damaged = store.prove(runs)
     logs = dict[str, LogOrigin]()
     for run in runs:
-        if run.facts.log is None:
-            damaged[run.run_id] = _wrong_with_log(store, run)
-        elif run.run_id not in damaged:
+        if run.facts.log is not None and run.run_id not in damaged:
             logs[run.run_id] = run.facts.log.source
     return [run for run in runs if run.run_id in logs], logs, damaged
-
-
-def _wrong_with_log(store: Store, run: RunDirectory) -> str:
-    try:
-        store.run_json(run.run_id)
-    except StoreError as error:
-        return error.problems[0]
-    return f"{store.runs_place.where(run.run_id)}/run-1.json: is gone"
 
 
 def _missing(store: Store, by_recipe: Mapping[str, str], by_version: Mapping[str, str], total: int) -> list[str]:

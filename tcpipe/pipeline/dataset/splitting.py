@@ -17,6 +17,7 @@ from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import DatasetCard, KeptSplit
 from tcpipe.formats.geojson import PolygonGeometry
 from tcpipe.recipe import Recipe
+from tcpipe.recipe.suggestions import recipe_key, suggested
 from tcpipe.splits.assignment import EXCLUDED, NO_FOLD, Assignment, assign_splits
 from tcpipe.splits.audit import HeldOut, audit_leakage
 from tcpipe.splits.ranking import hash_ranks
@@ -167,7 +168,7 @@ def _nothing_inside(regions: Regions, lonlat_deg: NDArray[np.float64], split: ND
     if near:
         return (
             f"the region (--split) holds no whole footprint: {near} of {len(split)} samples lie on its border or nearer "
-            "to it than the buffer; draw it larger, or lower split.buffer_m"
+            f"to it than the buffer; draw it larger, or lower the {recipe_key('split.buffer_m')}"
         )
     swapped = shapely.transform(regions.train_test, lambda lonlat: lonlat[:, ::-1])
     if shapely.intersects(swapped, points):
@@ -195,8 +196,8 @@ def empty_splits(card: DatasetCard) -> tuple[str, ...]:
             rules.holdout, "too few samples"
         )
         found.append(
-            f"no sample tests: all inside samples are {one}; try --holdout sample, or a smaller split.block_m, "
-            "or want none with split.test_fraction = 0"
+            f"no sample tests: all inside samples are {one}; try --holdout sample, or lower the {recipe_key('split.block_m')}"
+            + suggested("to want none", {"split": {"test_fraction": 0.0}})
         )
     if not counts["unseen"] and rules.region is not None:
         found.append(

@@ -26,9 +26,9 @@ def topic_times(draw) -> TopicTimes:
         )
     )
     header = np.maximum(log + errors, 0) if draw(st.booleans()) else None
-    content = draw(hnp.arrays(np.float64, (rows, 1), elements=st.sampled_from([0.0, 1.0, np.nan])))
+    content = draw(hnp.arrays(np.float64, rows, elements=st.sampled_from([0.0, 1.0, np.nan])))
     prefer = draw(st.sampled_from(["auto", "header", "log"]))
-    return TopicTimes(log, header, content, prefer, draw(st.integers(-S, S)))
+    return TopicTimes(log, header, (content,), prefer, draw(st.integers(-S, S)))
 
 
 @settings(max_examples=200, deadline=None)
@@ -58,7 +58,7 @@ def test_stamps_shuffled_within_a_second_come_back_in_order(order: np.ndarray, s
     stamps = BASE + np.arange(40) * step_ms * 1_000_000  # less than a second in all
     arrived = stamps[order]
     log = BASE + S + np.arange(40) * 1_000_000
-    found = settle_clocks({"t": TopicTimes(log, arrived, np.arange(40.0)[:, None])}).timelines
+    found = settle_clocks({"t": TopicTimes(log, arrived, (np.arange(40.0),))}).timelines
     np.testing.assert_array_equal(found["t"].stamp_ns, stamps)
     np.testing.assert_array_equal(order[found["t"].row], np.arange(40))
 
@@ -75,7 +75,7 @@ def test_a_step_is_found_where_it_is_whatever_the_jitter(step_ms: int, at_s: int
     jitter = np.random.default_rng(seed).integers(-40_000_000, 0, len(log))
     after = log >= BASE + at_s * S
     header = log + jitter + np.where(after, step_ms * 1_000_000, 0)
-    settled = settle_clocks({"t": TopicTimes(log, header, np.arange(len(log), dtype=float)[:, None])})
+    settled = settle_clocks({"t": TopicTimes(log, header, (np.arange(len(log), dtype=float),))})
     found, steps = settled.timelines, settled.steps
     assert len(steps) == 1
     assert abs(steps[0].step_s - step_ms / 1000) < 0.1

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tcpipe.cost.quality import voltage_outside
+from tcpipe.cost.quality import low_power_rate, voltage_outside
 from tcpipe.power.rails import rail, samples
 
 
@@ -15,3 +15,16 @@ def test_a_voltage_below_or_above_the_range_is_outside_and_the_ends_are_not(volt
     )
     found = voltage_outside([made], at[1:2] + 500_000_000, at[2:3] + 500_000_000, range_volt=(20.0, 30.0))
     assert found.tolist() == [outside]
+
+
+@pytest.mark.parametrize(
+    ("current_hz", "voltage_hz", "swing_volt", "slow"),
+    [(20, 20, 2.0, False), (20, 1, 0.1, False), (20, 1, 1.0, True), (5, 20, 0.1, True), (5, 1, 0.1, True)],
+)
+def test_the_rate_is_that_of_the_current_and_of_a_voltage_that_varies(current_hz, voltage_hz, swing_volt, slow):
+    def sampled(hz, values):
+        return samples((np.arange(30 * hz) * (1_000_000_000 // hz)).astype(np.int64), values(np.arange(30 * hz)))
+
+    voltage = sampled(voltage_hz, lambda i: 24.0 + swing_volt * (i % 2))
+    made = rail("drive", voltage, sampled(current_hz, lambda i: 5.0 + i % 3), averaged=False)
+    assert low_power_rate([made]) is slow

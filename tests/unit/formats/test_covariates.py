@@ -91,13 +91,17 @@ def test_two_rows_of_one_stamp_that_differ_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("text", "how", "said"),
     [
-        ("when,temp_c\n1,2\n", {}, "no column is called as one of time; name it in the recipe"),
+        ("when,temp_c\n1,2\n", {}, "no column is called as one of time; name it (recipe key covariates.time_column)"),
         ("time,date,temp_c\n1,2,3\n", {}, "2 columns tell the time (time, date)"),
-        ("time,temp_c\n1,2\n", {"time_column": "when"}, "no column 'when' ([covariates] time_column); there are time"),
+        (
+            "time,temp_c\n1,2\n",
+            {"time_column": "when"},
+            "no column 'when' (recipe key covariates.time_column); there are time",
+        ),
         (
             "time,temp_c\n17,2\n",
             {},
-            "time: its stamps (17) do not count from 1970; say what they count, one of ns, us, ms, s ([covariates] time_unit)",
+            "time: its stamps (17) do not count from 1970; say what they count, one of ns, us, ms, s (recipe key covariates.time_unit)",
         ),
         ("time,temp_c\nnoon,2\n", {}, "time is 'noon'; wanted ISO 8601"),
         ("time,temp_c\n", {}, "0 rows of 1 columns"),

@@ -1,5 +1,9 @@
 """Shards against zarr itself: what one writes, the other reads."""
 
+import json
+
+import google_crc32c
+import numcodecs
 import numpy as np
 import pytest
 import zarr
@@ -27,6 +31,21 @@ def array(directory, dtype, *, compression="zstd", shape=(70, 9, 8), fill_value=
     )
 
 
+def form(theirs):
+    """What a card would say of an array."""
+    return {
+        "shape": theirs.shape,
+        "chunk_shape": theirs.chunks,
+        "shard_shape": theirs.shards,
+        "dtype": theirs.dtype,
+        "fill": float(theirs.fill_value),
+    }
+
+
+def opened(path, theirs, **more):
+    return open_sharded(path, **form(theirs), **more)
+
+
 def values(dtype, shape=(70, 9, 8)):
     return RNG.integers(0, 200, shape).cumsum(axis=0).astype(dtype)
 
@@ -35,34 +54,34 @@ def values(dtype, shape=(70, 9, 8)):
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
 def test_zarr_reads_what_is_written_and_the_other_way_round(tmp_path, dtype, compression):
     theirs, data = array(tmp_path, dtype, compression=compression), values(dtype)
-    ours = open_sharded(tmp_path / "a.zarr" / "x")
+    ours = opened(tmp_path / "a.zarr" / "x", theirs)
     for number in range(3):
         shard = ours.path / ours.shard_name((number, 0, 0))
         shard.parent.mkdir(parents=True)
         shard.write_bytes(ours.encoded_shard(data[32 * number : 32 * number + 32], threads=2))
     np.testing.assert_array_equal(theirs[:], data)
     theirs[:] = data[::-1]
-    again = open_sharded(tmp_path / "a.zarr" / "x")
+    again = opened(tmp_path / "a.zarr" / "x", theirs)
     read = np.concatenate([again.chunk((number, 0, 0)) for number in range(9)])
     np.testing.assert_array_equal(read[:70], data[::-1])
     assert (read[70:] == 0).all()
 
 
 def test_threads_do_not_change_a_byte(tmp_path):
-    array(tmp_path, np.uint16)
-    ours, data = open_sharded(tmp_path / "a.zarr" / "x"), np.arange(32 * 72, dtype=np.uint16).reshape(32, 9, 8)
+    theirs = array(tmp_path, np.uint16)
+    ours, data = opened(tmp_path / "a.zarr" / "x", theirs), np.arange(32 * 72, dtype=np.uint16).reshape(32, 9, 8)
     assert ours.encoded_shard(data, threads=1) == ours.encoded_shard(data, threads=3)
 
 
 def test_what_zarr_leaves_out_is_fill_value(tmp_path):
     theirs = array(tmp_path, np.float32, fill_value=float("nan"))
     theirs[8:16] = 1.0
-    ours = open_sharded(tmp_path / "a.zarr" / "x", sparse=True)
+    ours = opened(tmp_path / "a.zarr" / "x", theirs, sparse=True)
     assert np.isnan(ours.chunk((0, 0, 0))).all()  # a chunk that is not in its shard
     assert (ours.chunk((1, 0, 0)) == 1.0).all()
     assert np.isnan(ours.chunk((5, 0, 0))).all()  # a shard without a file
     with pytest.raises(StoreError, match="is gone"):
-        open_sharded(tmp_path / "a.zarr" / "x").chunk((5, 0, 0))
+        opened(tmp_path / "a.zarr" / "x", theirs).chunk((5, 0, 0))
 
 
 def test_windows_of_a_plane(tmp_path):
@@ -72,7 +91,7 @@ def test_windows_of_a_plane(tmp_path):
         group, "x", shape=data.shape, dtype=np.uint8, chunks=(16, 16), shards=(48, 48), dimensions=("y", "x")
     )
     plane[:] = data
-    ours = open_sharded(tmp_path / "m.zarr" / "x")
+    ours = opened(tmp_path / "m.zarr" / "x", plane)
     for rows, cols in [((0, 16), (0, 16)), ((3, 60), (20, 77)), ((90, 120), (70, 90)), ((5, 6), (5, 6))]:
         np.testing.assert_array_equal(ours.window(*rows, *cols), data[slice(*rows), slice(*cols)])
 
@@ -89,12 +108,90 @@ def test_a_changed_byte_is_an_error_never_a_number(tmp_path, where):
         data[20 if where == "chunk" else -30] ^= 1
     file.write_bytes(data)
     with pytest.raises(StoreError, match=r"chunk \(0, 0, 0\) is damaged"):
-        open_sharded(tmp_path / "a.zarr" / "x").chunk((0, 0, 0))
+        opened(tmp_path / "a.zarr" / "x", theirs).chunk((0, 0, 0))
 
 
 def test_arrays_of_others_are_refused_in_a_line(tmp_path):
-    zarr.create_array(tmp_path / "plain.zarr", shape=(4, 4), chunks=(2, 2), dtype="u1")
-    with pytest.raises(StoreError, match="not an array that can be read"):
-        open_sharded(tmp_path / "plain.zarr")
+    plain = zarr.create_array(tmp_path / "plain.zarr", shape=(4, 4), chunks=(2, 2), dtype="u1")
+    wanted = {**form(plain), "shard_shape": (4, 4)}
+    with pytest.raises(StoreError, match=r"plain.zarr/zarr.json: chunk_grid is .*, wanted .*\[4, 4\]"):
+        open_sharded(tmp_path / "plain.zarr", **wanted)
     with pytest.raises(StoreError, match="is gone"):
-        open_sharded(tmp_path / "nothing")
+        open_sharded(tmp_path / "nothing", **wanted)
+
+
+NONSENSE = [0, "a", 1e30, 2.56e11, None, [], {}, [[]], -1, True, [1e30], {"name": "regular"}, 10**300, "\x1b[31m"]
+
+
+def changed_descriptions(described, key, value):
+    """The description with nonsense under a key, and below it."""
+    yield {**described, key: value}
+    if key == "chunk_grid":
+        for inside in (value, [value, 9, 8]):
+            yield {**described, key: {"name": "regular", "configuration": {"chunk_shape": inside}}}
+    if key == "codecs":
+        inner = described[key][0]["configuration"]
+        before, blosc, after = inner["codecs"]
+        changed = [{**inner, part: value} for part in inner]
+        if isinstance(value, str | list | dict | None):
+            settings = [{**blosc["configuration"], part: value} for part in ("cname", "clevel", "shuffle", "blocksize")]
+            changed += [{**inner, "codecs": [before, {**blosc, "configuration": of}, after]} for of in settings]
+        yield from ({**described, key: [{"name": "sharding_indexed", "configuration": of}]} for of in changed)
+
+
+@pytest.mark.parametrize("key", ["shape", "data_type", "chunk_grid", "fill_value", "codecs", "chunk_key_encoding"])
+def test_a_description_that_says_anything_else_is_refused_in_a_line(tmp_path, key):
+    theirs = array(tmp_path, np.uint16, fill_value=3)
+    path = tmp_path / "a.zarr" / "x" / "zarr.json"
+    described = json.loads(path.read_text())
+    for value in NONSENSE:
+        for document in changed_descriptions(described, key, value):
+            path.write_text(json.dumps(document))
+            with pytest.raises(StoreError, match=r"zarr.json") as caught:
+                opened(tmp_path / "a.zarr" / "x", theirs)
+            assert len(caught.value.problems) == 1
+            assert len(str(caught.value)) < 2000
+            assert "\x1b" not in str(caught.value)
+
+
+def sealed_shard(pieces):
+    """A shard of four chunks, of which each is given with its offset and size in the index, None: as it lies."""
+    body, index = b"", []
+    for data, offset, size in pieces:
+        whole = data + crc(data)
+        index += [len(body) if offset is None else offset, len(whole) if size is None else size]
+        body += whole
+    table = np.array(index, "<u8").tobytes()
+    return body + table + crc(table)
+
+
+def crc(data):
+    return google_crc32c.value(data).to_bytes(4, "little")
+
+
+@pytest.mark.parametrize("codec", [numcodecs.Blosc(cname="zstd"), numcodecs.Zstd()])
+@pytest.mark.parametrize(
+    ("length", "place", "wanted"),
+    [
+        (10, (None, None), "it holds 10 bytes, wanted 576"),
+        (500_000_000, (None, None), "it holds 500000000 bytes, wanted 576"),
+        (576, (2**63, 100), "its index names bytes beyond it"),
+        (576, (0, 2**62), "its index names bytes beyond it"),
+        (576, (0, 3), "its index names bytes beyond it"),
+        (576, (2**64 - 2, 2**63), "its index names bytes beyond it"),
+    ],
+)
+def test_a_sealed_shard_that_claims_too_much_or_too_little_is_damage(tmp_path, codec, length, place, wanted):
+    """Memory that nobody wrote to was read as pixels where a chunk held less."""
+    group = create_group(tmp_path / "a.zarr")
+    theirs = add_array(
+        group, "x", shape=(32, 9, 8), dtype=np.uint8, chunks=(8, 9, 8), shards=(32, 9, 8), dimensions=("a", "b", "c"),
+        compression="zstd" if isinstance(codec, numcodecs.Zstd) else "lz4",
+    )  # fmt: skip
+    shard = tmp_path / "a.zarr" / "x" / "c" / "0" / "0" / "0"
+    shard.parent.mkdir(parents=True)
+    shard.write_bytes(
+        sealed_shard([(codec.encode(np.zeros(length, np.uint8)), *place), *[(b"", 2**64 - 1, 2**64 - 1)] * 3])
+    )
+    with pytest.raises(StoreError, match=wanted):
+        opened(tmp_path / "a.zarr" / "x", theirs).chunk((0, 0, 0))

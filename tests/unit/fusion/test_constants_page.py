@@ -25,6 +25,7 @@ WHOLLY = (
 )
 """Modules of which every number is listed."""
 UNLISTED = {"_MAX_GAP_NS", "_GRAVITY_BAND_MPS2"}  # the recipe's default beside the recipe; a band, told in words
+UNLISTED |= {"_PIECE"}  # rows that are computed at once; no result depends on it
 UNLISTED |= {"WHEEL_SCALE_STD", "VISUAL_SCALE_STD", "FIXES_S", "DOPPLER_LASTS_S"}  # listed where they are made
 
 

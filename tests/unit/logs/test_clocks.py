@@ -15,7 +15,7 @@ def log_times(rate_hz: float = 20.0, duration_s: float = 60.0) -> np.ndarray:
 
 def times(log: np.ndarray, header: np.ndarray | None, **options) -> TopicTimes:
     content = options.pop("content", np.arange(len(log), dtype=np.float64)[:, None])
-    return TopicTimes(log, header, content, **options)
+    return TopicTimes(log, header, tuple(content.T), **options)
 
 
 def settle(**topics: TopicTimes):

@@ -1,5 +1,7 @@
 """What a message type of somebody's own could play is told by its definition, and by nothing that is of another role."""
 
+from suggested_recipes import suggestions_in
+
 from tcpipe.formats.robot_files import shipped_profiles
 from tcpipe.logs.names_of_fields import _numbers, fields_called, proposed_roles
 from tcpipe.logs.topics import Topic
@@ -38,14 +40,15 @@ def topic(
 
 def test_a_receiver_s_own_message_is_proposed_with_the_lines_of_the_recipe() -> None:
     (said,) = proposed_roles([topic("/rtk", RTK)], settled=())
-    assert '[read.topics] gnss = ["/rtk"]' in said
-    assert '[read.fields] gnss.latitude = "latitude", gnss.longitude = "longitude", gnss.altitude = "altitude"' in said
+    fields = {name: name for name in ("latitude", "longitude", "altitude")}
+    assert suggestions_in(said) == [{"read": {"topics": {"gnss": ["/rtk"]}, "fields": {"gnss": fields}}}]
 
 
 def test_fields_are_looked_for_in_the_messages_inside_a_message() -> None:
     (said,) = proposed_roles([topic("/vectornav", IMU_INSIDE)], settled=())
-    assert 'imu.angular_velocity_z = "imu.angular_velocity.z"' in said
-    assert 'imu.linear_acceleration_x = "imu.linear_acceleration.x"' in said
+    fields = suggestions_in(said)[0]["read"]["fields"]["imu"]
+    assert fields["angular_velocity_z"] == "imu.angular_velocity.z"
+    assert fields["linear_acceleration_x"] == "imu.linear_acceleration.x"
 
 
 def test_nothing_is_proposed_for_what_is_played_or_cannot_be_read_or_lacks_a_field() -> None:

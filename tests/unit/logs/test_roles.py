@@ -262,7 +262,7 @@ def test_a_log_without_motion_says_so_in_three_lines_and_how_to_use_what_was_lef
     found = assign(("/odometry/filtered", ODOMETRY), ("/imu", IMU), ("/chatter", "std_msgs/msg/String"))
     assert len(found.problems) == 3
     assert found.problems[0].startswith("nothing in the log tells motion")
-    assert '[read.topics] wheel_odometry = ["/odometry/filtered"]' in found.problems[1]
+    assert '[read.topics]: wheel_odometry = ["/odometry/filtered"]' in found.problems[1]
     assert "/chatter (std_msgs/msg/String" in found.problems[2]
     assert len(assign(("/chatter", "std_msgs/msg/String")).problems) == 2
     assert len(assign_roles([topic("/odom", ODOMETRY, count=0)], {}).problems) == 2, "an empty topic is no way out"

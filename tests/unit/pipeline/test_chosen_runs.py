@@ -35,7 +35,7 @@ def store(tmp_path):
 
 
 def runs(store, tmp_path, **tags):
-    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tags=tags)
+    build_dataset(tmp_path / "out", store=store.root, recipe=Recipe(), tags=tags, force=True)
     return [run.run_id for run in open_dataset(tmp_path / "out").card.runs]
 
 
@@ -74,7 +74,7 @@ def test_runs_of_another_data_model_are_named(store, tmp_path):
     assert (found.outdated, found.unfinished) == ({"a": "0.9"}, ())
     with pytest.raises(
         StoreError,
-        match=rf"runs/a: holds no finished ingestion of data model {DATA_MODEL_VERSION}; ingest its log again",
+        match=rf"runs/a: holds no finished run of data model {DATA_MODEL_VERSION}; ingest its log again",
     ):
         report(store.root / "runs" / "a")
 
@@ -118,7 +118,7 @@ def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_ho
     assert kept.stays.startswith(f"a dataset that lay at {out} refers to it; remove ")
     shutil.rmtree(out)
     (tmp_path / "moved").rename(out)
-    build_dataset(out, store=store.root, recipe=Recipe())
+    build_dataset(out, store=store.root, recipe=Recipe(), force=True)
     assert len(prune(store=store.root, recipe=Recipe(), dry_run=True).removed) == 1
 
 

@@ -63,7 +63,7 @@ def test_what_is_built_over_another_is_what_is_built_anew(places, tmp_path, key)
     directory, store = places
     recipe = with_value(Recipe(), key, OTHER[key])
     shutil.copytree(directory / "usual", tmp_path / "over")
-    build_dataset(tmp_path / "over", store=store.root, recipe=recipe)
+    build_dataset(tmp_path / "over", store=store.root, recipe=recipe, force=True)
     build_dataset(tmp_path / "anew", store=store.root, recipe=recipe)
     assert tree(tmp_path / "over") == tree(tmp_path / "anew")
     assert tree(tmp_path / "over") != tree(directory / "usual")

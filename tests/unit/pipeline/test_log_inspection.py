@@ -172,6 +172,18 @@ def test_power_that_is_too_slow_for_a_metre_is_said_with_what_sets_its_rate(tmp_
         assert "diagnostic_frequency of husky_base" in lines[0]
 
 
+def test_a_voltage_of_its_own_may_be_slow(tmp_path):
+    streams = [
+        MessageStream(
+            f"/battery/{name}", "std_msgs/msg/Float32", START_NS + np.arange(0, 10**10, step_ns), {"data": value}
+        )
+        for name, step_ns, value in (("voltage", 10**9, np.full(10, 25.0)), ("current", 10**9 // 20, np.full(200, 4.0)))
+    ]
+    found, topics = inspected(tmp_path / "a.mcap", streams)
+    assert topics["/battery/voltage"].role == topics["/battery/current"].role == "power"
+    assert not [line for line in found.warnings if "too slowly" in line]
+
+
 def test_a_topic_that_plays_two_roles_names_both(tmp_path):
     log_ns = START_NS + np.arange(20) * 10**9
     columns = {"sentence": np.full(20, "$GPGGA,", "S")}

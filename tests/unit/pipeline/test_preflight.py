@@ -33,7 +33,7 @@ def test_sensors_that_nothing_places_want_transforms_recorded():
         "imu: late",
     ]
     assert list(_unplaced(lines)) == [
-        "gnss, imu: no /tf_static tells where they sit: record it, or say it under [read.placement]"
+        "gnss, imu: no /tf_static tells where they sit: record it, or say it (recipe key read.placement)"
     ]
     assert list(_unplaced(lines[2:])) == []
 

@@ -96,11 +96,11 @@ def test_a_run_that_is_not_as_it_was_written_is_named_and_left_out(store, damage
     assert (again.status, again.problems) == ("unchanged", (line,)), "damage is told until it is mended"
 
 
-def test_a_run_that_lost_its_manifest_is_unfinished(store):
+def test_a_run_that_lost_its_manifest_is_left_out_and_named(store):
     manifest(store.recipes_of("b")[0]).unlink()
     result = build(store)
-    assert runs(store) == ["a", "c", "d"]
-    assert any("b" in line and "ingest" in line for line in result.warnings)
+    assert (result.exit_code, runs(store)) == (3, ["a", "c", "d"])
+    assert result.problems[0].startswith(f"run b: left out: {store.root / 'runs' / 'b'}: has no manifest-<n>.json")
 
 
 def test_a_manifest_of_another_run_is_not_believed_though_its_seal_is_whole(store):
@@ -149,15 +149,26 @@ def test_runs_that_have_to_be_ingested_again_are_told_each_time_unless_so_many_a
     assert runs(store) == ["a"]
 
 
-def test_runs_of_the_dataset_before_that_are_gone_are_told_once(store):
+def test_runs_that_are_gone_are_told_until_the_index_goes_too(store):
     build(store)
     shutil.rmtree(store.root / "runs" / "c")
-    assert build(store).problems == ("1 of the 4 runs of the dataset that is replaced are no longer in the store: c",)
+    for _ in range(2):
+        (line,) = build(store).problems
+        assert line.startswith(f"{store.root / 'runs'}: 1 run is gone that the index knows: c; copy the store again")
+    shutil.rmtree(store.root / "index")
     assert build(store).exit_code == 0
     shutil.rmtree(store.root / "runs" / "d")
     result = build(store, min_runs=2)
     assert result.exit_code == 0
-    assert any("no longer in the store: d" in line for line in result.warnings)
+    assert any("1 run is gone that the index knows: d" in line for line in result.warnings)
+
+
+def test_runs_of_the_dataset_before_that_the_store_no_longer_knows_are_told_once(store):
+    build(store)
+    for name in ("runs/c", "index"):
+        shutil.rmtree(store.root / name)
+    assert build(store).problems == ("1 of the 4 runs of the dataset that is replaced are no longer in the store: c",)
+    assert build(store).exit_code == 0
 
 
 def test_a_run_that_another_has_taken_the_place_of_is_not_gone(store):
@@ -171,11 +182,11 @@ def test_a_run_that_another_has_taken_the_place_of_is_not_gone(store):
 def test_what_a_user_leaves_out_by_choice_is_no_problem(store):
     store.tag_run("d", {"weather": "wet"})
     build(store)
-    assert build(store, tags={"weather": "wet"}).exit_code == 0
+    assert build(store, tags={"weather": "wet"}, force=True).exit_code == 0
     add_run(store, "e", segments("e", *lanes(14.0, -10.0, 10.0), robot="warthog"))
     under_another_recipe(store, "c")
-    assert build(store, robot="warthog").exit_code == 0
-    assert build(store, robot="husky").exit_code == 3
+    assert build(store, robot="warthog", force=True).exit_code == 0
+    assert build(store, robot="husky", force=True).exit_code == 3
 
 
 @pytest.mark.parametrize(

@@ -97,7 +97,7 @@ def test_the_card_names_the_maps_in_their_order_and_a_second_call_does_nothing(s
     assert [entry.name for entry in card.maps] == ["east", "west"]
     assert [entry.crs for entry in card.maps] == ["EPSG:31256", "EPSG:32633"]
     assert build(store, tmp_path / "out", ["east", "west"]).status == "unchanged"
-    assert build(store, tmp_path / "out", ["west", "east"]).status == "done"
+    assert build(store, tmp_path / "out", ["west", "east"], force=True).status == "done"
 
 
 @pytest.mark.parametrize("order", [("west", "east"), ("east", "west")])

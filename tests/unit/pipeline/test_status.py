@@ -209,8 +209,7 @@ def test_a_run_whose_log_s_document_is_gone_is_named_and_asked_for_again(first_n
         "its run is not as it was written",
         (str(first_night / "logs" / "whole.mcap"),),
     )
-    name = gone.parent.name
-    assert found.problems == (f"run {name}: its run-<n>.json is gone, or not as it was written; ingest its log again",)
+    assert found.problems == (f"{gone}: is gone; ingest the log again",)
     assert found.exit_code == 3
 
 
@@ -251,3 +250,32 @@ def test_a_small_call_tells_little_of_a_million_samples():
     assert 100.0 < found.wall_s < 300.0, "185 s (docs/explanation/scale.md); 7,400 s in proportion"
     assert found.written_bytes < 5e9
     assert calls.estimate([small], "build-dataset", 312, jobs=8).wall_s == pytest.approx(1.5, abs=0.1)
+
+
+def test_a_drive_without_a_segment_is_news_once_and_can_be_accepted(tmp_path):
+    drive_at(tmp_path / "logs" / "drive.mcap")
+
+    def run(*words):
+        return CliRunner().invoke(cli, words, standalone_mode=False)
+
+    os.utime(tmp_path / "logs" / "drive.mcap", ns=(OLD_NS, OLD_NS))
+    (tmp_path / "tcpipe.toml").write_text("[segment]\nchord_m = 900.0\n")  # no drive here is as long
+    how = ["--store", str(tmp_path / "store"), "--recipe", str(tmp_path / "tcpipe.toml")]
+    ingest_it = ["ingest", str(tmp_path / "logs"), *how]
+    first = run(*ingest_it)
+    assert first.return_value == 3, first.output
+    empty, why = [line for line in first.output.splitlines() if line.startswith(("empty ", "  no segment "))]
+    assert empty.startswith("empty ")
+    assert why.strip().startswith("no segment from ")
+    assert " m driven: " in why
+    again = run(*ingest_it)
+    assert again.return_value == 0
+    assert "(empty, known)" in again.output
+    shown = run("status", *how)
+    assert (shown.return_value, "1 empty" in shown.output) == (3, True)
+    (run_id,) = Store(tmp_path / "store").run_ids()
+    accepted = run("accept", run_id, *how[:2])
+    assert "(empty)" in accepted.output
+    shown = run("status", *how)
+    assert (shown.return_value, "done, empty, accepted" in shown.output) == (0, True)
+    assert run(*ingest_it).return_value == 0

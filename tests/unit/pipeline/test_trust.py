@@ -1,6 +1,7 @@
 """Datasets and stores that are verified, explained and compared: damage of every kind is found, and causes are named."""
 
 import json
+import os
 import shutil
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from tcpipe.errors import DatasetError, UsageError
 from tcpipe.formats.maps.map_facts import MapInputs
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.numbered import read_as_at
+from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import MapDocument
 from tcpipe.formats.seals import broken_seal, file_checksum, seal_of, sealed_page, write_sealed
@@ -211,7 +213,7 @@ def test_damage_of_a_map_is_found_and_hides_nothing_else(copy):
     assert any("height, rows 0" in problem for problem in verify(layers).problems)
     assert any("ortho covers 0.000000%" in problem for problem in verify(layers).problems)
     problems = verify(store).problems
-    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is gone", "north: holds no finished ingestion"):
+    for words in ("height/c/0/0: its sha256", "ortho/c/0/0: is gone", "north: holds no finished run"):
         assert any(words in problem for problem in problems), words
 
 
@@ -413,3 +415,51 @@ def test_the_shift_of_labels_is_that_of_scipy(made, copy, tmp_path):
     a, b = (open_dataset(path)["train"].samples["power_watt"].to_numpy() for path in (made / "zarr", tmp_path / "b"))
     assert found.labels_of_train["power_watt"]["largest_gap"] == pytest.approx(ks_2samp(a, b).statistic)
     assert any(line.startswith("power_watt in train: mean ") for line in str(found).splitlines())
+
+
+@pytest.mark.parametrize("name", ["zarr", "parquet"])
+def test_a_shard_of_another_build_is_refused_though_its_own_checksums_agree(copy, made, name, tmp_path):
+    """A folder that was copied in part over an older build trained a model without a word."""
+    region = region_file(tmp_path / "region.geojson", box(-20, -20, 5, 20))
+    other = replace(Recipe(), split=replace(Recipe().split, seed=7), sample=replace(Recipe().sample, patch_m=4.5))
+    build_dataset(tmp_path / "other", store=made / "store", split=region, recipe=other, file_format=name)
+    half = copy(name)
+    shard = "patches.zarr/height/c/0/0/0" if name == "zarr" else "data/train-00000-of-00001.parquet"
+    shutil.copyfile(tmp_path / "other" / shard, half / shard)
+    with pytest.raises(
+        DatasetError, match=rf"{shard}: .*not of the build that .*dataset.json tells of; copy the whole"
+    ):
+        open_dataset(half)
+    shutil.copyfile(made / name / shard, half / shard)
+    assert len(open_dataset(half)["train"].patches)
+
+
+def test_a_digest_is_found_once_until_the_file_changes(copy, monkeypatch, tmp_path):
+    monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "cache"))
+    dataset, hashed = copy("zarr"), []
+    whole = DirectoryPlace.checksum
+    monkeypatch.setattr(DirectoryPlace, "checksum", lambda place, name: hashed.append(name) or whole(place, name))
+    open_dataset(dataset)
+    shards = sorted(hashed)
+    layers = [f"patches.zarr/{layer}/c/0/0/0" for layer in ("height", "ortho", "terrain")]
+    assert shards == sorted([*layers, "patches.zarr/sample_id/c/0"])
+    for _ in range(2):
+        open_dataset(dataset)
+    assert sorted(hashed) == shards
+    path = dataset / shards[0]
+    seen = path.stat()
+    flip(path)
+    os.utime(path, ns=(seen.st_atime_ns, seen.st_mtime_ns))
+    with pytest.raises(DatasetError, match="its sha256 is"):
+        open_dataset(dataset)
+    for memo in (tmp_path / "cache").rglob("*"):
+        if memo.is_file():
+            memo.write_text("")
+    flip(path)
+    assert open_dataset(dataset)
+
+
+def test_without_a_cache_every_opening_hashes_and_none_fails(copy, monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TCPIPE_CACHE", str(tmp_path / "file" / "below"))
+    assert open_dataset(copy("zarr"))

@@ -96,7 +96,7 @@ def test_sums_are_of_the_ruling_recipe_without_superseded_runs(store):
 
 def test_what_failed_is_named_until_its_content_gives_a_run_or_a_person_accepts_it(store):
     _, html, *_ = shown(store)
-    part = html.split("<h2>Failed and damaged</h2>")[1].split("</section>")[0]
+    part = html.split("<h2>Failed, damaged and empty</h2>")[1].split("</section>")[0]
     assert "is no log" in part
     assert "failed for what it holds" in part
     assert "passing.mcap" in part

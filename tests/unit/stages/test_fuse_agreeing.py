@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from tcpipe.errors import FusionError
 from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
 from tcpipe.recipe import FuseConfig
@@ -42,11 +43,13 @@ def fusing(monkeypatch):
     """Fuse by a table: what the audit says of each set of sensors; all others are contradicted."""
     tried = []
 
-    def put(told):
+    def put(told, lost=()):
         def fuse(given, *_):
             (heard,) = given.measurements.values()
             tried.append(frozenset(heard.sensors()))
-            return Fused(tallies=told.get(tried[-1], contradicted(15)))
+            tallies = told.get(tried[-1], contradicted(15))
+            astray = 12 if tried[-1] in lost else 0
+            return Fused(found=[None], tallies=tallies, windows=20, astray=astray)
 
         monkeypatch.setattr(fuse_agreeing, "fuse_stretches", fuse)
         monkeypatch.setattr(fuse_agreeing, "fuse_mounted", lambda given, *rest: (given, fuse(given, *rest)))
@@ -72,7 +75,7 @@ def test_one_that_is_alone_in_most_of_the_way_is_left_out(fusing):
     assert sensors == set(ROLES) - {"gnss"}
     assert len(tried) == 2 + len(ROLES)
     assert "/gnss is not fused: in most of the way the others contradict it" in sanity.warnings[0]
-    assert sanity.warnings[0].endswith('[read]: ignore_topics = ["/gnss"]')
+    assert sanity.warnings[0].endswith("[read.topics]: gnss = []")
 
 
 def test_fixes_against_one_odometry_are_left_out_without_being_blamed(fusing):
@@ -83,7 +86,7 @@ def test_fixes_against_one_odometry_are_left_out_without_being_blamed(fusing):
     assert sensors == {"imu", "wheel_odometry"}
     assert sanity.facts.refused["gnss"].endswith("; or wheel_odometry errs: nothing else tells how far the robot goes")
     assert sanity.warnings[0].endswith(
-        'to leave wheel_odometry out instead, write in the recipe under [read]: ignore_topics = ["/wheel_odometry"]'
+        "to leave wheel_odometry out instead, write in the recipe under [read.topics]: wheel_odometry = []"
     )
 
 
@@ -122,3 +125,29 @@ def test_of_two_sensors_nobody_can_tell_and_nothing_is_tried(fusing):
     sensors, _ = agreed(inputs(visual=False, imu=False))
     assert sensors == {"gnss", "wheel_odometry"}
     assert len(tried) == 1
+
+
+@pytest.mark.parametrize("visual", [True, False])
+def test_of_a_track_that_goes_astray_the_imu_is_tried_first(fusing, visual):
+    roles = frozenset(ROLES) if visual else frozenset(ROLES) - {"visual_odometry"}
+    fusing({roles: contradicted(0)}, lost=[roles])
+    sensors, sanity = agreed(inputs(visual=visual))
+    assert sensors == roles - {"imu"}
+    assert "the track moves otherwise than every sensor says" in sanity.facts.refused["imu"]
+
+
+def test_a_track_that_goes_astray_without_its_imu_too_is_mended_by_the_only_other_that_does(fusing):
+    roles = frozenset(ROLES)
+    lost = [roles, *(roles - {role} for role in ("imu", "gnss", "wheel_odometry"))]
+    fusing({roles: contradicted(0)}, lost=lost)
+    assert agreed(inputs())[0] == roles - {"visual_odometry"}
+    fusing({roles: contradicted(0)}, lost=lost[:-1])  # either of two: nobody can tell
+    with pytest.raises(FusionError):
+        agreed(inputs())
+
+
+def test_a_track_that_goes_astray_whatever_is_left_out_is_refused(fusing):
+    roles = frozenset(ROLES)
+    fusing({roles: contradicted(0)}, lost=[roles, *(roles - {role} for role in roles)])
+    with pytest.raises(FusionError, match=r"in 60% of the run .* \(recipe key read.topics"):
+        agreed(inputs())

@@ -1,9 +1,7 @@
 """What a person reads of the audit: one line for each sensor and thing, and why a run has no segments."""
 
-import tomllib
-
 import numpy as np
-import pytest
+from suggested_recipes import suggestions_in
 
 from tcpipe.fusion.checks.audit import Tally
 from tcpipe.fusion.measurements import BodyVelocities, Measurements
@@ -54,7 +52,7 @@ def test_a_run_that_no_third_decides_says_why_it_has_no_segments():
     (line,) = told.warnings
     assert line.startswith("displacement by wheel_odometry: in most of the way the track is not what this sensor says")
     assert "no segments" in line
-    assert "ignore_topics" in line
+    assert suggestions_in(line) == [{"read": {"topics": {"wheel_odometry": []}}}]
 
 
 def wheels_alone(speed_mps):
@@ -76,5 +74,6 @@ def test_wheels_faster_than_any_command_bear_no_segment_where_nothing_else_tells
     assert told.facts.undecided == ("wheel_odometry",)
     (line,) = told.warnings
     assert "1.25 times as fast as commanded" in line
-    entry = tomllib.loads(line.split("under [read]: ")[1].split(" (or less")[0])
-    assert entry["odometry_scale"] == {"wheel_odometry": pytest.approx(0.8)}
+    scale, without = suggestions_in(line)
+    assert scale == {"read": {"odometry_scale": {"wheel_odometry": 0.8}}}
+    assert without == {"read": {"topics": {"command": []}}}

@@ -69,7 +69,7 @@ def test_nothing_is_said_where_nothing_is_odd():
 def test_refusals_are_told_beyond_a_fifth(rejected, said):
     lines = warned(FusionInputs(PLACE), stretch(measurements={"gnss": 10}, rejected={"gnss": rejected}))
     assert any(f"gnss: {rejected} of 10 measurements were refused" in line for line in lines) == said
-    assert any("leave it out: [read.topics] gnss = []" in line for line in lines) == said
+    assert any("leave it out, write in the recipe under [read.topics]: gnss = []" in line for line in lines) == said
 
 
 @pytest.mark.parametrize(("common", "said"), [(None, None), (0.02, None), (0.03, "3%")])

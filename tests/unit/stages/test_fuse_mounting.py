@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from suggested_recipes import suggestions_in
 
 from tcpipe.fusion.checks.mounting import Arm, ArmEvidence, Tilt, TiltEvidence
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, Measurements, Positions
@@ -123,5 +124,5 @@ def test_a_scale_that_is_off_throughout_is_taken_out_and_the_recipe_line_states_
     told = mounting_findings(found, replace(log, findings=given))
     assert told.facts.odometry_scale == {"wheel_odometry": pytest.approx(1.3)}
     (line,) = told.warnings
-    entry = tomllib.loads(line.rsplit("under [read]: ", 1)[1])["odometry_scale"]
+    entry = suggestions_in(line)[0]["read"]["odometry_scale"]
     assert entry == {"wheel_odometry": pytest.approx(0.5 / 1.3, rel=1e-3)}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from made_tracks import make_track, stamps, straight_track
 
+from tcpipe.errors import FusionError
 from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.gate import gate_track
 from tcpipe.stages.segment import segment_track
@@ -81,7 +82,7 @@ def test_below_the_limit_unless_it_is_unknown_or_allowed():
     assert not rows_of(gate(track, config=GateConfig(require_full_speed=False)), DropReason.BELOW_LIMIT).any()
     unknown = gate(track, limit_mps=None)
     assert not rows_of(unknown, DropReason.BELOW_LIMIT).any()
-    assert "gate.max_velocity_mps" in unknown.info.findings.warnings[0]
+    assert "under [gate]: max_velocity_mps = " in unknown.info.findings.warnings[0]
     assert not rows_of(gate(track, config=GateConfig(max_velocity_mps=0.7)), DropReason.BELOW_LIMIT).any()
     assert "100% of the moving track" in gate(track).info.findings.warnings[0]
 
@@ -123,6 +124,7 @@ def test_a_jump_is_a_gap_and_not_driven():
         "uncertain": 0,
         "jumps": 2,
         "contradicted": 0,
+        "implausible": 0,
     }
     assert "jumps 1 times, the furthest by 1000000.0 m" in gated.info.findings.warnings[0]
     segments = segment_track(gated, SegmentConfig())
@@ -136,7 +138,7 @@ def test_relative_not_absolute_position_error_makes_a_gap():
     assert not rows_of(far_off, DropReason.GAP).any()
     unsure = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.12))
     assert rows_of(unsure, DropReason.GAP).all()
-    assert "is not known to 0.1 m (gate.max_relative_position_std_m)" in unsure.info.findings.warnings[0]
+    assert "is not known to 0.1 m (recipe key gate.max_relative_position_std_m)" in unsure.info.findings.warnings[0]
 
 
 def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
@@ -171,3 +173,26 @@ def test_an_empty_track_and_one_row():
     for count in (0, 1):
         nothing = np.zeros((count, 3))
         assert gate(make_track(nothing, nothing, stamp_ns=stamps(count))).table.num_rows == count
+
+
+def test_a_track_faster_than_plausible_bears_no_segment_there():
+    speed = np.where((T > 20) & (T < 30), 40.0, 0.9)
+    gated = gate(straight_track(speed))
+    segments = segment_track(gated, SegmentConfig())
+    assert segments.table.num_rows > 30
+    spans_s = (segments.table["end_ns"].to_numpy() - segments.table["start_ns"].to_numpy()) * 1e-9
+    assert (segments.table["chord_m"].to_numpy() / spans_s).max() < 2.0
+    assert gated.info.findings.facts.gate.gap_rows["implausible"] == pytest.approx(200, abs=3)
+    (said,) = [line for line in gated.info.findings.warnings if "faster than 15 m/s" in line]
+    assert said.endswith("set recipe key gate.max_plausible_mps")
+    assert not rows_of(gate(straight_track(speed), config=GateConfig(max_plausible_mps=50.0)), DropReason.GAP)[450]
+
+
+def test_a_run_that_is_mostly_faster_than_plausible_is_refused():
+    track = straight_track(np.where(T > 20, 1873.0, 0.9))
+    with pytest.raises(FusionError, match=r"faster than 15 m/s .*recipe key read.topics.*gate.max_plausible_mps"):
+        gate(track)
+    robot = {"max_velocity_mps": 1.0, "chord_m": 1.0}
+    assert gate_track(track, GateConfig(), **robot, max_plausible_mps=1e4).table.num_rows == T.size
+    with pytest.raises(FusionError, match="faster than 20 m/s"):  # the recipe's goes first
+        gate_track(track, GateConfig(max_plausible_mps=20.0), **robot, max_plausible_mps=1e4)

@@ -152,7 +152,7 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
 def test_low_power_rate(period_s, averaged, low):
     labelled = label(straight_track(SPEED), power_streams({"drive": record(period_s)}, averaged=averaged))
     assert flagged(labelled, Quality.LOW_POWER_RATE).all() == low
-    assert any("power comes at" in text for text in labelled.info.findings.warnings) == low
+    assert any("the current is measured at" in text for text in labelled.info.findings.warnings) == low
 
 
 def test_voltage_out_of_range_where_it_is():
@@ -298,3 +298,11 @@ def test_deviations_grow_with_their_causes():
     assert floats(noisy, "energy_std_joule").mean() == pytest.approx(np.hypot(0.9, 24 * np.sqrt(25) * 0.05), rel=0.15)
     assert floats(unsure, "duration_std_s") == pytest.approx(0.02 * 1.25 / 0.8, rel=1e-3)
     assert floats(unsure, "velocity_std_mps") == pytest.approx(0.8 * 0.02 / 0.8, rel=1e-3)
+
+
+def test_a_run_without_any_current_has_no_relative_deviation_and_divides_by_nothing():
+    """No energy is the share of no energy: a raw RuntimeWarning reached the terminal."""
+    labelled = label(straight_track(SPEED), power_streams({"drive": record(amp=lambda t: 0 * t)}))
+    told = labelled.info.findings.facts.label.relative_std_median
+    assert (told["power"], told["energy"]) == (None, None)
+    assert told["duration"] > 0.0

@@ -25,7 +25,7 @@ def timeline(**said):
 def source(*, role="gnss", header=True, **said):
     row = np.arange(COUNT)
     found = Readings(**{"row": row, "log_time_ns": row, "header_ns": row if header else None, "columns": {}, **said})
-    return TopicReadings("/fix", role, SENSOR.type_name, {"log_time_ns": row}, found)
+    return TopicReadings("/fix", role, SENSOR.type_name, COUNT, {}, found)
 
 
 def read(topic=None, clock=None, *, steps=(), power=None, warnings=(), timelines=None):
@@ -82,7 +82,7 @@ def test_stamps_that_were_replaced_or_moved_are_told():
     replaced, moved = read(source(), timeline(notes={"stamps_replaced": 4}, moved_s=(0.0, -0.5))).warnings
     assert replaced == "gnss: /fix: 4 header stamps are unset or wrong and were taken from the log time"
     assert moved.startswith(
-        "gnss: /fix: its clock is not the other topics': its stamps were moved by -0.500 s in epoch 1;"
+        "gnss: /fix: its clock is not the other topics': its stamps were moved by -0.500 s in epoch 1"
     )
     assert read(source(), timeline(notes={"stamps_replaced": 0})).warnings == ()
 

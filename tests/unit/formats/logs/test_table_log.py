@@ -17,6 +17,7 @@ from tcpipe.recipe import Recipe, TableMapping
 from tcpipe.recipe.checking import from_values
 from tcpipe.simulation.scenarios import tiny
 from tcpipe.stages.read import read_run
+from tcpipe.stages.read_roles import find_read_config
 from tcpipe.tables.columns import floats, integers
 
 START_NS = 1_760_456_485 * 10**9
@@ -88,7 +89,7 @@ def test_what_a_bag_holds_is_the_same_as_tables(bag, tmp_path):
     recipe = Recipe(tables=SAME)
     with open_logs([folder], tables=recipe.tables) as log:
         assert (log.damage, log.remarks) == ([], [])
-        found = read_run(log, recipe.read_of(log.topics), robot=None, known=shipped_profiles())
+        found = read_run(log, find_read_config(recipe, log.topics), robot=None, known=shipped_profiles())
     for role in ("gnss", "imu", "wheel_odometry", "power"):
         assert integers(found.tables[role], "stamp_ns").tolist() == integers(wanted.tables[role], "stamp_ns").tolist()
     for role, names in (

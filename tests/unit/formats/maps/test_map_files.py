@@ -152,7 +152,7 @@ def test_of_a_map_in_a_bucket_the_tiles_that_are_read_are_fetched(wide, tmp_path
 
 
 def test_what_is_no_map_says_so(path, tmp_path):
-    with pytest.raises(MapError, match="no Zarr directory"):
+    with pytest.raises(MapError, match=r"not a map, it has no zarr\.json"):
         open_map(tmp_path / "absent.zarr")
     with pytest.raises(MapError, match="not a map"):
         open_map(tmp_path)
@@ -196,3 +196,29 @@ def test_tiles_are_windows_and_hold_no_data_beyond_the_map(path):
             np.testing.assert_array_equal(tile[: part.shape[0], : part.shape[1]], part)
             beyond = np.concatenate([tile[part.shape[0] :].ravel(), tile[:, part.shape[1] :].ravel()])
             assert np.isnan(beyond).all() if layer == "height" else not beyond.any()
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "wanted"),
+    [
+        ("grid.rows", 10**9, "pixels"),
+        ("grid.rows", 0, "pixels"),
+        ("grid.rows", -5, "pixels"),
+        ("grid.cols", "wide", "wanted a whole number"),
+        ("tile_px", 0, "tiles and overviews"),
+        ("factors", [1, 0], "tiles and overviews"),
+        ("factors", [1, 10**12], "tiles and overviews"),
+    ],
+)
+def test_sizes_that_no_map_has_are_refused_before_a_tile_is_read(path, tmp_path, key, value, wanted):
+    copy = tmp_path / "copy.zarr"
+    shutil.copytree(path, copy)
+    group = json.loads((copy / "zarr.json").read_text())
+    kept, _, name = ("tcpipe_map." + key).rpartition(".")
+    within = group["attributes"]
+    for part in kept.split("."):
+        within = within[part]
+    within[name] = value
+    (copy / "zarr.json").write_text(json.dumps(group))
+    with pytest.raises(MapError, match=wanted):
+        open_map(copy, proved=False)

@@ -8,9 +8,9 @@ from rough_drive import ANTENNA_M, drive, measured, true_track
 from scipy.stats import chi2
 
 from tcpipe.fusion.checks import audit
-from tcpipe.fusion.checks.audit import Tally, alone_in_most, audited, undecided_in_most
+from tcpipe.fusion.checks.audit import Tally, alone_in_most, audited, goes_astray, undecided_in_most
 from tcpipe.fusion.measurements import GroundVelocities
-from tcpipe.fusion.trajectory import Trajectory
+from tcpipe.fusion.trajectory import Rejections, Trajectory
 
 SECONDS = 120.0
 
@@ -198,3 +198,26 @@ def test_wheels_that_turn_while_the_robot_stands_are_stuck_not_wrong(track, sens
         compared = list(audit._comparisons(here, replace(sensors, wheels=dug_in), audit._windows(here.stamp_ns)))
         (way,) = [one for one in compared if one.sensor == "wheel_odometry"]
         assert way.told.mean() == pytest.approx(telling, abs=0.1)
+
+
+def test_a_track_that_no_sensor_follows_is_astray_whatever_it_claims_and_refuses(track, sensors):
+    """From 60 s on it drifts off at 2 m/s and refuses every fix; one sensor that holds with it is enough."""
+    at_s = seconds(track, track.stamp_ns)
+    east = track.position_enu_m + np.outer(np.maximum(at_s - 60.0, 0.0), [2.0, 0.0, 0.0])
+    few = replace(sensors, wheels=None, visual=None)
+    late = few.gnss.stamp_ns[seconds(track, few.gnss.stamp_ns) > 60.0]
+    refused = Rejections(
+        late, np.full(late.size, "gnss"), np.full(late.size, "gate"), np.ones(late.size), np.ones(late.size)
+    )
+    lost = replace(
+        track, position_enu_m=east, position_std_m=np.full_like(track.position_std_m, 1e3), rejections=refused
+    )
+    raised, found = audited(lost, few)
+    assert 0.4 < found.astray / found.windows < 0.6
+    assert goes_astray(found.windows, found.astray)
+    assert (raised.forward_velocity_std_mps[at_s > 65.0] > 1.0).all()
+    _, right = audited(track, few)
+    assert right.astray == 0
+    ahead = few.gnss.position_enu_m + np.outer(np.maximum(seconds(track, few.gnss.stamp_ns) - 60.0, 0.0), [2.0, 0, 0])
+    _, held = audited(track, replace(sensors, gnss=replace(few.gnss, position_enu_m=ahead)))  # wheels follow the track
+    assert held.astray == 0

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from tcpipe.fusion.checks.distances import COMMAND, contradictions, find_distances, path_of_fixes
+from tcpipe.fusion.checks.distances import COMMAND, contradictions, far_scale, find_distances, path_of_fixes
 from tcpipe.fusion.checks.lags import GRID_NS, GRID_S
 from tcpipe.fusion.checks.windows import liveliest_ns, windows_ns
 from tcpipe.fusion.measurements import BodyVelocities, Measurements, Positions
@@ -101,3 +101,25 @@ def test_windows_cover_all_of_the_time_once():
     assert found[0][0] == 0
     assert all(abs(b[0] - a[-1]) <= GRID_NS for a, b in itertools.pairwise(found))
     assert 2500 * 10**9 - found[-1][-1] < GRID_NS
+
+
+def test_coarse_fixes_contradict_an_odometry_over_longer_windows():
+    wrong = judged(path(TWIST, std_m=2.0), wheel_odometry=TWIST * [0.4, 1])
+    assert set(wrong) == {"gnss", "wheel_odometry"}
+
+
+@pytest.mark.parametrize("std_m", [0.02, 2.0])
+@pytest.mark.parametrize("factor", [0.25, 0.43, 1.6, 3.6])
+def test_a_scale_far_from_one_is_told_by_the_fixes_where_the_paths_are_alike(factor, std_m):
+    found, std = far_scale(path(TWIST, std_m=std_m), TWIST * [factor, 1], AT_NS)
+    assert found == pytest.approx(factor, rel=0.06)
+    assert std < 0.05 * factor
+
+
+def test_a_scale_near_one_or_out_of_reason_or_of_another_path_is_none():
+    fixes = path(TWIST)
+    for other in (TWIST, TWIST * [1.3, 1], TWIST * [57.3, 1], TWIST * [0.43, -4.0], TWIST * [0.0, 1], STILL):
+        assert far_scale(fixes, other, AT_NS) is None
+    slips = np.where((T > 40) & (T < 80), 0.3, 0.9)[:, None]
+    assert far_scale(fixes, TWIST * np.column_stack((slips, np.ones_like(slips))), AT_NS) is None
+    assert far_scale(path(STILL, std_m=2.0), TWIST * [0.43, 1], AT_NS) is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rough_drive import drive, measured, true_track
 
-from tcpipe.fusion.checks.odometry_scale import over_command, rescaled, solve_scales, way_ratios
+from tcpipe.fusion.checks.odometry_scale import Scale, over_command, rescaled, solve_scales, way_ratios
 from tcpipe.fusion.measurements import BodyVelocities
 
 
@@ -80,3 +80,10 @@ def test_a_command_that_is_not_what_drives_tells_nothing():
     moving = driven(1.2, commanded=np.ones(COMMAND_NS.size))
     assert over_command(moving, COMMAND_NS, np.zeros(COMMAND_NS.size)) is None
     assert over_command(moving, COMMAND_NS[:0], np.zeros(0)) is None
+
+
+def test_a_scale_that_is_found_after_another_was_taken_out_counts_with_it():
+    first = Scale(0.4, 0.02, driven_m=40.0)
+    both = Scale(1.1, 0.01).after(first)
+    assert (both.factor, both.std, both.driven_m) == (pytest.approx(0.44), pytest.approx(0.004), 40.0)
+    assert first.after(None) is first

@@ -77,9 +77,9 @@ def test_samples_that_no_row_reaches_are_null_counted_and_said(store, tmp_path):
     told = [line for line in result.warnings if line.startswith("weather.csv: no row reaches")]
     assert len(told) == 1
     assert "40 of 80 samples (run c, d): its rows are of 2025-10-09T08:43:20Z to 2025-10-10T08:43:20Z" in told[0]
-    assert "older than 7200 s ([covariates] max_age_s)" in told[0]
+    assert "older than 7200 s (recipe key covariates.max_age_s)" in told[0]
     older = Recipe(covariates=CovariateConfig(max_age_s=3e5))
-    build(store, tmp_path / "out", covariates=tmp_path / "weather.csv", recipe=older)
+    build(store, tmp_path / "out", covariates=tmp_path / "weather.csv", recipe=older, force=True)
     assert read_samples(tmp_path / "out")["weather_temp_c"].null_count == 0
 
 
@@ -89,7 +89,7 @@ def test_another_table_of_the_same_name_makes_another_dataset(store, tmp_path):
     assert build(store, tmp_path / "out", covariates=path).status == "unchanged"
     path.write_text(path.read_text().replace("dry", "wet"))
     assert build(store, tmp_path / "out", covariates=path).status == "done"
-    assert build(store, tmp_path / "out").status == "done"
+    assert build(store, tmp_path / "out", force=True).status == "done"
     assert "weather_temp_c" not in read_samples(tmp_path / "out").column_names
 
 

@@ -297,7 +297,7 @@ def test_holdout_and_seed_overrule_the_recipe(store, tmp_path):
     sample = build(store, tmp_path, holdout="sample")
     assert (sample.splits["train"], sample.splits["test"]) == (16, 4)
     first = set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist())
-    build(store, tmp_path, holdout="sample", seed=1)
+    build(store, tmp_path, holdout="sample", seed=1, force=True)
     assert set(open_dataset(tmp_path / "out")["test"].samples["sample_id"].to_pylist()) != first
 
 
@@ -386,7 +386,7 @@ def test_a_kept_split_moves_nothing_whatever_the_rules_are_now(store, tmp_path, 
     before = splits_by_id(tmp_path / "out")
     add(store, "c", (-3.0, 6.0), start_ns=-(10**15))  # recorded before the others
     region = region_file(tmp_path / "r.geojson", box(-20, -20, 2, 20))
-    result = build(store, tmp_path, holdout=holdout, seed=7, split=region, keep_split=tmp_path / "out")
+    result = build(store, tmp_path, holdout=holdout, seed=7, split=region, keep_split=tmp_path / "out", force=True)
     now = splits_by_id(tmp_path / "out")
     assert {sample: now[sample] for sample in before} == before
     assert len(now) == 80

@@ -1,0 +1,94 @@
+"""Readings that a driver publishes several times: a battery monitor that is read once a second, in messages at 20 Hz.
+
+A repeated value is no new measurement. Messages repeat readings where values change only every so many messages, at almost constant
+intervals (a reading that equals the one before makes one of twice the length), and often by more than one level. A true signal that is
+coarsely quantised changes at irregular times; where it does so regularly (a ramp, an oscillation), it passes from level to level.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Stamps = NDArray[np.int64]
+
+_FEWEST_INTERVALS = 20
+_LEAST_MESSAGES = 1.5
+"""For which a reading lasts."""
+_LONGEST_INTERVAL = 4
+"""In reading periods: longer ones, as of a robot that stands, show no period."""
+_REGULAR_SHARE = 0.9
+_SINGLE_SHARE = 0.5
+"""Of the intervals, one reading period long."""
+_TOLERANCE = 0.3
+"""Of a reading period: a reading shows at the next message, and no device is read at exact times."""
+_JUMPING_SHARE = 0.1
+"""Of the changes."""
+
+
+def find_readings(stamp_ns: Stamps, values: Floats) -> NDArray[np.int64] | None:
+    """Return the rows on which new readings arrived, shape (R,); None where messages do not surely repeat readings.
+
+    A reading that equals the one before it shows no change: its row is the one at which it is expected.
+
+    Parameters
+    ----------
+    stamp_ns : [ns], shape (N,), not decreasing, of which most differ.
+    values : shape (N, K), quantities that are read together, finite.
+    """
+    changed = np.flatnonzero((values[1:] != values[:-1]).any(axis=1)) + 1
+    if changed.size <= _FEWEST_INTERVALS or not _jumps(values[changed]):
+        return None
+    message_ns = float(np.median(np.diff(stamp_ns)))
+    messages = _reading_period(np.diff(stamp_ns[changed]) / message_ns)
+    if messages is None:
+        return None
+    at_ns = (stamp_ns - stamp_ns[0]).astype(np.float64)
+    return _arrivals(at_ns, changed, period_ns=messages * message_ns, message_ns=message_ns)
+
+
+def _jumps(values: Floats) -> bool:
+    """Return whether successive values of one of the quantities often pass over a level that occurs elsewhere."""
+    levels = [np.unique(column, return_inverse=True)[1] for column in values.T]
+    return any(np.mean(np.abs(np.diff(level)) > 1) > _JUMPING_SHARE for level in levels)
+
+
+def _reading_period(interval: Floats) -> float | None:
+    """Return how many messages a reading lasts, by the intervals between changes [messages]; None where they are not regular."""
+    period = float(interval[interval <= 1.5 * np.quantile(interval, 0.2)].mean())
+    for _ in range(3):
+        count = np.maximum(np.rint(interval / period), 1.0)
+        judged = count <= _LONGEST_INTERVAL
+        used = judged & (interval > 0.5 * period)
+        period = float(interval[used].sum() / count[used].sum())
+    regular = judged & (np.abs(interval - count * period) <= _TOLERANCE * period)
+    is_repeated = (
+        period > _LEAST_MESSAGES
+        and judged.sum() >= _FEWEST_INTERVALS
+        and regular.sum() >= _REGULAR_SHARE * judged.sum()
+        and (regular & (count == 1.0)).sum() >= _SINGLE_SHARE * judged.sum()
+    )
+    return period if is_repeated else None
+
+
+def _arrivals(at_ns: Floats, changed: NDArray[np.int64], *, period_ns: float, message_ns: float) -> NDArray[np.int64]:
+    """Return the rows that change, and those at which equal readings are expected: evenly between changes, and beyond the outer ones.
+
+    Where messages are missing for a reading's period, the age of the first message after them is not known: it is no arrival.
+    """
+    resumed = np.flatnonzero(np.diff(at_ns) > period_ns) + 1
+    found = [changed[:0]]
+    for rows in np.split(np.arange(at_ns.size), resumed):
+        mine = changed[(changed > rows[0]) & (changed <= rows[-1])]
+        anchor = at_ns[mine] if mine.size else at_ns[rows[:1]]
+        begin = anchor[0] - np.floor((anchor[0] - at_ns[rows[0]]) / period_ns) * period_ns
+        end = anchor[-1] + np.floor((at_ns[rows[-1]] - anchor[-1]) / period_ns) * period_ns
+        anchor = np.concatenate(([begin], anchor, [end]))
+        between = np.diff(anchor)
+        count = np.maximum(np.rint(between / period_ns), 1.0).astype(np.int64)
+        step = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        expected = np.repeat(anchor[:-1], count) + step * np.repeat(between / count, count)
+        equal = np.setdiff1d(np.append(expected, end), at_ns[mine])
+        found += [mine, np.maximum(np.searchsorted(at_ns, equal - 0.5 * message_ns), rows[0])]
+    return np.unique(np.concatenate(found))

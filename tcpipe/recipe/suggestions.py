@@ -1,0 +1,89 @@
+"""The parts of a recipe that messages suggest: made here alone, by the recipe's own rules, so that what is suggested is accepted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, TypeAlias
+
+from tcpipe.errors import RecipeError
+from tcpipe.recipe.checking import as_toml, from_values, kinds_of
+from tcpipe.recipe.sections import Recipe
+
+TomlValue: TypeAlias = "bool | float | str | Sequence[TomlValue] | Mapping[str, TomlValue]"
+Keys: TypeAlias = Mapping[str, TomlValue]
+
+
+@dataclass(frozen=True, slots=True)
+class RecipeFragment:
+    """A part of a recipe: the keys of each table by its dotted name, as ``read.time_offset_s``; an array of tables as a list of them.
+
+    Raises
+    ------
+    RecipeError : a key is unknown, or the recipe refuses its value.
+    """
+
+    tables: Mapping[str, Keys | Sequence[Keys]]
+
+    def __post_init__(self) -> None:
+        """Check it as a recipe that holds nothing else."""
+        values: dict[str, Any] = {}
+        for name, keys in self.tables.items():
+            *above, last = name.split(".")
+            inner = values
+            for part in above:
+                inner = inner.setdefault(part, {})
+            inner[last] = keys if not isinstance(keys, Mapping) else {**inner.get(last, {}), **keys}
+        from_values(Recipe, values, where="suggested recipe")
+
+    def __str__(self) -> str:
+        """Return it inside a sentence, as ``under [read]: imu_units = "deg"``."""
+        return " and ".join(
+            f"under [{name}]: {line}"
+            for name, keys in self.tables.items()
+            if isinstance(keys, Mapping)
+            for line in _lines(keys)
+        )
+
+    def toml(self) -> str:
+        """Return it as lines that stand in a recipe as they are."""
+        lines = []
+        for name, keys in self.tables.items():
+            for each in [keys] if isinstance(keys, Mapping) else keys:
+                head = f"[{name}]" if isinstance(keys, Mapping) else f"[[{name}]]"
+                lines += [head, *_lines(each)]
+        return "\n".join(lines)
+
+
+def _lines(keys: Keys) -> list[str]:
+    return [f"{name} = {as_toml(value)}" for name, value in keys.items()]
+
+
+def suggested(purpose: str, tables: Mapping[str, Keys]) -> str:
+    """Return the end of a message that says what to write in the recipe; "" where the recipe would refuse that.
+
+    Parameters
+    ----------
+    purpose : what it is for, as ``to correct it``.
+    tables : as those of `RecipeFragment`.
+    """
+    try:
+        return f"; {purpose}, write in the recipe {RecipeFragment(tables)}"
+    except RecipeError:
+        return ""
+
+
+@cache
+def recipe_key(name: str) -> str:
+    """Return the dotted name of a key whose value only the reader knows, as a message names it.
+
+    Raises
+    ------
+    RecipeError : the recipe has no such key.
+    """
+    section, _, key = name.partition(".")
+    known = kinds_of(Recipe)
+    if section not in known or (key and key not in kinds_of(known[section])):
+        raise RecipeError(f"there is no key {name} in a recipe")
+    return f"recipe key {name}"

@@ -1,0 +1,49 @@
+"""One simulated drive as messages in memory, of which a test leaves sensors out or changes what they say."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from tcpipe.formats.logs.writing import MessageStream
+from tcpipe.simulation import Faults, Truth, scenario, simulated_drive
+from tcpipe.simulation.messages import TOPICS, streams
+from tcpipe.simulation.route import Wander
+
+NAMES = TOPICS["ros2"]
+Columns = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Drive:
+    truth: Truth
+    messages: tuple[MessageStream, ...]
+
+    def without(self, *sensors: str) -> "Drive":
+        return Drive(self.truth, tuple(m for m in self.messages if m.topic not in {NAMES[s] for s in sensors}))
+
+    def changed(self, sensor: str, change: Callable[[Columns], Mapping[str, np.ndarray]]) -> "Drive":
+        """Every column of a sensor's messages may be replaced; ``change`` gets copies of all, constants as columns too."""
+
+        def apply(m: MessageStream) -> MessageStream:
+            if m.topic != NAMES[sensor]:
+                return m
+            columns = {name: np.array(values) for name, values in m.columns.items()}
+            return replace(m, columns={**columns, **change(columns)})
+
+        return Drive(self.truth, tuple(apply(m) for m in self.messages))
+
+
+def make(plan=None, *, placements: bool = True) -> Drive:
+    demo = scenario("demo")
+    spec = demo.drives[0]
+    spec = replace(
+        spec,
+        plan=plan or Wander(60.0, (110.0, 30.0)),
+        recorder=replace(spec.recorder, placements=placements),
+        faults=replace(Faults.every(), gnss_outage=False, visual_dropouts=False, power_gap=False),
+    )
+    demo = replace(demo, drives=(spec,))
+    truth, readings = simulated_drive(demo, seed=5)
+    made = streams(readings, spec.sensors.mounted(spec.faults), spec.recorder, geoid_m=demo.world.site.geoid_m)
+    return Drive(truth, tuple(made))

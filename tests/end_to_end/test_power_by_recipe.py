@@ -1,0 +1,105 @@
+"""Power that no topic plays, or that is refused: the recipe as the commands print it gives labels with energy."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from changed_drives import NAMES, make
+from click.testing import CliRunner
+
+from tcpipe.cli import cli
+from tcpipe.formats.logs.writing import MessageStream, write_mcap
+from tcpipe.store import Store
+
+FLOAT = "std_msgs/msg/Float32"
+
+
+@pytest.fixture(scope="module")
+def drive():
+    return make()
+
+
+def bare(stamp_ns, name, values):
+    return MessageStream(name, FLOAT, stamp_ns, {"data": np.asarray(values, np.float64)})
+
+
+def floats_of(drive, kind):
+    """The drive with its power in Float32 topics: a voltage and a current a rail, or several ESCs on one rail, and others beside them."""
+    every = slice(None, None, 10)
+    truth = drive.truth
+    stamp_ns, volt, amp, right = (
+        values[every] for values in (truth.stamp_ns, truth.voltage_volt, truth.current_amp, truth.right_share)
+    )
+    if kind == "one":
+        made = [bare(stamp_ns, "/bus/voltage", volt), bare(stamp_ns, "/bus/current", amp)]
+    else:
+        milli = 1000.0 if kind == "escs in mA" else 1.0
+        made = [bare(stamp_ns, "/bus/voltage", volt), bare(stamp_ns, "/bus/current", amp + 2.0)]
+        made += [bare(stamp_ns, f"/esc{i}/current", milli * amp * part) for i, part in enumerate((right, 1.0 - right))]
+    image = MessageStream("/camera/image", "sensor_msgs/msg/Image", stamp_ns[:100], {})
+    return [*drive.without("power").messages, *made, image]
+
+
+def run(*words):
+    return CliRunner().invoke(cli, [str(word) for word in words], standalone_mode=False)
+
+
+def block_of(output):
+    """The lines of a recipe that a command prints, as they are."""
+    lines = [line.strip() for line in output.splitlines()]
+    first = next(at for at, line in enumerate(lines) if line.startswith("["))
+    rest = (at for at, line in enumerate(lines) if at > first and not (line.startswith("[") or " = " in line))
+    return "\n".join(lines[first : next(rest, len(lines))])
+
+
+def energy(store):
+    (found,) = Store(store).runs()
+    return found.segments()["energy_joule"].drop_null().to_numpy().sum(), found.segments().num_rows
+
+
+@pytest.mark.parametrize("kind", ["one", "escs", "escs in mA"])
+def test_bare_numbers_are_read_by_the_recipe_as_it_is_printed(drive, tmp_path, kind):
+    log = tmp_path / "run.mcap"
+    write_mcap(log, floats_of(drive, kind))
+    told = {name: run(name, log).output for name in ("inspect", "preflight")}
+    told["ingest"] = run("ingest", log, "--store", tmp_path / "without").output
+    (block,) = {block_of(output) for output in told.values()}
+    for output in told.values():
+        assert "/bus/voltage (V, " in output
+    record = next(line for line in told["preflight"].splitlines() if line.startswith("record"))
+    assert "/bus/voltage /bus/current" in record or "/bus/current /bus/voltage" in record
+    assert "/camera/image" not in record
+    assert "/camera/image at 20 Hz" in told["preflight"]
+    (tmp_path / "tcpipe.toml").write_text(block + "\n")
+    cured = run("ingest", log, "--store", tmp_path / "with", "--recipe", tmp_path / "tcpipe.toml")
+    assert "no topic plays power" not in cured.output
+    write_mcap(tmp_path / "known.mcap", drive.messages)
+    run("ingest", tmp_path / "known.mcap", "--store", tmp_path / "known")
+    (ours, count), (theirs, _) = energy(tmp_path / "with"), energy(tmp_path / "known")
+    assert count > 30
+    assert ours == pytest.approx(theirs, rel=0.03)
+
+
+def test_currents_in_milliamperes_come_first_and_are_cured_by_the_recipe_as_it_is_printed(drive, tmp_path):
+    other = tuple(
+        replace(m, columns={n: 1000.0 * v if "current" in n else v for n, v in m.columns.items()})
+        if m.topic == NAMES["power"]
+        else m
+        for m in drive.messages
+    )
+    log = tmp_path / "run.mcap"
+    write_mcap(log, other)
+    told = run("ingest", log, "--store", tmp_path / "without").output
+    first = told.split("robot ", 1)[1].splitlines()[1]
+    assert "power refused" in first
+    run("report", tmp_path / "without")
+    (page,) = (tmp_path / "without" / "runs").rglob("report.html")
+    verdict = page.read_text().split('class="verdict"')[1].split("</section>")[0]
+    assert verdict.index("ower refused") < verdict.index("<b>Good</b>")
+    assert "current_scale = 0.001" in verdict
+    assert "Record voltage and current" not in verdict
+    (tmp_path / "tcpipe.toml").write_text(block_of(told) + "\n")
+    run("ingest", log, "--store", tmp_path / "with", "--recipe", tmp_path / "tcpipe.toml")
+    write_mcap(tmp_path / "known.mcap", drive.messages)
+    run("ingest", tmp_path / "known.mcap", "--store", tmp_path / "known")
+    assert energy(tmp_path / "with")[0] == pytest.approx(energy(tmp_path / "known")[0], rel=1e-6)

@@ -1,0 +1,112 @@
+"""Parquet that unfolds out of all proportion is refused by the headers of its pages, in a process that may take little memory."""
+
+import resource
+import subprocess
+import sys
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from tcpipe.errors import StoreError
+from tcpipe.formats.parquet import parquet_bytes, parquet_of, read_row_group, read_table, write_table
+
+READ = (
+    "import sys; from pathlib import Path; from tcpipe.formats.parquet import read_table; read_table(Path(sys.argv[1]))"
+)
+ROWS = 40_000_000
+
+
+def texts(rows):
+    """One long text, which lies in the file once."""
+    text = pa.array(["x" * 500_000])
+    return pa.table({"s": pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), text)})
+
+
+def lists(rows):
+    values = pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array(["x" * 500_000]))
+    offsets = pa.array(np.arange(rows + 1, dtype=np.int32))
+    return pa.table({"s": pa.ListArray.from_arrays(offsets, values)})
+
+
+BOMBS = {
+    "zeros": lambda: pa.table({"a": np.zeros(ROWS)}),
+    "nulls": lambda: pa.table({"a": pa.nulls(2 * ROWS, pa.float64())}),
+    "many columns": lambda: pa.table({f"a{n}": np.zeros(ROWS // 8, np.int64) for n in range(9)}),
+    "one text": lambda: texts(5000),
+    "one text in lists": lambda: lists(5000),
+}
+
+
+@pytest.mark.parametrize("bomb", BOMBS)
+def test_a_small_file_that_becomes_large_is_refused_before_it_does(tmp_path, bomb):
+    path = tmp_path / "a.parquet"
+    pq.write_table(BOMBS[bomb](), path, compression="zstd", store_schema=False)
+    assert path.stat().st_size < 2_000_000
+    most = 1_600_000_000  # of addresses, of which Arrow takes many that it does not use
+    found = subprocess.run(
+        [sys.executable, "-c", READ, path],
+        check=False,
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (most, most)),
+    )
+    assert "StoreError" in found.stderr
+    assert "unfold" in found.stderr
+    with pytest.raises(StoreError, match="unfold"):
+        parquet_of(path.read_bytes(), "there", None)
+    if pq.read_metadata(path).num_row_groups == 1:
+        with pytest.raises(StoreError, match="unfold"):
+            read_row_group(path, 0, None)
+
+
+def test_a_page_that_says_it_is_larger_than_its_footer_does_is_refused(tmp_path):
+    """Arrow makes room for what the header of a page says."""
+    path = tmp_path / "a.parquet"
+    write_table(pa.table({"a": np.arange(20_000.0)}), path)
+    data = bytearray(path.read_bytes())
+    at = pq.read_metadata(path).row_group(0).column(0).data_page_offset
+    size = data.index(b"\x15", at + 1)  # field 2 of the header: the size without compression, a varint of 3 bytes
+    assert data[at] == 0x15
+    assert data[size + 3] < 0x80
+    data[size + 1 : size + 4] = b"\xfe\xff\xff"  # goes on
+    data[size + 4 : size + 4] = b"\xff\x0f"
+    with pytest.raises(StoreError):
+        parquet_of(bytes(data), "there", ["a"])
+
+
+@pytest.mark.parametrize("rows", [0, 1, 3, 5000])
+def test_what_is_written_is_read_whatever_it_holds(tmp_path, rows):
+    table = pa.table(
+        {
+            "n": pa.array(np.arange(rows)),
+            "x": pa.array(np.arange(rows) / 3, pa.float32()),
+            "text": pa.array([f"run-{n % 3}" if n % 5 else None for n in range(rows)], pa.string()),
+            "each": pa.array([f"{n:0400}" for n in range(rows)], pa.string()),
+            "yes": pa.array([n % 2 == 0 for n in range(rows)]),
+            "list": pa.array([[1.0, 2.0]] * rows, pa.list_(pa.float32(), 2)),
+            "texts": pa.array([["a", "b"]] * rows, pa.list_(pa.string())),
+        },
+    ).replace_schema_metadata({"a": "b"})
+    write_table(table, tmp_path / "a.parquet")
+    found = read_table(tmp_path / "a.parquet")
+    assert found.equals(table)
+    assert found.schema.metadata == table.schema.metadata
+    assert read_table(tmp_path / "a.parquet", ["text", "n"]).equals(table.select(["text", "n"]))
+    assert parquet_of(parquet_bytes(table, rows_per_group=1024), "there", ["each"]).equals(table.select(["each"]))
+
+
+def test_a_damaged_file_is_an_error_in_a_line_wherever_a_byte_changed(tmp_path):
+    table = pa.table({"a": np.arange(300.0), "s": [f"t{n % 9}" for n in range(300)]})
+    whole, rng = parquet_bytes(table, rows_per_group=100), np.random.default_rng(0)
+    said = []
+    for at in rng.integers(4, len(whole) - 4, 300):
+        data = bytearray(whole)
+        data[at] ^= 1 << int(rng.integers(8))
+        try:
+            parquet_of(bytes(data), "there", ["a", "s"])
+        except StoreError as error:
+            said += error.problems
+    assert len(said) > 200
+    assert not any("\n" in line for line in said)

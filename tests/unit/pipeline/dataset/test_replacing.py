@@ -1,0 +1,224 @@
+"""A dataset is replaced unasked only by one of the same options: everything else that differs is named, and nothing is written."""
+
+import json
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from object_gateway import in_environment
+from storage_server import object_store
+from synthetic_store import add_run, add_world, box, lanes, region_file, segments
+
+from tcpipe.cli import cli
+from tcpipe.errors import DatasetError, StoreError, UsageError
+from tcpipe.formats.dataset_files import read_card
+from tcpipe.pipeline.dataset import build as building
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.recipe import DatasetConfig, Recipe, SampleConfig
+from tcpipe.store import open_store
+
+
+@pytest.fixture(autouse=True)
+def no_page(monkeypatch):
+    monkeypatch.setattr(building, "dataset_report", lambda *_: "<!doctype html>")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """Two maps, a run of each weather, and the dataset of the dry one."""
+    here = tmp_path_factory.mktemp("replacing")
+    store = open_store(here / "store", create=True)
+    for name in ("site", "yard"):
+        add_world(store, here / name, name=name)
+    for number, weather in enumerate(("dry", "wet")):
+        add_run(store, weather, segments(weather, *lanes(3.0 * number, -10.0, 10.0)), tags={"weather": weather})
+        store.tag_run(weather, {"weather": weather})
+    region_file(here / "region.geojson", box(-20, -20, 2, 20))
+    region_file(here / "other.geojson", box(-20, -20, 3, 20))
+    (here / "soil.csv").write_text("time,moisture\n1970-01-01T00:00:00Z,0.2\n1970-01-01T00:01:00Z,0.3\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(building, "dataset_report", lambda *_: "<!doctype html>")
+        build_dataset(here / "dataset", **usual(here))
+    return here
+
+
+def usual(here: Path, **how: object) -> dict[str, object]:
+    first = {"store": here / "store", "map_name": "site", "split": here / "region.geojson", "tags": {"weather": "dry"}}
+    return first | {"recipe": Recipe()} | how
+
+
+@pytest.fixture
+def here(made, tmp_path):
+    shutil.copytree(made, tmp_path / "here", copy_function=shutil.copy2)
+    return tmp_path / "here"
+
+
+def tree(directory: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(directory)): path.read_bytes() for path in directory.rglob("*") if path.is_file()}
+
+
+def refused(here: Path, **how: object) -> tuple[str, ...]:
+    """What differs, after a build and a dry run that left the dataset as it was."""
+    before, problems = tree(here / "dataset"), []
+    for dry_run in (False, True):
+        with pytest.raises(UsageError) as caught:
+            build_dataset(here / "dataset", **usual(here, dry_run=dry_run, **how))
+        problems.append(caught.value.problems)
+    assert problems[0] == problems[1]
+    assert "made with other options, and stays; give another OUT, or replace it with --force" in problems[0][0]
+    assert tree(here / "dataset") == before
+    return tuple(line.partition("dataset: ")[2] for line in problems[0][1:])
+
+
+OTHER = {
+    "map_name": ("yard", "--map: site in the dataset, yard now"),
+    "tags": ({}, "--tag: weather=dry in the dataset, none now"),
+    "file_format": ("parquet", "--format: zarr in the dataset, parquet now"),
+    "seed": (5, "recipe split.seed: 0 in the dataset, 5 now"),
+    "holdout": ("sample", "recipe split.holdout: block in the dataset, sample now"),
+    "redact": (True, "--redact: no in the dataset, yes now"),
+    "recipe": (
+        Recipe(sample=SampleConfig(patch_px=20), dataset=DatasetConfig(licence="CC0-1.0")),
+        "recipe dataset.licence: none in the dataset, CC0-1.0 now",
+    ),
+}
+
+
+@pytest.mark.parametrize("option", OTHER)
+def test_another_option_is_refused_with_both_values_and_taken_with_force(made, here, option):
+    value, line = OTHER[option]
+    lines = refused(here, **{option: value})
+    assert line in lines
+    assert len(lines) == (2 if option == "recipe" else 1)
+    assert build_dataset(here / "dataset", **usual(here, force=True, **{option: value})).status == "done"
+    again = build_dataset(here / "dataset", **usual(here, **{option: value}))
+    assert again.status == "unchanged", "what differs is what is there now"
+
+
+def test_regions_and_tables_differ_by_what_they_are(here):
+    for region, now in ((None, "none now"), (here / "other.geojson", "train_test (")):
+        (line,) = refused(here, split=region)
+        assert line.startswith("--split: train_test (")
+        assert now in line
+    assert refused(here, covariates=here / "soil.csv") == ("--covariates: none in the dataset, soil.csv now",)
+    assert len(refused(here, split=None, seed=3, map_name=["site", "yard"])) == 3
+
+
+def test_the_same_region_written_otherwise_is_the_same_option(here):
+    path = here / "region.geojson"
+    path.write_text(json.dumps(json.loads(path.read_text()), indent=3))
+    assert build_dataset(here / "dataset", **usual(here)).status == "done"
+
+
+def test_other_runs_and_another_map_of_the_name_are_built_in_unasked(here):
+    assert build_dataset(here / "dataset", **usual(here)).status == "unchanged"
+    store = open_store(here / "store")
+    add_run(store, "new", segments("new", *lanes(6.0, -10.0, 10.0)))
+    store.tag_run("new", {"weather": "dry"})
+    assert build_dataset(here / "dataset", **usual(here)).status == "done"
+    assert {run.run_id for run in read_card(here / "dataset").runs} == {"dry", "new"}
+
+
+def test_another_robot_is_refused(here):
+    store = open_store(here / "store")
+    add_run(store, "big", segments("big", *lanes(6.0, -10.0, 10.0), robot="warthog"))
+    store.tag_run("big", {"weather": "dry"})
+    assert refused(here, robot="warthog") == ("--robot: husky in the dataset, warthog now",)
+    assert build_dataset(here / "dataset", **usual(here, robot="husky")).status == "unchanged"
+
+
+def test_its_own_split_may_be_kept_and_then_has_to_be_asked_for(here):
+    out = here / "dataset"
+    shutil.copytree(out, here / "earlier")
+    assert refused(here, keep_split=here / "earlier") == ("--keep-split: no in the dataset, yes now",)
+    assert build_dataset(out, **usual(here, keep_split=out)).status == "done"
+    assert refused(here) == ("--keep-split: yes in the dataset, no now",)
+    assert build_dataset(out, **usual(here, keep_split=here / "earlier")).status in ("done", "unchanged")
+
+
+def reseal(directory: Path, **values: object) -> None:
+    """Write a card as an earlier version might have; ``None`` takes a key away."""
+    card = json.loads((directory / "dataset.json").read_text()) | values
+    (directory / "dataset.json").write_text(json.dumps({key: of for key, of in card.items() if of is not None}))
+
+
+@pytest.mark.parametrize("version", ["2.1", "1.1"])
+def test_a_dataset_of_an_earlier_version_is_compared_by_what_its_card_tells(here, version):
+    reseal(here / "dataset", data_model_version=version, tcpipe_version="0.7.0", run_tags=None, inputs="0" * 64)
+    assert refused(here, map_name="yard") == (OTHER["map_name"][1],)
+    assert refused(here, tags={}) == (OTHER["tags"][1],), "its runs share what the runs now do not"
+    assert refused(here, tags={"weather": "wet"}) == ("--tag: weather=dry in the dataset, weather=wet now",)
+    assert build_dataset(here / "dataset", **usual(here)).status == "done"
+    assert read_card(here / "dataset").run_tags == {"weather": "dry"}
+
+
+def test_a_redacted_dataset_does_not_tell_its_options(here):
+    out = here / "dataset"
+    build_dataset(out, **usual(here, redact=True, force=True))
+    assert read_card(out).run_tags is None
+    assert build_dataset(out, **usual(here, redact=True)).status == "unchanged"
+    (line,) = refused(here, redact=True, map_name="yard")
+    assert line.startswith("--redact: a redacted dataset does not tell")
+    assert refused(here) == ("--redact: yes in the dataset, no now",)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_what_is_no_dataset_is_left_alone_with_force_too(here, force):
+    for name, error, text in (
+        ("notes.txt", UsageError, "exists and is no dataset"),
+        ("dataset.json", DatasetError, "is left alone, since nobody can tell what it was made of; move it away"),
+    ):
+        (here / "folder").mkdir(exist_ok=True)
+        (here / "folder" / name).write_text("{}")
+        before = tree(here / "folder")
+        with pytest.raises(error, match=text):
+            build_dataset(here / "folder", **usual(here, force=force))
+        assert tree(here / "folder") == before
+
+
+def test_nothing_in_a_bucket_is_replaced_and_the_differences_are_named(here, monkeypatch):
+    (here / "served" / "sets").mkdir(parents=True)
+    shutil.copytree(here / "dataset", here / "served" / "sets" / "ds")
+    with object_store(here / "served") as (environment, _):
+        in_environment(monkeypatch, environment, here / "cache")
+        for force in (False, True):
+            with pytest.raises(UsageError) as caught:
+                build_dataset("s3://sets/ds", **usual(here, map_name="yard", force=force))
+            assert "what lies in a bucket is not replaced: give another place" in caught.value.problems[0]
+            assert caught.value.problems[1:] == (f"s3://sets/ds: {OTHER['map_name'][1]}",)
+        assert build_dataset("s3://sets/ds", **usual(here)).status == "unchanged"
+    assert tree(here / "served" / "sets" / "ds") == tree(here / "dataset")
+
+
+def test_what_another_call_builds_there_meanwhile_stays(here, monkeypatch):
+    out, draw = here / "dataset", building.write_patches
+
+    def while_the_first_draws(*how, **more):
+        monkeypatch.setattr(building, "write_patches", draw)
+        build_dataset(out, **usual(here, map_name="yard", force=True))
+        return draw(*how, **more)
+
+    add_run(open_store(here / "store"), "dry", segments("dry", *lanes(1.0, -10.0, 10.0)))
+    monkeypatch.setattr(building, "write_patches", while_the_first_draws)
+    with pytest.raises(StoreError, match="another call has built a dataset here meanwhile, which stays"):
+        build_dataset(out, **usual(here))
+    assert [entry.name for entry in read_card(out).maps] == ["yard"]
+
+
+def test_the_command_says_each_difference_and_ends_with_2(here, monkeypatch):
+    monkeypatch.chdir(here)
+    told = CliRunner().invoke(
+        cli, ["build-dataset", "dataset", "--store", "store", "--map", "yard", "--tag", "weather=dry"]
+    )
+    assert isinstance(told.exception, UsageError)
+    _, by_map, by_region = told.exception.problems
+    assert by_map == "dataset: --map: site in the dataset, yard now"
+    assert by_region.startswith("dataset: --split: train_test (")
+
+
+def test_the_options_are_compared_as_data_and_not_by_how_they_are_written(here):
+    same = replace(Recipe(), sample=SampleConfig(patch_px=40))
+    assert build_dataset(here / "dataset", **usual(here, recipe=same, robot="husky")).status == "unchanged"
+    assert build_dataset(here / "dataset", **usual(here, tags={"weather": "dry"}, min_runs=1)).status == "unchanged"

@@ -1,0 +1,160 @@
+"""A store that was copied by halves: whatever of a run is gone, every command says so, and does until it is back or made again."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from object_gateway import in_environment
+from storage_server import object_store
+from synthetic_store import add_run, add_world, lanes, segments
+from wheel_drives import START_NS, drive_at
+
+from tcpipe.formats.index_files import read_runs
+from tcpipe.pipeline import report as reporting
+from tcpipe.pipeline.begun_calls import begun_call
+from tcpipe.pipeline.dataset import build as building
+from tcpipe.pipeline.dataset.build import build_dataset
+from tcpipe.pipeline.ingest import ingest
+from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.known_runs import list_runs
+from tcpipe.pipeline.prune import prune
+from tcpipe.pipeline.status import status
+from tcpipe.pipeline.verify import verify
+from tcpipe.recipe import Recipe
+from tcpipe.store import Store, open_store
+
+LOST = {
+    "the only manifest": "runs/b/*/manifest-1.json",
+    "all manifests": "runs/twice/*/manifest-*.json",
+    "the last manifest": "runs/twice/*/manifest-2.json",
+    "the last run.json": "runs/twice/run-2.json",
+    "the only run.json": "runs/b/run-1.json",
+    "the last tags": "runs/twice/tags-1.json",
+    "segments": "runs/b/*/*/segments.parquet",
+    "a track": "runs/b/*/*/track.parquet",
+    "a run": "runs/b",
+}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A store with a map and three runs, one of them made twice and tagged since; its index is there."""
+    here = tmp_path_factory.mktemp("incomplete")
+    store = open_store(here / "store", create=True)
+    add_world(store, here / "rasters")
+    for number, run_id in enumerate(("a", "b", "twice")):
+        for more in (0.0, 1.0) if run_id == "twice" else (0.0,):
+            add_run(store, run_id, segments(run_id, *lanes(3.0 * number, -10.0, 9.0 + more)))
+            known = store.run_json(run_id)
+            if more:
+                store.write_run_json(run_id, type(known)(known.source, damage=("cut",)))
+    store.tag_run("twice", {"weather": "dry"})
+    store.keep_index(store.ingestions())
+    return here
+
+
+@pytest.fixture(params=["directory", "bucket"])
+def place(request, made, tmp_path, monkeypatch):
+    """A copy of the store: where its files lie here, and what it is called."""
+    monkeypatch.setattr(building, "dataset_report", lambda *_: "<!doctype html>")
+    files = tmp_path / "served" / "sets" / "store"
+    shutil.copytree(made / "store", files, copy_function=shutil.copy2)
+    if request.param == "directory":
+        yield files, files
+        return
+    with object_store(tmp_path / "served") as (environment, _):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        Store("s3://sets/store").keep_index(Store("s3://sets/store").ingestions())
+        yield files, "s3://sets/store"
+
+
+def lose(files: Path, pattern: str) -> Callable[[], None]:
+    """Remove part of a store; return what puts it back."""
+    held = {
+        path: path.read_bytes() for part in files.glob(pattern) for path in (part, *part.rglob("*")) if path.is_file()
+    }
+    assert held
+    for path in held:
+        path.unlink()
+    shutil.rmtree(files / pattern, ignore_errors=True)
+
+    def put_back() -> None:
+        for path, data in held.items():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+
+    return put_back
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, tmp_path, lost):
+    files, root = place
+    before, new = set(read_runs(Store(root).index_place)), tmp_path / "new.mcap"
+    new.write_bytes(b"to be ingested")
+    put_back = lose(files, LOST[lost])
+    name = LOST[lost].split("/")[1]
+    for _ in range(2):  # what the first call writes into the index hides nothing from the next
+        result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
+        assert result.exit_code == 3
+        assert any(f"/{name}" in line or f": {name};" in line for line in result.problems), result.problems
+        assert not any(f"run {name}:" in line for line in result.warnings)
+        found = status([new], store=root, recipe=Recipe())
+        assert (found.exit_code, len(found.problems)) == (3, 1)
+        assert verify(root).problems
+        assert list(inspect(root, recipe=Recipe()).damaged_runs)
+        assert len(list_runs(Store(root)).finished) == 2
+    reporting.report(root, runs=False)
+    assert "not as it was written" in (files / "report.html").read_text()
+    assert set(read_runs(Store(root).index_place)) == before
+    put_back()
+    assert not list_runs(Store(root)).damaged
+    assert build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True).exit_code == 0
+    assert verify(root).problems == ()
+
+
+def test_a_run_that_a_call_is_making_is_on_its_way_and_no_problem(place, tmp_path):
+    files, root = place
+    lose(files, "runs/b/*/manifest-1.json")
+    shutil.rmtree(files / "index")
+    with begun_call(Store(root), "ingest", ["/logs"]):
+        found = list_runs(Store(root))
+        assert (found.damaged, found.unfinished) == ({}, ("b",))
+        assert inspect(root, recipe=Recipe()).unfinished == ("b",)
+        result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
+        assert result.exit_code == 0
+        assert any("no ingestion of b has finished" in line for line in result.warnings)
+    assert list(list_runs(Store(root)).damaged) == [("b", "")]
+
+
+def test_what_prune_and_a_person_remove_is_not_missed(place):
+    files, root = place
+    store = Store(root)
+    store.supersede("b", "a")
+    store.keep_index(store.ingestions())
+    assert [each.what for each in prune(store=root, recipe=Recipe(), min_age_s=0.0).removed] != []
+    assert not store.runs_place.entries("b")
+    assert not list_runs(store).damaged
+    shutil.rmtree(files / "runs" / "a")
+    assert list(list_runs(store).damaged) == [("a", "")]
+    shutil.rmtree(files / "index")
+    assert not list_runs(store).damaged
+
+
+@pytest.mark.parametrize(
+    "lost", ["runs/one-*/*/manifest-1.json", "runs/one-*", "runs/one-*/run-1.json", "runs/*/tags-1.json"]
+)
+def test_what_is_lost_is_made_again_from_the_log(tmp_path, lost):
+    logs, root = tmp_path / "logs", tmp_path / "store"
+    drive_at(logs / "one.mcap")
+    drive_at(logs / "two.mcap", seed=1, start_ns=START_NS + 10**13)
+    ingest([logs], store=root, recipe=Recipe())
+    ingest([logs / "one.mcap"], store=root, recipe=Recipe(), tags={"load": "12"})
+    for part in root.glob(lost):
+        shutil.rmtree(part) if part.is_dir() else part.unlink()
+    (line,) = status(store=root, recipe=Recipe()).problems
+    assert "ingest the log" in line
+    assert ingest([logs], store=root, recipe=Recipe()).exit_code == 0
+    found = status(store=root, recipe=Recipe())
+    assert (found.exit_code, found.problems, found.counts) == (0, (), {"done": 2})
+    assert verify(root).problems == ()

@@ -1,0 +1,92 @@
+"""Messages that repeat readings are told from a slow or coarse signal that was measured for every message."""
+
+import numpy as np
+import pytest
+
+from tcpipe.power.repeats import find_readings
+
+COUNT = 6000
+AT_NS = 1_700_000_000_000_000_000 + 50_000_000 * np.arange(COUNT, dtype=np.int64)
+
+
+def wandering(count, rows, rng):
+    """Return a signal of unit variance that is forgotten within so many rows."""
+    kept = np.exp(-1.0 / rows)
+    white = rng.standard_normal(count) * np.sqrt(1.0 - kept**2)
+    value = np.empty(count)
+    value[0] = white[0]
+    for i in range(1, count):
+        value[i] = kept * value[i - 1] + white[i]
+    return value
+
+
+def repeated(reading_hz, *, step, jitter=0.0, seed=1):
+    """Return what messages at 20 Hz tell of a device that is read so often, and the rows on which a reading arrives."""
+    rng = np.random.default_rng(seed)
+    period_s = 1.0 / reading_hz
+    read_s = np.arange(0.37 * period_s, COUNT / 20, period_s)
+    read_s = read_s + jitter * period_s * rng.uniform(-1, 1, read_s.size)
+    value = np.round((5.0 + 1.5 * wandering(10 * COUNT, 60, rng)[(read_s * 200).astype(int)]) / step) * step
+    last = np.maximum(np.searchsorted(read_s, np.arange(COUNT) / 20, "right") - 1, 0)
+    return value[last], np.flatnonzero(np.diff(last)) + 1
+
+
+@pytest.mark.parametrize("step", [0.01, 0.1, 0.5])
+@pytest.mark.parametrize("jitter", [0.0, 0.1])
+@pytest.mark.parametrize("reading_hz", [0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0])
+def test_readings_are_found_at_the_first_message_that_holds_them(reading_hz, jitter, step):
+    value, arrivals = repeated(reading_hz, step=step, jitter=jitter)
+    rows = find_readings(AT_NS, value[:, None])
+    assert len(rows) == pytest.approx(len(arrivals), rel=0.02)
+    assert set(np.flatnonzero(np.diff(value)) + 1) <= set(rows)
+    # A reading that equals the last shows no change: it is expected to within a part of its period.
+    aside = np.abs(rows - arrivals[np.abs(rows[:, None] - arrivals).argmin(axis=1)])[1:-1]
+    assert aside.max() <= max(1.0, 0.3 * 20 / reading_hz)
+
+
+@pytest.mark.parametrize("step", [0.02, 0.1, 0.3, 1.0, 2.0])
+@pytest.mark.parametrize("rows", [1, 10, 100, 1000])
+@pytest.mark.parametrize("noise", [0.0, 0.1])
+def test_a_coarse_signal_is_no_repeated_one(rows, step, noise):
+    rng = np.random.default_rng(3)
+    value = np.round((5.0 + wandering(COUNT, rows, rng) + noise * rng.standard_normal(COUNT)) / step) * step
+    assert find_readings(AT_NS, value[:, None]) is None
+
+
+@pytest.mark.parametrize("share", [0.01, 0.05, 0.1, 0.25, 0.5])
+def test_levels_that_change_at_irregular_times_are_no_repeated_readings(share):
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        value = np.cumsum((rng.random(COUNT) < share) * rng.integers(-4, 5, COUNT)) * 0.1
+        assert find_readings(AT_NS, value[:, None]) is None
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0])
+def test_a_ramp_and_an_oscillation_pass_from_level_to_level(step):
+    at_s = np.arange(COUNT) / 20
+    for value in (24.0 - 0.05 * at_s, 5.0 + 1.3 * np.sin(0.3 * at_s), 5.0 + 1.3 * np.sin(2.4 * at_s)):
+        assert find_readings(AT_NS, (np.round(value / step) * step)[:, None]) is None
+
+
+def test_of_missing_messages_the_next_reading_is_no_older_than_it_says():
+    value, arrivals = repeated(1.0, step=0.01)
+    kept = np.ones(COUNT, bool)
+    kept[::97] = False
+    kept[3005:3066] = False  # three readings are lost
+    rows = np.flatnonzero(kept)[find_readings(AT_NS[kept], value[kept, None])]
+    assert len(rows) == pytest.approx(len(arrivals) - 3, abs=2)
+    assert not set(rows) & set(range(3066, arrivals[arrivals > 3066][0]))
+    assert np.abs(rows[1:-1, None] - arrivals).min(axis=1).max() <= 1
+
+
+def test_a_robot_that_stands_is_read_as_often_as_one_that_drives():
+    value, _ = repeated(2.0, step=0.1)
+    value[2000:4000] = value[2000]
+    rows = find_readings(AT_NS, value[:, None])
+    assert np.diff(rows).max() <= 11
+
+
+def test_twenty_readings_are_too_few():
+    value, _ = repeated(1.0, step=0.01)
+    assert find_readings(AT_NS[:400], value[:400, None]) is None
+    assert find_readings(AT_NS[:1], value[:1, None]) is None

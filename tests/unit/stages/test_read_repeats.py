@@ -1,0 +1,122 @@
+"""A power table whose messages repeat readings becomes the readings, quantity by quantity; any other table stays as it is."""
+
+import numpy as np
+import pytest
+from made_tracks import power_streams, stamps
+
+from tcpipe.power.energy import energy_joule
+from tcpipe.power.noise import energy_noise, median_period_s
+from tcpipe.simulation import scenario, simulated_drive
+from tcpipe.simulation.faults import Faults
+from tcpipe.simulation.scenarios import small_world
+from tcpipe.simulation.sensors import Noise, Power, Sensors, record
+from tcpipe.stages.power_rails import rails_of
+from tcpipe.stages.read_repeats import repeats_warnings, without_repeats
+from tcpipe.tables.levels import Streams
+
+COUNT = 4000
+STAMP_NS = stamps(COUNT)
+
+
+def held(values, rows):
+    """Return values of which each is repeated for so many rows, from the middle of the first."""
+    return values[(np.arange(COUNT) + rows // 2) // rows]
+
+
+def drawn(seed, *, step=0.01, scale=2.0):
+    return np.round((6.0 + scale * np.random.default_rng(seed).standard_normal(COUNT)) / step) * step
+
+
+def read(rails):
+    streams, repeats = without_repeats(power_streams(rails).tables)
+    return rails_of(Streams(streams, {}, "husky"), 0), repeats
+
+
+def rates_hz(rails):
+    return [round(1.0 / median_period_s(signal), 1) for each in rails for signal in (each.current, each.voltage)]
+
+
+def test_voltage_and_current_may_be_read_at_rates_of_their_own():
+    rails, repeats = read({"battery": (STAMP_NS, held(drawn(1) + 20, 20), held(drawn(2), 5))})
+    assert rates_hz(rails) == [4.0, 1.0]
+    assert [(each.quantity, round(each.reading_hz, 1)) for each in repeats] == [("current", 4.0), ("voltage", 1.0)]
+
+
+@pytest.mark.parametrize("volt", [np.full(COUNT, 25.0), held(np.round(25 + 0.1 * drawn(3), 1), 10)])
+def test_a_voltage_that_hardly_changes_comes_with_the_current(volt):
+    rails, _ = read({"battery": (STAMP_NS, volt, held(drawn(2), 10))})
+    assert rates_hz(rails) == [2.0, 2.0]
+
+
+def test_of_several_rails_each_has_its_own_rate():
+    volt = held(drawn(1) + 20, 4)
+    rails, _ = read({"left": (STAMP_NS, volt, held(drawn(2), 4)), "right": (STAMP_NS, 20 + drawn(4), drawn(5))})
+    assert rates_hz(rails) == [5.0, 5.0, 20.0, 20.0]
+
+
+def test_a_voltage_alone_on_its_topic_is_told_by_itself():
+    nothing = np.full(COUNT, np.nan)
+    volt, amp = held(drawn(1) + 20, 20), drawn(2)
+    both = (np.concatenate((STAMP_NS, STAMP_NS + 7)), np.append(volt, nothing), np.append(nothing, amp))
+    rails, repeats = read({"battery": both})
+    assert rates_hz(rails) == [20.0, 1.0]
+    assert [each.quantity for each in repeats] == ["voltage"]
+    (line,) = repeats_warnings(repeats, averaged=False)
+    assert "too slowly" not in line
+
+
+@pytest.mark.parametrize(
+    ("volt", "amp"),
+    [
+        (np.full(COUNT, 25.0), np.round(5.0 + 0.08 * np.random.default_rng(1).standard_normal(COUNT), 1)),
+        (np.full(COUNT, 25.0), np.full(COUNT, 3.0)),
+        (np.full(COUNT, 25.0), np.where(np.random.default_rng(2).random(COUNT) < 0.5, 3.0, 8.0)),
+        (np.round(25 - np.arange(COUNT) / 1000, 1), drawn(6)),
+        (np.full(COUNT, 25.0), np.linspace(0.0, 20.0, COUNT)),
+    ],
+    ids=["quiet driving in steps of 0.1 A", "standing", "two levels", "voltage that sinks", "ramp"],
+)
+def test_a_signal_measured_for_every_message_stays_as_it_is(volt, amp):
+    streams = power_streams({"battery": (STAMP_NS, volt, amp)}).tables
+    kept, repeats = without_repeats(streams)
+    assert kept["power"] is streams["power"]
+    assert not repeats
+
+
+def test_clock_epochs_are_told_together_and_kept_apart():
+    table = power_streams({"battery": (STAMP_NS, drawn(1) + 20, held(drawn(2), 20))}).tables["power"]
+    epoch = (np.arange(COUNT) >= COUNT - 300).astype(np.int16)  # 15 readings are too few to tell by themselves
+    back_ns = np.where(epoch, STAMP_NS - 30_000_000_000, STAMP_NS)
+    for name, values in (("epoch", epoch), ("stamp_ns", back_ns)):
+        table = table.set_column(table.column_names.index(name), table.schema.field(name), [values])
+    streams, _ = without_repeats({"power": table})
+    assert [rates_hz(rails_of(Streams(streams, {}, "husky"), number))[0] for number in (0, 1)] == [1.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return simulated_drive(scenario("hills12"))[0]
+
+
+@pytest.mark.parametrize("reading_hz", [1.0, 2.0, 4.0, 5.0])
+def test_energies_are_as_wrong_as_they_say(truth, reading_hz):
+    faults, sensors = Faults.only("power_noise"), Sensors(power=Power(reading_hz=reading_hz))
+    reading = record(truth, small_world().site, sensors, faults, Noise(1, 0))["power"]
+    amp = reading.values["left_amp"] + reading.values["right_amp"]
+    streams = power_streams({"drive": (reading.stamp_ns, reading.values["voltage_volt"], amp)}).tables
+    start_ns = np.arange(truth.stamp_ns[0] + 10**10, truth.stamp_ns[-1] - 10**10, 1_200_000_000)
+    end_ns = start_ns + 1_200_000_000
+    steady = truth.at(start_ns).forward_velocity_mps * truth.at(end_ns).forward_velocity_mps > 0.3
+    start_ns, end_ns = start_ns[steady], end_ns[steady]
+    true_joule = truth.at(end_ns).energy_joule - truth.at(start_ns).energy_joule
+    inside, rms = {}, {}
+    for name, table in (("messages", streams), ("readings", without_repeats(streams)[0])):
+        rails = rails_of(Streams(table, {}, "husky"), 0)
+        error = energy_joule(rails, start_ns, end_ns, rule="exact") - true_joule
+        std = energy_noise(rails, start_ns, end_ns, np.empty((0, 2), np.int64)).std_joule()
+        inside[name] = [float(np.mean(np.abs(error) <= k * std)) for k in (1, 2)]
+        rms[name] = float(np.sqrt(np.mean(error**2)))
+    assert inside["messages"][1] < 0.6
+    assert 0.5 < inside["readings"][0] < 0.95
+    assert inside["readings"][1] > 0.85
+    assert rms["readings"] < 0.85 * rms["messages"]
