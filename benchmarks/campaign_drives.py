@@ -255,7 +255,7 @@ def _compared(labelled: LabelledSegments, read: Streams, drive: Drive, fault: Fa
         start_s=drive.seconds(start_ns).tolist(), error=error, claimed=claimed,
         bits=numbers(table["quality"]).tolist(), placed=placed.tolist(),
         driven_m=sum(labelled.ledger_m.values()), true_m=float(drive.truth.distance_m[-1]), wheels_m=wheels_m(read),
-        kept_m=labelled.ledger_m.get("kept", 0.0), said=list(dict.fromkeys(labelled.info.findings.warnings)),
+        kept_m=labelled.ledger_m.get("kept", 0.0), said=list(dict.fromkeys(labelled.info.report.findings)),
     )  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import Recipe
 from tcpipe.simulation.sensors import Power, Sensors
 from tcpipe.stages.read import read_run
-from tcpipe.tables.findings import EnergyBudget
+from tcpipe.tables.facts import EnergyBudget
 
 WAYS = tuple(Power(rate_hz=rate_hz, averaged=averaged) for averaged in (False, True) for rate_hz in (1.0, 5.0, 20.0))
 
@@ -34,7 +34,7 @@ def budget_of(power: Power) -> EnergyBudget:
     read_config = replace(recipe.read, power_averaged="yes" if power.averaged else "no")
     streams = read_run(log, read_config, robot="husky", known=shipped_profiles())
     _, _, labelled = run_stages(streams, recipe.ingest, run_id="run")
-    facts = labelled.info.findings.facts.label
+    facts = labelled.info.report.facts.label
     if facts is None or facts.energy_budget is None:
         raise SystemExit("the drive has no labels")
     return facts.energy_budget

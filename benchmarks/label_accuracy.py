@@ -55,7 +55,7 @@ def figures(run: RunDirectory, truth: Truth) -> Iterator[tuple[str, str]]:
     yield "forward velocity of the kept track, RMS", f"{_rms(speed[kept]):.4f} m/s"
     yield "yaw of the kept track, RMS", f"{np.degrees(_rms(yaw[kept])):.2f} deg"
     yield "chords, largest departure from 1 m", f"{1e3 * np.abs(floats(segments, 'chord_m') - 1).max():.6f} mm"
-    energy = run.manifest.info.findings.facts.label.energy_joule
+    energy = run.manifest.info.report.facts.label.energy_joule
     driven_m = sum(run.manifest.ledger_m.values())
     yield "energy of the whole run", f"{energy / truth.energy_joule[-1] - 1:+.3%} of {truth.energy_joule[-1]:.0f} J"
     yield "odometer", f"{driven_m / truth.distance_m[-1] - 1:+.3%} of {truth.distance_m[-1]:.1f} m"

@@ -55,7 +55,7 @@ def ladder(path: Path, robot: str | None) -> Ladder:
     arc_m = floats(table, "arc_length_m")
     chosen = (np.ones_like(power), power, sure, sure & placed)
     steps_m = (wheels_m(streams), sum(ledger_m.values()), ledger_m.get("kept", 0.0))
-    return Ladder((*steps_m, *(float(arc_m[rows].sum()) for rows in chosen)), labelled.info.findings.warnings)
+    return Ladder((*steps_m, *(float(arc_m[rows].sum()) for rows in chosen)), labelled.info.report.findings)
 
 
 def main() -> None:

@@ -445,7 +445,7 @@ class Store:
         told: dict[str, pa.Table] = {}
         for role, table in streams.tables.items():
             read_with = key, streams.robot, streams.gnss_crs, streams.power_averaged
-            info = StreamInfo(*read_with, findings=streams.findings, sensor=streams.sensors[role])
+            info = StreamInfo(*read_with, report=streams.report, sensor=streams.sensors[role])
             told[role] = with_metadata(table, plain(info))
         return put_tables(self.runs_place.below(run_id), told, folder=f"{_STREAMS}/")
 
@@ -465,7 +465,7 @@ class Store:
             if not tables:
                 return None
             sensors = {role: each.sensor for role, each in of.items()}
-            return Streams(tables, sensors, told.robot, told.gnss_crs, told.power_averaged, told.findings)
+            return Streams(tables, sensors, told.robot, told.gnss_crs, told.power_averaged, told.report)
         except (TableError, StoreError):
             return None
 

@@ -38,7 +38,7 @@ ROOMS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "terrain": (("tcpipe/terrain",), ("tests/unit/terrain", "tests/unit/stages/test_sample.py")),
     "findings": (
         (
-            "tcpipe/tables/findings.py",
+            "tcpipe/tables/facts.py",
             "tcpipe/stages/read_findings.py",
             "tcpipe/stages/fuse_findings.py",
             "tcpipe/stages/label_quality.py",

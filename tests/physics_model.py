@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from tcpipe.tables.findings import PhysicsFit
+from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
 CLASSES_SEEN = (4, 5, 6, 7)

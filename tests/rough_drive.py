@@ -7,7 +7,7 @@ import numpy as np
 from tcpipe.fusion.measurements import BodyVelocities, InertialMeasurements, InitialState, Measurements, Positions
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import quat_from_matrix, quat_from_rpy, rotation_vector_from_quat, rpy_from_matrix
-from tcpipe.tables.findings import StretchFacts
+from tcpipe.tables.facts import StretchFacts
 
 GRAVITY_MPS2 = 9.80665
 RATE_HZ = 200

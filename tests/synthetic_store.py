@@ -14,7 +14,8 @@ from tcpipe.formats.run_documents import Counts, LogOrigin, Manifest, RunJson
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.findings import NOTHING_FOUND, Findings, PowerSign, RunFacts
+from tcpipe.tables.facts import NOTHING_FOUND, PowerSign, RunFacts
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import (
     DATA_MODEL_VERSION,
     GATED_TRACK,
@@ -134,7 +135,7 @@ def add_run(
     recipe = recipe or Recipe()
     robot = table.column("robot")[0].as_py() if table.num_rows else "husky"
     power = PowerSign("drawn_positive", averaged=False, includes=includes)
-    found = Findings((), RunFacts(power=power)) if includes else NOTHING_FOUND
+    found = StageReport((), RunFacts(power=power)) if includes else NOTHING_FOUND
     info = TrackInfo(run_id, robot, Datum(15.43, 47.07, 400.0), 20.0, "smoother", found)
     identity = recipe_id(recipe, robot)
     metres = float(np.sum(table.column("arc_length_m").to_numpy()))

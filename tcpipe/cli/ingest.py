@@ -195,7 +195,7 @@ def _of_one(result: IngestResult, *, several: bool) -> Iterator[str]:
 
 def _print_warnings(summary: IngestSummary) -> None:
     """Print a line for each cause of warnings, that of most runs first."""
-    from tcpipe.tables.findings import by_cause
+    from tcpipe.tables.facts import by_cause
 
     made = [result for result in summary.results if result.run_id and result.status != "unchanged"]
     for line in dict.fromkeys(line for of in made if of.no_power for line in (of.no_power.recipe,) if line):

@@ -8,7 +8,7 @@ from dataclasses import asdict
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.tables.findings import EnergyBudget
+from tcpipe.tables.facts import EnergyBudget
 
 CAUSES = ("position", "rate", "current", "voltage")
 """Displacement of both ends; what the current did between samples; noise and rounding of the current; the voltage's."""

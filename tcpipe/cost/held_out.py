@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.cost.physics import FEWEST, Metres, fit_physics
-from tcpipe.tables.findings import PhysicsFit, PhysicsScore, PhysicsTerm
+from tcpipe.tables.facts import PhysicsFit, PhysicsScore, PhysicsTerm
 
 Floats = NDArray[np.float64]
 

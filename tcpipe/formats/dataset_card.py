@@ -16,7 +16,7 @@ from tcpipe.motion.removal import Group
 from tcpipe.recipe import Recipe
 from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.holdouts import Holdout
-from tcpipe.tables.findings import ABSENT, LEFT_OUT, EnergyBudget, PhysicsFit
+from tcpipe.tables.facts import ABSENT, LEFT_OUT, EnergyBudget, PhysicsFit
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe dataset"

@@ -26,7 +26,7 @@ from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
 from tcpipe.motion.remedies import REMEDIES
 from tcpipe.tables.arrays import column_of
-from tcpipe.tables.findings import EnergyBudget, NoPower, PhysicsFit
+from tcpipe.tables.facts import EnergyBudget, NoPower, PhysicsFit
 
 T = TypeVar("T")
 
@@ -151,7 +151,7 @@ def state_of(entry: Entry) -> str:
 
 def facts_of(manifest: Manifest, state: str) -> RunFacts:
     """Return what the index holds of a manifest."""
-    label, place = manifest.info.findings.facts.label, f"runs/{manifest.run_id}/{manifest.recipe_id}"
+    label, place = manifest.info.report.facts.label, f"runs/{manifest.run_id}/{manifest.recipe_id}"
     named = {PurePosixPath(name).name: name for name in manifest.checksums}
     if gone := [name for name in ("segments.parquet", "track.parquet", "rejections.parquet") if name not in named]:
         raise StoreError(f"{place}: its manifest lists no {gone[0]}; ingest the log again")
@@ -163,7 +163,7 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
         driven_m=math.fsum(manifest.ledger_m.values()),
         kept_m=manifest.ledger_m.get("kept", 0.0),
         energy_budget=None if label is None else label.energy_budget,
-        no_power=manifest.info.findings.facts.no_power,
+        no_power=manifest.info.report.facts.no_power,
         segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",

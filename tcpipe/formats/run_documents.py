@@ -11,7 +11,8 @@ from typing import Literal
 
 from tcpipe.formats.seals import Checksum
 from tcpipe.recipe import IngestSections
-from tcpipe.tables.findings import LEFT_OUT, NOTHING_FOUND, Findings, RunFacts
+from tcpipe.tables.facts import LEFT_OUT, NOTHING_FOUND, RunFacts
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import TABLES_VERSION, Sensor, TrackInfo
 
 
@@ -48,7 +49,7 @@ class RunJson:
     remarks: tuple[str, ...] = ()
     message_definitions: str = ""
     """Hash of the definitions that were given for types which the log does not define; "" without."""
-    findings: Findings[RunFacts] = NOTHING_FOUND
+    report: StageReport[RunFacts] = NOTHING_FOUND
     streams: Mapping[str, Checksum] = field(default_factory=dict)
     """The tables of what was read, by their name beside this document."""
     streams_key: str = ""
@@ -57,8 +58,8 @@ class RunJson:
 
 def tell_the_same(one: RunJson, other: RunJson) -> bool:
     """Tell whether two documents say the same of a log; what was computed may differ in the last bit on another processor, tags later."""
-    bare = RunJson(one.source).findings
-    return replace(one, streams={}, findings=bare, tags={}) == replace(other, streams={}, findings=bare, tags={})
+    bare = RunJson(one.source).report
+    return replace(one, streams={}, report=bare, tags={}) == replace(other, streams={}, report=bare, tags={})
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,6 +144,6 @@ class StreamInfo:
     robot: str
     gnss_crs: str
     power_averaged: bool
-    findings: Findings[RunFacts]
+    report: StageReport[RunFacts]
     sensor: Sensor
     data_model_version: str = TABLES_VERSION

@@ -34,7 +34,7 @@ from tcpipe.fusion.timeline import EventTimeline, build_timeline
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.fusion.wrong_fixes import Explained, Spans, WrongFixes, find_wrong_fixes, inside, returned
 from tcpipe.geometry.rotation import quat_from_matrix
-from tcpipe.tables.findings import Reopening
+from tcpipe.tables.facts import Reopening
 
 _MANY_FIXES = 50
 _LEVELLING_NS = 60_000_000_000

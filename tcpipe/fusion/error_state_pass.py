@@ -30,7 +30,7 @@ from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S
 from tcpipe.fusion.wrong_fixes import Explained, Innovations, Jump, Spans, explained, inside
 from tcpipe.geometry.rotation import matrix_from_quat
-from tcpipe.tables.findings import Reopening
+from tcpipe.tables.facts import Reopening
 
 _BLOCK = 2048
 _KEPT_BLOCKS = 12

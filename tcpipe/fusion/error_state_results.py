@@ -13,7 +13,7 @@ from tcpipe.fusion.process import GROUND, UNSEEN_TURN_RADPS
 from tcpipe.fusion.timeline import EventTimeline
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, quat_from_rpy
-from tcpipe.tables.findings import Reopening, StretchFacts, vector
+from tcpipe.tables.facts import Reopening, StretchFacts, vector
 
 
 def trajectory_of(

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.tables.findings import StretchFacts
+from tcpipe.tables.facts import StretchFacts
 
 DISPLACEMENT_LAGS_S = (0.5, 1.0, 2.0, 4.0)
 """Durations over which a smoother tells the uncertainty of a displacement [s]."""

@@ -40,7 +40,7 @@ from tcpipe.fusion.signals import is_covered
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Rejections, Trajectory
 from tcpipe.fusion.ukf15_events import ACCEPTED, NOT_RUN, RECOVERED, REJECTED, Belief, Events, Outputs, Sources
 from tcpipe.geometry.rotation import inverse, quat_from_rpy, rotate, rpy_from_quat
-from tcpipe.tables.findings import StretchFacts
+from tcpipe.tables.facts import StretchFacts
 
 _PLACE, _TURNING, _ACCELERATING = (
     tuple(range(kernel.STATES)[of]) for of in (kernel.POSITION, kernel.TURN, kernel.ACCELERATION)

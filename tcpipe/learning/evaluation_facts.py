@@ -14,7 +14,7 @@ from tcpipe.learning.fitting import Seed
 from tcpipe.learning.metrics import Errors
 from tcpipe.learning.model_card import Training
 from tcpipe.learning.ratios import Ratio
-from tcpipe.tables.findings import ABSENT
+from tcpipe.tables.facts import ABSENT
 
 KIND = "tcpipe evaluation"
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from tcpipe.tables.findings import ABSENT
+from tcpipe.tables.facts import ABSENT
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from tcpipe.formats.json_files import Json
 from tcpipe.formats.seals import Checksum
 from tcpipe.learning.architecture import Architecture
 from tcpipe.learning.fitting import FitConfig
-from tcpipe.tables.findings import LEFT_OUT, PhysicsFit
+from tcpipe.tables.facts import LEFT_OUT, PhysicsFit
 from tcpipe.terrain.classes import TerrainClass
 
 KIND = "tcpipe model"

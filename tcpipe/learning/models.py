@@ -34,7 +34,7 @@ from tcpipe.learning.architecture import check_trainable, weight_forms
 from tcpipe.learning.metrics import LEAST_VELOCITY_MPS
 from tcpipe.learning.model_card import KIND, SCHEMA_VERSION, ModelCard, is_current
 from tcpipe.learning.physics_model import PhysicsModel, physics_forms, physics_model_of
-from tcpipe.tables.findings import PhysicsFit
+from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
 if TYPE_CHECKING:

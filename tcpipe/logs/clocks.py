@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.logs.simulated_clock import SimulatedClock, find_simulated_clock
-from tcpipe.tables.findings import ClockStep
+from tcpipe.tables.facts import ClockStep
 
 Ints = NDArray[np.int64]
 Mask = NDArray[np.bool_]

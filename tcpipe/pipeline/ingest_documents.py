@@ -19,7 +19,7 @@ def run_json_of(task: IngestTask, log: AnyLog, streams: Streams, sha256: str) ->
         topics=tuple(TopicCount(topic.name, topic.type_name, topic.message_count) for topic in log.topics.values()),
         sensors=streams.sensors,
         message_definitions=task.definitions,
-        findings=streams.findings,
+        report=streams.report,
     )
 
 
@@ -40,7 +40,7 @@ def manifest_of(
         tags=known.tags,
         counts=Counts(labelled.table.num_rows, track.table.num_rows, track.rejections.num_rows, **rows),
         ledger_m=labelled.ledger_m,
-        warnings=tuple(dict.fromkeys(info.findings.warnings)),
+        warnings=tuple(dict.fromkeys(info.report.findings)),
         damage=known.damage,
         info=info,
         robot_requested=task.robot,

@@ -20,7 +20,7 @@ from tcpipe.pipeline.known_trouble import failure_name
 from tcpipe.pipeline.log_sources import LogSource
 from tcpipe.pipeline.transience import is_transient
 from tcpipe.recipe import Recipe
-from tcpipe.tables.findings import EnergyBudget, NoPower
+from tcpipe.tables.facts import EnergyBudget, NoPower
 
 R = TypeVar("R")
 

@@ -15,7 +15,7 @@ from tcpipe.formats.record_files import record_name
 from tcpipe.pipeline.begun_calls import BegunCall, begun_calls
 from tcpipe.pipeline.log_sources import LogSource, find_sources, lineage_of
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.facts import LEFT_OUT
 
 _MOST_CANDIDATES = 10
 

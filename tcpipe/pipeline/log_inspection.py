@@ -20,7 +20,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import Profiles
 from tcpipe.stages.read_candidates import power_candidates
 from tcpipe.stages.read_roles import find_read_config, roles_by
-from tcpipe.tables.findings import ABSENT, ClockStep, NoPower
+from tcpipe.tables.facts import ABSENT, ClockStep, NoPower
 
 if TYPE_CHECKING:
     from tcpipe.formats.logs.table_log import TableLog

@@ -31,7 +31,7 @@ from tcpipe.recipe.suggestions import recipe_key
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config, roles_by
 from tcpipe.tables.columns import integers
-from tcpipe.tables.findings import EnergyBudget, NoPower, RunFacts
+from tcpipe.tables.facts import EnergyBudget, NoPower, RunFacts
 from tcpipe.tables.levels import LabelledSegments
 
 MISSING: Mapping[Role, str] = {
@@ -218,8 +218,8 @@ def _told(
     placed: bool,
     problems: tuple[str, ...],
 ) -> Preflight:
-    facts = labelled.info.findings.facts if labelled else RunFacts()
-    every = tuple(dict.fromkeys((*(labelled.info.findings.warnings if labelled else ()), *(seen.warnings or ()))))
+    facts = labelled.info.report.facts if labelled else RunFacts()
+    every = tuple(dict.fromkeys((*(labelled.info.report.findings if labelled else ()), *(seen.warnings or ()))))
     clock = tuple(line for line in every if _CLOCK.search(line))
     promise = _promise(labelled) if labelled else None
     topics = tuple(_topics(facts, seen.duration_s or 0.0))
@@ -249,7 +249,7 @@ def _told(
 
 
 def _promise(labelled: LabelledSegments) -> Promise:
-    facts, ledger_m = labelled.info.findings.facts, labelled.ledger_m
+    facts, ledger_m = labelled.info.report.facts, labelled.ledger_m
     cut, label = facts.segment, facts.label
     seconds = cut.ledger_s if cut else {}
     span_s, count = math.fsum(seconds.values()), labelled.table.num_rows

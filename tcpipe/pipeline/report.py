@@ -108,7 +108,7 @@ def _of_dataset(path: Path | str, *, patches: bool) -> Page:
 
 
 def _physics_of(run: RunDirectory) -> tuple[str, ...]:
-    label = run.manifest.info.findings.facts.label
+    label = run.manifest.info.report.facts.label
     fit = label.physics.fit if label is not None and label.physics is not None else None
     return () if fit is None else (physics_in_words(run.manifest.robot, fit),)
 

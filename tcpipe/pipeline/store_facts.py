@@ -16,7 +16,7 @@ from tcpipe.pipeline.prune import is_replaced
 from tcpipe.pipeline.status import failed_for_now
 from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts
 from tcpipe.store import Store
-from tcpipe.tables.findings import by_cause
+from tcpipe.tables.facts import by_cause
 
 
 def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirectory] = ()) -> StoreFacts:

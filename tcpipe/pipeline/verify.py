@@ -16,7 +16,7 @@ from tcpipe.formats.seals import Checksums, broken_checksums, read_sealed_as
 from tcpipe.pipeline.verify_dataset import verify_dataset
 from tcpipe.pipeline.verify_store import verify_map, verify_run, verify_store
 from tcpipe.store import Store, inside_store, is_store
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.facts import LEFT_OUT
 
 Finding = tuple[str, int] | str
 """What was read and how much of it, or a problem."""

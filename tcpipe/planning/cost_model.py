@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tcpipe.dataset.beside import Beside
 from tcpipe.dataset.tensor import TensorForm
 from tcpipe.errors import ModelError
-from tcpipe.tables.findings import PhysicsFit
+from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 from tcpipe.terrain.layers import PAPER_LAYERS, paper_layers
 from tcpipe.terrain.sampling import Patches

@@ -22,7 +22,7 @@ from tcpipe.planning.cost_model import CostModel, check_model
 from tcpipe.planning.path_files import cost_text
 from tcpipe.planning.plan import OBJECTIVES, Objective, PlanTotals, plan_path
 from tcpipe.planning.survey import Survey, new_survey, survey_from
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.facts import LEFT_OUT
 
 VERSION = "1.1"
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tcpipe.geometry.angles import wrap_to_pi
-from tcpipe.tables.findings import PhysicsFit
+from tcpipe.tables.facts import PhysicsFit
 from tcpipe.terrain.classes import ClassTable
 
 Floats = NDArray[np.float64]

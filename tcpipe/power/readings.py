@@ -24,7 +24,7 @@ from tcpipe.power.sources import (
 from tcpipe.power.wrapped import wrap_of
 from tcpipe.recipe.suggestions import RecipeFragment, suggested
 from tcpipe.robots.profiles import CurrentSign, PowerSource
-from tcpipe.tables.findings import NoPower
+from tcpipe.tables.facts import NoPower
 
 _LOG_TIME = "log_time_ns"
 _OF_USUAL_VOLTAGE = (0.2, 3.0)

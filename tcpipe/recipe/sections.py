@@ -15,7 +15,7 @@ from annotated_types import Ge, Le, Lt
 
 from tcpipe.recipe.checking import settle
 from tcpipe.robots.profiles import PlausibleSpeed, PowerSource, Robot
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.facts import LEFT_OUT
 
 _STRICT = {"extra": "forbid", "use_attribute_docstrings": True, "allow_inf_nan": False}
 

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias
 from tcpipe.errors import RecipeError
 from tcpipe.recipe.checking import as_toml, from_values, kinds_of
 from tcpipe.recipe.sections import Recipe
+from tcpipe.tables.findings import Remedy
 
 TomlValue: TypeAlias = "bool | float | str | Sequence[TomlValue] | Mapping[str, TomlValue]"
 Keys: TypeAlias = Mapping[str, TomlValue]
@@ -37,14 +38,14 @@ class RecipeFragment:
             inner[last] = keys if not isinstance(keys, Mapping) else {**inner.get(last, {}), **keys}
         from_values(Recipe, values, where="suggested recipe")
 
-    def __str__(self) -> str:
-        """Return it inside a sentence, as ``under [read]: imu_units = "deg"``."""
-        return " and ".join(
-            f"under [{name}]: {line}"
+    def inline(self) -> str:
+        """Return it inside a sentence, as ``[read] imu_units = "deg"``."""
+        parts = [
+            (f"[{name}]" if isinstance(keys, Mapping) else f"[[{name}]]", each)
             for name, keys in self.tables.items()
-            if isinstance(keys, Mapping)
-            for line in _lines(keys)
-        )
+            for each in ([keys] if isinstance(keys, Mapping) else keys)
+        ]
+        return " and ".join(f"{head} {', '.join(_lines(each))}" for head, each in parts)
 
     def toml(self) -> str:
         """Return it as lines that stand in a recipe as they are."""
@@ -60,18 +61,19 @@ def _lines(keys: Keys) -> list[str]:
     return [f"{name} = {as_toml(value)}" for name, value in keys.items()]
 
 
-def suggested(purpose: str, tables: Mapping[str, Keys]) -> str:
-    """Return the end of a message that says what to write in the recipe; "" where the recipe would refuse that.
+def suggest(name: str, tables: Mapping[str, Keys | Sequence[Keys]]) -> tuple[Remedy, ...]:
+    """Return a remedy that changes keys of the recipe; none where the recipe would refuse them.
 
     Parameters
     ----------
-    purpose : what it is for, as ``to correct it``.
+    name : key in the catalogue's ``remedies`` of the finding's code.
     tables : as those of `RecipeFragment`.
     """
     try:
-        return f"; {purpose}, write in the recipe {RecipeFragment(tables)}"
+        RecipeFragment(tables)
     except RecipeError:
-        return ""
+        return ()
+    return (Remedy(name, recipe=tables),)
 
 
 @cache

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from tcpipe.cost.budget import in_words
 from tcpipe.report.page import Section
-from tcpipe.tables.findings import EnergyBudget
+from tcpipe.tables.facts import EnergyBudget
 
 _ROWS = {
     "position": "position of both ends",

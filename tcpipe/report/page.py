@@ -22,7 +22,7 @@ from tcpipe.errors import plain_line
 from tcpipe.formats.json_files import Json
 from tcpipe.report import plots
 from tcpipe.report.plots import Plot
-from tcpipe.tables.findings import by_cause
+from tcpipe.tables.facts import by_cause
 
 _UNSEEN = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u061c\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff]")
 """Characters that cannot be seen in a page, or turn its text round: a name may hold them."""

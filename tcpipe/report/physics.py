@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from tcpipe.report.page import Section
-from tcpipe.tables.findings import PhysicsFit, PhysicsTerm
+from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 
 _ASIDE = {"grade": "weight over efficiency"}
 

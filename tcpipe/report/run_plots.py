@@ -15,7 +15,7 @@ from tcpipe.report.run_series import Floats, Series, Spans, Timeline, thinned
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import RunFacts
+from tcpipe.tables.facts import RunFacts
 
 REASON_WORDS = {
     DropReason.GAP: "no usable motion or power here: a gap of a sensor, a jump, or a position that is too uncertain",

@@ -30,7 +30,7 @@ from tcpipe.report.run_verdict import verdict
 from tcpipe.store import Store
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import PhysicsFacts
+from tcpipe.tables.facts import PhysicsFacts
 
 _PAGE = "report.html"
 _STEP_M = 0.05
@@ -59,7 +59,7 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
     ``of_maps`` keeps pictures of maps by name, for who writes the pages of many runs.
     """
     track, segments, manifest, refused = run.track().table, run.segments(), run.manifest, run.rejections()
-    label = manifest.info.findings.facts.label
+    label = manifest.info.report.facts.label
     known = store.run_json(run.run_id)
     ledger, total = manifest.ledger_m, sum(manifest.ledger_m.values())
     bits = integers(segments, "quality")
@@ -122,7 +122,7 @@ def _drawn(
     series = [track_series(track, timeline, ground.track_xy_m), *told]
     lines, spans = lines_of(series), gate_spans(track, timeline, info.rate_hz)
     over_time = time_plots(
-        timeline, lines=lines, spans=spans, facts=info.findings.facts, refused=refused, labels=bool(segments.num_rows)
+        timeline, lines=lines, spans=spans, facts=info.report.facts, refused=refused, labels=bool(segments.num_rows)
     )
     data: dict[str, Json] = {
         "run": run.run_id,

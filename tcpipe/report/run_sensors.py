@@ -8,12 +8,12 @@ import pyarrow as pa
 
 from tcpipe.formats.run_documents import Counts, Manifest, RunJson
 from tcpipe.report.page import Section
-from tcpipe.tables.findings import ClockOffset, RunFacts
+from tcpipe.tables.facts import ClockOffset, RunFacts
 
 
 def sensor_sections(known: RunJson | None, manifest: Manifest, rejections: pa.Table) -> list[Section]:
     """Return the sections on topics, on trust, on disagreement and on clocks; ``known`` is None where the run's ``run.json`` is lost."""
-    facts = manifest.info.findings.facts
+    facts = manifest.info.report.facts
     topics = [] if known is None else [_topics(known, manifest.counts)]
     return [*topics, *_trust(facts, rejections), *_disagreements(facts), *_clocks(facts)]
 

@@ -10,7 +10,7 @@ from tcpipe.motion.remedies import REMEDIES
 from tcpipe.report.page import Verdict
 from tcpipe.report.quality import QUALITY_WORDS
 from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.findings import NoPower, RunFacts
+from tcpipe.tables.facts import NoPower, RunFacts
 
 _FEW_SEGMENTS = 30
 _MANY = 0.1
@@ -29,7 +29,7 @@ _SENSORS = {
 
 def verdict(manifest: Manifest, quality: Mapping[str, int], missing: Sequence[str]) -> list[Verdict]:
     """Return the sentences; ``quality`` counts segments by bit, ``missing`` is what the page itself lacks."""
-    facts = manifest.info.findings.facts
+    facts = manifest.info.report.facts
     driven_m = sum(manifest.ledger_m.values())
     segments = manifest.counts.segments
     refused = facts.no_power
@@ -73,12 +73,12 @@ def _thin(manifest: Manifest, segments: int, missing: Sequence[str]) -> Iterator
         yield Verdict("thin", f"{segments} segments only.")
     instead = {"gnss"} if manifest.counts.pose_messages else set()
     for role, text in _SENSORS.items():
-        said = role == "power" and manifest.info.findings.facts.no_power is not None
+        said = role == "power" and manifest.info.report.facts.no_power is not None
         if not getattr(manifest.counts, f"{role}_messages") and role not in instead and not said:
             yield Verdict("thin", text)
     for text in missing:
         yield Verdict("thin", text)
-    label = manifest.info.findings.facts.label
+    label = manifest.info.report.facts.label
     if segments and label is not None and label.energy_joule is not None and not label.physics.fitted:
         yield Verdict("thin", "Physics could not be fitted: too few segments, or too much alike.")
 

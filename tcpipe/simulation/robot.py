@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from tcpipe.compiled import kernel
 from tcpipe.simulation.site import Float
 from tcpipe.simulation.world import GRASS, MUD, PAVED, UNPAVED
-from tcpipe.tables.findings import ABSENT
+from tcpipe.tables.facts import ABSENT
 
 GRAVITY_MPS2 = 9.80665
 _STEEPEST_SIN = float(np.sin(np.radians(22.5)))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from tcpipe.simulation.ripples import Wave, ripple
 from tcpipe.simulation.site import Float, Site
 from tcpipe.simulation.surface import Surface
-from tcpipe.tables.findings import ABSENT
+from tcpipe.tables.facts import ABSENT
 
 OBSTACLE, TREE, VEGETATION, GRASS, MUD, UNPAVED, PAVED = range(1, 8)
 

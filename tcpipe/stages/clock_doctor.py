@@ -18,7 +18,8 @@ from tcpipe.stages.fuse_sanity import longest_epoch
 from tcpipe.stages.power_rails import rails_of
 from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.columns import floats
-from tcpipe.tables.findings import ClockFacts, ClockOffset, ClockPair, Findings
+from tcpipe.tables.facts import ClockFacts, ClockOffset, ClockPair
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Streams
 
 _MAX_GAP_NS = 300_000_000
@@ -26,14 +27,14 @@ _FINE_S = 0.004
 _TURNED_OVER_M = 1.0
 
 
-def clock_findings(streams: Streams, inputs: FusionInputs) -> Findings[ClockFacts]:
+def clock_findings(streams: Streams, inputs: FusionInputs) -> StageReport[ClockFacts]:
     """Return the offsets between the sensors' clocks in the longest clock epoch; nothing is corrected.
 
     The recipe lines that would correct an offset include what the recipe adds already.
     """
     epoch = longest_epoch(inputs)
     found = find_clock_offsets(inputs.measurements[epoch], _power(streams, epoch))
-    given_s = streams.findings.facts.time_offset_s
+    given_s = streams.report.facts.time_offset_s
     offsets, warnings = {}, []
     for role, offset in found.offsets.items():
         name = recipe_role(role, streams)
@@ -47,7 +48,7 @@ def clock_findings(streams: Streams, inputs: FusionInputs) -> Findings[ClockFact
             warnings.append(_said(found, role, offset, name) + ("" if useless else suggested(purpose, tables)))
     pairs = tuple(ClockPair(**_told(pair), determined=pair.determined) for pair in found.pairs)
     lost = found.position_offset_s or None, found.heading_offset_s or None
-    return Findings(tuple(warnings), ClockFacts(epoch, found.reference, pairs, offsets, *lost))
+    return StageReport(tuple(warnings), ClockFacts(epoch, found.reference, pairs, offsets, *lost))
 
 
 def _is_open(offset: RoleOffset) -> bool:

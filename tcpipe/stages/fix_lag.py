@@ -9,20 +9,21 @@ from tcpipe.fusion.measurements import GNSS
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import moved_m
 from tcpipe.stages.fuse_stretches import Fused
-from tcpipe.tables.findings import ClockFacts, ClockOffset, Findings
+from tcpipe.tables.facts import ClockFacts, ClockOffset
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Streams
 
 
 def with_lag_on_path(
-    clocks: Findings[ClockFacts], fused: Fused, inputs: FusionInputs, streams: Streams
-) -> Findings[ClockFacts]:
+    clocks: StageReport[ClockFacts], fused: Fused, inputs: FusionInputs, streams: Streams
+) -> StageReport[ClockFacts]:
     """Return the findings on clocks with the lag of the fixes behind the path, where that is sure and was not told."""
     if GNSS not in streams.sensors:
         return clocks
     return with_lag_of_fixes(clocks, lag_of(fused.arms, moved_m(inputs, streams)))
 
 
-def with_lag_of_fixes(clocks: Findings[ClockFacts], lag: tuple[float, float] | None) -> Findings[ClockFacts]:
+def with_lag_of_fixes(clocks: StageReport[ClockFacts], lag: tuple[float, float] | None) -> StageReport[ClockFacts]:
     """Return the findings with a lag of the fixes and its deviation [s].
 
     Whether they are late or the odometry early, the path does not tell.
@@ -38,4 +39,4 @@ def with_lag_of_fixes(clocks: Findings[ClockFacts], lag: tuple[float, float] | N
     )
     offset = ClockOffset(lag_s, std_s, True, None, None, False, "", blamed=False)
     facts = replace(clocks.facts, offsets={**clocks.facts.offsets, GNSS: offset}, position_offset_s=abs(lag_s))
-    return Findings((*clocks.warnings, line), facts)
+    return StageReport((*clocks.warnings, line), facts)

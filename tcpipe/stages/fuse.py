@@ -19,7 +19,7 @@ from tcpipe.stages.fuse_inputs import FusionInputs, prepare_inputs
 from tcpipe.stages.fuse_mounting_findings import mounting_findings
 from tcpipe.stages.fuse_sanity import sane_inputs
 from tcpipe.stages.read_pose import GNSS, pose_as_fixes, recipe_role
-from tcpipe.tables.findings import Findings
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import TRACK, Datum, Streams, Track, TrackInfo
 
 
@@ -63,15 +63,15 @@ def fuse_run(streams: Streams, config: FuseConfig, *, run_id: str) -> Track:
         *(line for each in found for line in each.warnings),
     )
     facts = replace(
-        streams.findings.facts,
+        streams.report.facts,
         fuse=summary,
         sensor_checks=sanity.facts,
         mounting=mounting.facts,
         audit=audit.facts,
         clock_offsets=clocks.facts,
     )
-    findings = Findings(streams.findings.warnings + warnings, facts)
-    info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, findings)
+    report = StageReport(streams.report.findings + warnings, facts)
+    info = TrackInfo(run_id, streams.robot, datum, config.rate_hz, config.estimator, report)
     return Track(table, rejections_table(inputs, fused.found), info)
 
 

@@ -19,18 +19,19 @@ from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import fuse_mounted
 from tcpipe.stages.fuse_sanity import left_out
 from tcpipe.stages.fuse_stretches import Fused, fuse_stretches
-from tcpipe.tables.findings import Findings, SensorChecks
+from tcpipe.tables.facts import SensorChecks
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Streams
 
 _WHY = "in most of the way the others contradict it, and not each other (another clock, drive or unit?)"
 _WHY_ASTRAY = "with it the track moves otherwise than every sensor says, without it the track follows them"
 
-Judged = tuple[FusionInputs, Findings[SensorChecks]]
+Judged = tuple[FusionInputs, StageReport[SensorChecks]]
 
 
 def fuse_agreeing(
-    inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams, config: FuseConfig
-) -> tuple[FusionInputs, Findings[SensorChecks], Fused]:
+    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig
+) -> tuple[FusionInputs, StageReport[SensorChecks], Fused]:
     """Fuse each stretch; where sensors contradict each other in most of the way, again without the one that is at fault.
 
     So it is where the track goes astray. What a track that they led showed of mountings and scales is forgotten then.
@@ -61,7 +62,7 @@ def _is_astray(fused: Fused) -> bool:
 
 
 def _without(
-    roles: Sequence[str], why: str, inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams
+    roles: Sequence[str], why: str, inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams
 ) -> Judged:
     odometries = {name for m in inputs.measurements.values() for name in m.odometries()}.difference(roles)
     refusals = [fixes_refused(why, odometries) if role == GNSS else Refusal(role, why) for role in roles]
@@ -69,7 +70,7 @@ def _without(
 
 
 def _at_fault(
-    inputs: FusionInputs, sanity: Findings[SensorChecks], streams: Streams, config: FuseConfig, *, astray: bool
+    inputs: FusionInputs, sanity: StageReport[SensorChecks], streams: Streams, config: FuseConfig, *, astray: bool
 ) -> tuple[str, ...]:
     """Return the one sensor without which the others agree; of several that whose others confirm each other most, none of two equals.
 

@@ -12,11 +12,12 @@ from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_sanity import command_of, longest_epoch, without_role
 from tcpipe.stages.fuse_stretches import Fused
 from tcpipe.stages.read_pose import recipe_role
-from tcpipe.tables.findings import AuditFacts, Disagreement, Findings
+from tcpipe.tables.facts import AuditFacts, Disagreement
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Streams
 
 
-def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> Findings[AuditFacts]:
+def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> StageReport[AuditFacts]:
     """Return every disagreement, the sensors that contradict each other in most of the way, and the warnings of both."""
     undecided = undecided_in_most(fused.tallies)
     found = fused.disagreements
@@ -37,7 +38,7 @@ def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> Find
     faster = _over_command(inputs, streams)
     if faster is not None:
         sensors.add(WHEELS)
-        scale = round((streams.findings.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
+        scale = round((streams.report.facts.odometry_scale or {}).get(WHEELS, 1.0) / faster, 2)
         lines.append(
             f"{WHEELS}: it goes {faster:.2f} times as fast as commanded, which no robot does, and no fix or camera tells how long a metre "
             f"is: no segments"
@@ -47,7 +48,7 @@ def audit_findings(fused: Fused, inputs: FusionInputs, streams: Streams) -> Find
             )
             + without_role("command", "to leave out the command, if it is not what drives")
         )
-    return Findings(tuple(lines), AuditFacts(tuple(found), tuple(sorted(sensors))))
+    return StageReport(tuple(lines), AuditFacts(tuple(found), tuple(sorted(sensors))))
 
 
 def _over_command(inputs: FusionInputs, streams: Streams) -> float | None:

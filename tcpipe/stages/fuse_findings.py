@@ -13,7 +13,7 @@ from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_sanity import without_role
-from tcpipe.tables.findings import FuseFacts, StretchFacts
+from tcpipe.tables.facts import FuseFacts, StretchFacts
 
 _MANY_REFUSED = 0.2
 _COMMON = 0.02

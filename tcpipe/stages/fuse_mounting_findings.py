@@ -14,24 +14,25 @@ from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_mounting import moved_m
 from tcpipe.stages.fuse_sanity import stated_placement
 from tcpipe.stages.read_pose import recipe_role
-from tcpipe.tables.findings import Findings, MountingFacts, vector
+from tcpipe.tables.facts import MountingFacts, vector
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Sensor, Streams
 
 
-def mounting_findings(inputs: FusionInputs, streams: Streams) -> Findings[MountingFacts | None]:
+def mounting_findings(inputs: FusionInputs, streams: Streams) -> StageReport[MountingFacts | None]:
     """Return what was mended, with the recipe lines that would state it."""
     arm, tilt = inputs.arm, inputs.imu_tilt
     warnings = [] if arm is None else [_arm_warning(arm, streams.sensors[GNSS], recipe_role(GNSS, streams))]
     warnings += [] if tilt is None else [_tilt_warning(tilt, streams.sensors[IMU])]
-    given = streams.findings.facts.odometry_scale or {}
+    given = streams.report.facts.odometry_scale or {}
     warnings += [_scale_warning(role, scale, given.get(role, 1.0)) for role, scale in inputs.scales.items()]
     if not warnings:
-        return Findings((), None)
+        return StageReport((), None)
     std_m = None if arm is None else vector(np.sqrt(np.diag(arm.covariance)[:3]))
     moved = None if arm is None else vector(moved_m(inputs, streams))
     roll_pitch = None if tilt is None else (float(tilt.rad[0]), float(tilt.rad[1]))
     scales = {role: scale.factor for role, scale in inputs.scales.items()} or None
-    return Findings(tuple(warnings), MountingFacts(moved, std_m, roll_pitch, scales))
+    return StageReport(tuple(warnings), MountingFacts(moved, std_m, roll_pitch, scales))
 
 
 def _scale_warning(role: str, scale: Scale, given: float) -> str:

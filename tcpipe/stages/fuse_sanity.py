@@ -18,16 +18,17 @@ from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.read_pose import recipe_role
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import Findings, SensorChecks
+from tcpipe.tables.facts import SensorChecks
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Streams
 
 _STATED = ("recipe", "tf_static", "same frame")
 
 
-def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, Findings[SensorChecks]]:
+def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, StageReport[SensorChecks]]:
     """Return the inputs without the sensors that are refused, and why, judged over the longest clock epoch."""
     if not inputs.measurements:
-        return inputs, Findings((), SensorChecks())
+        return inputs, StageReport((), SensorChecks())
     epoch = longest_epoch(inputs)
     stated = {role: sensor.placed_by in _STATED for role, sensor in streams.sensors.items()}
     checks = check_sensors(
@@ -36,21 +37,21 @@ def sane_inputs(inputs: FusionInputs, streams: Streams) -> tuple[FusionInputs, F
     if checks.scales:
         measured = {number: rescaled_odometries(m, checks.scales) for number, m in inputs.measurements.items()}
         inputs = replace(inputs, measurements=measured, scales=checks.scales)
-    sane, found = left_out(inputs, Findings((), checks.facts), checks.refusals, streams)
+    sane, found = left_out(inputs, StageReport((), checks.facts), checks.refusals, streams)
     doubt = doubt_of_velocity(sane.measurements[epoch])
     if doubt is None:
         return sane, found
     sane, found = left_out(sane, found, [Refusal(DOPPLER, doubt.why)], streams)
     if doubt.late_s is None:
         return sane, found
-    given_s = streams.findings.facts.time_offset_s.get(DOPPLER, 0.0)
+    given_s = streams.report.facts.time_offset_s.get(DOPPLER, 0.0)
     mend = suggested("to correct its clock", {"read.time_offset_s": {DOPPLER: round(given_s - doubt.late_s, 2)}})
     return sane, replace(found, warnings=(*found.warnings[:-1], found.warnings[-1] + mend))
 
 
 def left_out(
-    inputs: FusionInputs, before: Findings[SensorChecks], refusals: Sequence[Refusal], streams: Streams
-) -> tuple[FusionInputs, Findings[SensorChecks]]:
+    inputs: FusionInputs, before: StageReport[SensorChecks], refusals: Sequence[Refusal], streams: Streams
+) -> tuple[FusionInputs, StageReport[SensorChecks]]:
     """Return the inputs without refused sensors, with why and the warnings that name the mending line."""
     refused = inputs.refused | {refusal.role for refusal in refusals}
     kept = {number: _without(refused, measurements) for number, measurements in inputs.measurements.items()}
@@ -58,7 +59,7 @@ def left_out(
     warnings = (*before.warnings, *(_warning(refusal, streams) for refusal in refusals))
     datum = None if GNSS in refused else inputs.datum_deg_m
     inputs = replace(inputs, datum_deg_m=datum, measurements=kept, refused=refused)
-    return inputs, Findings(warnings, replace(before.facts, refused=reasons))
+    return inputs, StageReport(warnings, replace(before.facts, refused=reasons))
 
 
 def _without(refused: frozenset[str], m: Measurements) -> Measurements:

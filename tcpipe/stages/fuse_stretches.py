@@ -29,7 +29,7 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages.fuse_columns import command_columns, pose_columns, power_columns, wheel_column
 from tcpipe.stages.fuse_findings import stretch_facts
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.tables.findings import Disagreement, StretchFacts
+from tcpipe.tables.facts import Disagreement, StretchFacts
 from tcpipe.tables.levels import Streams
 
 

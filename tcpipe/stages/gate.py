@@ -11,11 +11,11 @@ from tcpipe.motion.pieces import Mask, MotionRows, piece_of_rows
 from tcpipe.recipe import GateConfig
 from tcpipe.robots.profiles import MAX_PLAUSIBLE_MPS
 from tcpipe.stages.gate_gaps import find_gaps
-from tcpipe.stages.gate_limit import limit_warnings, speed_limit
+from tcpipe.stages.gate_limit import find_limits, speed_limit
 from tcpipe.tables.bits import DropReason, name_of
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import GateFacts
-from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, with_findings
+from tcpipe.tables.facts import GateFacts
+from tcpipe.tables.levels import GATED_TRACK, GatedTrack, Track, add_findings
 
 
 def gate_track(
@@ -66,8 +66,8 @@ def gate_track(
         full_speed_mps=slowest,
     )
     gated = GATED_TRACK.table(**{name: table[name] for name in table.column_names}, dropped_by=dropped_by)
-    warnings = (*gaps.warnings, *limit_warnings(rows, dropped_by, limit, config))
-    return GatedTrack(gated, with_findings(track.info, warnings, replace(track.info.findings.facts, gate=facts)))
+    findings = (*gaps.findings, *find_limits(rows, dropped_by, limit, config))
+    return GatedTrack(gated, add_findings(track.info, findings, replace(track.info.report.facts, gate=facts)))
 
 
 def _motion(rows: MotionRows, config: GateConfig) -> dict[DropReason, Mask]:

@@ -71,7 +71,7 @@ def find_gaps(track: Track, rows: MotionRows, *, chord_m: float, config: GateCon
             f"the position jumps {far} times, the furthest by {off_m.max():.1f} m at {at_ns} ns, which no speed explains (a GNSS that "
             "changed its base, datum or receiver, or an odometry that errs?): nothing is cut across, and the jump is not counted as driven"
         )
-    audit = track.info.findings.facts.audit
+    audit = track.info.report.facts.audit
     contradicted = np.full(len(moving), bool(audit and audit.undecided))
     implausible, fast_lines = find_implausible(track, rows, jumps, max_plausible_mps)
     warnings += fast_lines
@@ -101,7 +101,7 @@ def _common_std_mps(track: Track) -> Floats:
     stamp_ns, epoch = integers(table, "stamp_ns"), integers(table, "epoch")
     speed_mps = np.linalg.norm([floats(table, f"{name}_velocity_mps") for name in ("east", "north", "up")], axis=0)
     scale_std = np.zeros(len(speed_mps))
-    fuse = track.info.findings.facts.fuse
+    fuse = track.info.report.facts.fuse
     for stretch in fuse.stretches if fuse else ():
         inside = (epoch == stretch.epoch) & (stamp_ns >= stretch.start_ns) & (stamp_ns <= stretch.end_ns)
         scale_std[inside] = stretch.common_scale_std or 0.0

@@ -9,24 +9,27 @@ import numpy as np
 from tcpipe.motion import masks
 from tcpipe.motion.pieces import Mask, MotionRows
 from tcpipe.recipe import GateConfig
-from tcpipe.recipe.suggestions import suggested
+from tcpipe.recipe.suggestions import suggest
 from tcpipe.tables.bits import DropReason
+from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.findings import Finding, Remedy, Subject, make_finding
 
 _MOST = 0.5
 """More than this share of the moving track at one top command makes that the limit of the run."""
 
 
-_WITHOUT = suggested("to keep rows whatever was commanded", {"gate": {"require_full_speed": False}})
+_COMMAND = Subject("role", "command")
+_KEEP = suggest("keep", {"gate": {"require_full_speed": False}})
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedLimit:
-    """The limit [m/s], None where nobody knows one; the run's top command [m/s] and the share of it held there; what is to be said."""
+    """The limit [m/s], None where nobody knows one; the run's top command [m/s] and the share of it held there; what was found."""
 
     limit_mps: float | None
     top_mps: float
     held: float
-    warnings: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def speed_limit(rows: MotionRows, config: GateConfig, *, max_velocity_mps: float | None) -> SpeedLimit:
@@ -41,28 +44,33 @@ def speed_limit(rows: MotionRows, config: GateConfig, *, max_velocity_mps: float
         return SpeedLimit(config.max_velocity_mps or max_velocity_mps, top, held)
     if held <= _MOST or top >= config.full_speed_fraction * max_velocity_mps:
         return SpeedLimit(max_velocity_mps, top, held)
-    text = f"{held:.0%} of the moving track was commanded at {top:.2f} m/s, not at the robot's {max_velocity_mps} m/s"
-    said = f"{text}: that is taken for the limit of this run{_suggest_limit('to settle it', top)}"
-    return SpeedLimit(top, top, held, (said,))
+    found = make_finding(
+        "limit-from-commands",
+        _COMMAND,
+        held_fraction=held,
+        top_mps=top,
+        limit_mps=max_velocity_mps,
+        remedies=_state_limit(top),
+    )
+    return SpeedLimit(top, top, held, (found,))
 
 
-def limit_warnings(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: GateConfig) -> tuple[str, ...]:
-    """Return what is to be said of commands: that there are none, that no limit is known, that most was driven below it."""
+def find_limits(rows: MotionRows, dropped_by: Mask, limit: SpeedLimit, config: GateConfig) -> tuple[Finding, ...]:
+    """Return the findings on commands: that there are none, that no limit is known, that most was driven below it."""
     commanded, moving = np.isfinite(rows.commanded_mps), np.abs(rows.velocity_mps) > config.turning_velocity_mps
     if not commanded.any():
-        return ("no command topic: it cannot be known whether the robot was driven at its maximum speed",)
+        return (make_finding("no-command", _COMMAND),)
     if limit.limit_mps is None and config.require_full_speed:
-        text = "the robot's maximum speed is not known, so no row is dropped as commanded below it"
-        return (
-            f"{text}{_suggest_limit('if its largest command was the limit', np.nanmax(rows.commanded_mps))}{_WITHOUT}",
-        )
+        remedies = (*_state_limit(np.nanmax(rows.commanded_mps)), *_KEEP)
+        return (make_finding("max-velocity-unknown", _COMMAND, remedies=remedies),)
     slow = (dropped_by & DropReason.BELOW_LIMIT) != 0
-    if slow[moving].sum() > 0.5 * moving.sum():
-        text = f"{slow[moving].mean():.0%} of the moving track was commanded below {config.full_speed_fraction} of {limit.limit_mps} m/s"
-        own = f"if this robot is slower (its top command, {limit.top_mps:.2f} m/s, was held for {limit.held:.0%} of it)"
-        return (f"{text}{_suggest_limit(own, limit.top_mps)}{_WITHOUT}",)
-    return limit.warnings
+    if limit.limit_mps and slow[moving].sum() > threshold("driven-below-limit", "min_slow_fraction") * moving.sum():
+        remedies = (*_state_limit(limit.top_mps), *_KEEP)
+        speeds = {"limit_mps": config.full_speed_fraction * limit.limit_mps, "top_mps": limit.top_mps}
+        slow_fraction = float(slow[moving].mean())
+        return (make_finding("driven-below-limit", _COMMAND, slow_fraction=slow_fraction, remedies=remedies, **speeds),)
+    return limit.findings
 
 
-def _suggest_limit(purpose: str, speed_mps: float) -> str:
-    return suggested(purpose, {"gate": {"max_velocity_mps": round(float(speed_mps), 2)}})
+def _state_limit(speed_mps: float) -> tuple[Remedy, ...]:
+    return suggest("state", {"gate": {"max_velocity_mps": round(float(speed_mps), 2)}})

@@ -42,7 +42,7 @@ def find_implausible(track: Track, rows: MotionRows, jumps: Mask, limit_mps: flo
             f"fusion: in most of a minute the track drives faster than {limit_mps:g} m/s (median {np.median(driving_mps):.0f} m/s over the "
             "run): the estimate does not follow the robot, and nothing of the run is used; look at the sensors with tcpipe inspect "
             f"--full, and leave out the one that errs ({recipe_key('read.topics')}: an empty list for its role); {_remedy()}",
-            *track.info.findings.warnings,
+            *track.info.report.findings,
         )
     fast_s = implausible.sum() * rows.period_s
     return implausible, (

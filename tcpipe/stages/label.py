@@ -24,7 +24,7 @@ from tcpipe.stages.power_rails import energy_entries, rails_of
 from tcpipe.tables.arrays import rows_where
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats, integers, lonlat_deg
-from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, LabelledSegments, Segments, Streams, with_findings
+from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack, LabelledSegments, Segments, Streams, add_findings
 from tcpipe.tables.wkb import line_column
 
 
@@ -88,5 +88,5 @@ def label_segments(
     facts = label_facts(
         table, rails_by_epoch, joules, ledger_m, variance_j2, rule=rule, velocity=velocity, physics=physics
     )
-    info = with_findings(segments.info, label_warnings(facts), replace(segments.info.findings.facts, label=facts))
+    info = add_findings(segments.info, label_warnings(facts), replace(segments.info.report.facts, label=facts))
     return LabelledSegments(table, info, segments.ledger_m)

@@ -16,7 +16,7 @@ from tcpipe.stages.power_rails import rail_facts
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import Quality, name_of
 from tcpipe.tables.columns import floats
-from tcpipe.tables.findings import EnergyBudget, LabelFacts, PhysicsFacts
+from tcpipe.tables.facts import EnergyBudget, LabelFacts, PhysicsFacts
 
 _MUCH_SLIP = 0.05  # of the segments
 _MUCH_STANDING = 0.5

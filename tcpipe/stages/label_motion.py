@@ -68,7 +68,7 @@ def _turn_density(cut: pa.Table, imu: pa.Table | None, info: TrackInfo) -> NDArr
     Positions and odometry hold the yaw itself; of how it changes within a second they tell far less.
     """
     start_ns, density = integers(cut, "start_ns"), np.full(cut.num_rows, np.nan)
-    facts = info.findings.facts.fuse
+    facts = info.report.facts.fuse
     if imu is None or imu.num_rows < 2 or facts is None or info.estimator != "smoother":
         return density
     rate_hz = 1e9 / median_period_ns(np.unique(integers(imu, "stamp_ns")))

@@ -10,7 +10,7 @@ from tcpipe.cost.physics import ALL, Metres, fit_physics
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats
-from tcpipe.tables.findings import PhysicsFacts
+from tcpipe.tables.facts import PhysicsFacts
 from tcpipe.tables.levels import LABELLED_SEGMENTS
 
 

@@ -49,7 +49,7 @@ def motion_flags(
     wheel_mps = mean_between(stamp_ns, floats(rows, "wheel_velocity_mps"), start_ns, end_ns)
     driven_m = np.concatenate(([0.0], np.cumsum(np.hypot(*(np.diff(floats(rows, f"{axis}_m")) for axis in "xy")))))
     start_m, end_m = (interpolate(stamp_ns, driven_m, at_ns) for at_ns in (start_ns, end_ns))
-    gate, commanded_mps = info.findings.facts.gate, floats(cut, "commanded_velocity_mps")
+    gate, commanded_mps = info.report.facts.gate, floats(cut, "commanded_velocity_mps")
     full_speed_mps = gate.full_speed_mps if gate else None
     return {
         Quality.NEAR_GAP: near(driven_m[_gap_edges(rows, info.rate_hz)], start_m, end_m, within_m=float(chord_m[0])),
@@ -65,7 +65,7 @@ def motion_flags(
 def _disputed(cut: pa.Table, info: TrackInfo) -> NDArray[np.bool_]:
     """Return the segments of one epoch that touch a time in which a sensor disagrees with the track undecided, or fixes were off it."""
     start_ns, end_ns, epoch = integers(cut, "start_ns"), integers(cut, "end_ns"), integers(cut, "epoch")
-    facts = info.findings.facts
+    facts = info.report.facts
     times = [(e.epoch, e.start_ns, e.end_ns) for e in (facts.audit.disagreements if facts.audit else ()) if not e.alone]
     for stretch in facts.fuse.stretches if facts.fuse else ():
         times += [(stretch.epoch, r.start_ns, r.end_ns) for r in stretch.reopenings if r.role == GNSS]
@@ -92,9 +92,9 @@ def clock_doubtful(streams: Streams, info: TrackInfo) -> bool:
     Commands are left out: they mostly have no stamp of their own, and a label does not depend on theirs.
     """
     recorder = any(s.time_source == "log" for role, s in streams.sensors.items() if role != "command")
-    clocks = info.findings.facts.clock_offsets
+    clocks = info.report.facts.clock_offsets
     off = clocks is not None and any(
         (offset.noted or offset.drifts) and not (role == "imu" and clocks.heading_offset_s)
         for role, offset in clocks.offsets.items()
     )
-    return recorder or off or streams.findings.facts.epochs > 1
+    return recorder or off or streams.report.facts.epochs > 1

@@ -14,7 +14,7 @@ from tcpipe.power.noise import median_period_s, resolution
 from tcpipe.power.rails import Rail, Samples, rail, samples
 from tcpipe.tables.arrays import numbers, rows_where
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import RailFacts, SignalFacts
+from tcpipe.tables.facts import RailFacts, SignalFacts
 from tcpipe.tables.levels import Streams
 
 

@@ -69,17 +69,17 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
     repeated = repeats_warnings(repeats, averaged=power.averaged)
     offset_s = {str(role): offset for role, offset in config.time_offset_s.items()}
     no_power = power.refusal or power_candidates(log, assignment, config)
-    findings = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
+    report = read_findings(assignment, every, clocks, power=power, sensors=sensors, offset_s=offset_s)
     scale = {str(role): factor for role, factor in config.odometry_scale.items()} or None
-    facts = replace(findings.facts, odometry_scale=scale, no_power=no_power)
-    first = (no_power.why,) if no_power and no_power.why not in findings.warnings else ()
-    findings = replace(
-        findings, warnings=(*first, *findings.warnings, *unread, *unplaced, *repeated, *asked, *of_pose), facts=facts
+    facts = replace(report.facts, odometry_scale=scale, no_power=no_power)
+    first = (no_power.why,) if no_power and no_power.why not in report.findings else ()
+    report = replace(
+        report, findings=(*first, *report.findings, *unread, *unplaced, *repeated, *asked, *of_pose), facts=facts
     )
     if not any(role in streams for role in MOTION_ROLES):
         what = "nothing in the log tells motion: wheel_odometry, visual_odometry, gnss and pose have no usable row"
-        raise RoleError(what, *findings.warnings)
-    return Streams(streams, sensors, assignment.robot, crs, power.averaged, findings)
+        raise RoleError(what, *report.findings)
+    return Streams(streams, sensors, assignment.robot, crs, power.averaged, report)
 
 
 def _times(source: TopicReadings, config: ReadConfig) -> TopicTimes:

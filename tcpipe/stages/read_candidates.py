@@ -14,7 +14,7 @@ from tcpipe.recipe import ReadConfig
 from tcpipe.recipe.suggestions import RecipeFragment, TomlValue
 from tcpipe.stages.message_arrays import message_arrays
 from tcpipe.stages.protocols import LogReader
-from tcpipe.tables.findings import NoPower
+from tcpipe.tables.facts import NoPower
 
 
 @dataclass(frozen=True, slots=True)

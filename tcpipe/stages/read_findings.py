@@ -10,7 +10,8 @@ from tcpipe.logs.clocks import ON_SIMULATED_CLOCK, Settled, Timeline
 from tcpipe.logs.roles import RoleAssignment
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_sources import TopicReadings
-from tcpipe.tables.findings import Findings, PowerSign, RobotChoice, RoleFacts, RunFacts, TopicClock, TopicFacts
+from tcpipe.tables.facts import PowerSign, RobotChoice, RoleFacts, RunFacts, TopicClock, TopicFacts
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Sensor
 
 _MANY_DROPPED = 0.01
@@ -24,7 +25,7 @@ def read_findings(
     power: PowerReadings,
     sensors: Mapping[str, Sensor],
     offset_s: Mapping[str, float],
-) -> Findings[RunFacts]:
+) -> StageReport[RunFacts]:
     """Return the warnings and facts of a read log; ``offset_s`` [s] is what the recipe adds to a role's stamps."""
     timelines, steps = clocks.timelines, clocks.steps
     simulated = clocks.simulated.remark() if clocks.simulated else None
@@ -45,7 +46,7 @@ def read_findings(
         time_offset_s=offset_s,
         power=None if power.current_sign is None else PowerSign(power.current_sign, power.averaged, power.includes),
     )
-    return Findings(tuple(dict.fromkeys(warnings)), facts)
+    return StageReport(tuple(dict.fromkeys(warnings)), facts)
 
 
 def _warnings(source: TopicReadings, timeline: Timeline | None) -> Iterable[str]:

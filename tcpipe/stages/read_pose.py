@@ -23,7 +23,7 @@ _ANYWHERE_DEG_M = (0.0, 45.0, 0.0)
 
 def recipe_role(role: str, streams: Streams) -> str:
     """Return the role by which the recipe knows what is fused as ``role``: a pose that stands in for GNSS is a pose there."""
-    roles = streams.findings.facts.roles
+    roles = streams.report.facts.roles
     return POSE if role == GNSS and POSE in roles and GNSS not in roles else role
 
 

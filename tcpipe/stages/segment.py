@@ -18,9 +18,11 @@ from tcpipe.path.cutting import Cut, cut_by_chord
 from tcpipe.recipe import SegmentConfig
 from tcpipe.tables.arrays import numbers
 from tcpipe.tables.bits import DropReason, Loss, name_of
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import SegmentFacts
-from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, with_findings
+from tcpipe.tables.facts import SegmentFacts
+from tcpipe.tables.findings import Finding, Subject, make_finding
+from tcpipe.tables.levels import SEGMENTS, Datum, GatedTrack, Segments, TrackInfo, add_findings
 
 ENTRIES = ("kept", *(name_of(bit) for bit in (*DropReason, Loss.CURVED, Loss.LEFTOVER)))
 """Names of the ledger's entries, in order."""
@@ -52,8 +54,8 @@ def segment_track(gated: GatedTrack, config: SegmentConfig) -> Segments:
             tables.append(_segments(table.slice(first, last + 1 - first), path, cut, info))
     segments = pa.concat_tables(tables).combine_chunks()
     facts = SegmentFacts(segments.num_rows, len(spans), odometer_m=sum(metres.values()), ledger_s=seconds)
-    warnings = () if segments.num_rows else (_why_none(metres),)
-    return Segments(segments, with_findings(info, warnings, replace(info.findings.facts, segment=facts)), metres)
+    findings = [] if segments.num_rows else [_find_why_none(metres, info.run_id)]
+    return Segments(segments, add_findings(info, findings, replace(info.report.facts, segment=facts)), metres)
 
 
 def _segments(rows: pa.Table, path: Polyline, cut: Cut, info: TrackInfo) -> pa.Table:
@@ -90,8 +92,12 @@ def _lon_lat(end: str, position_m: NDArray[np.float64], datum: Datum | None) -> 
     return {f"{end}_lon_deg": lon, f"{end}_lat_deg": lat}
 
 
-def _why_none(metres: dict[str, float]) -> str:
-    lost = [
-        f"{value:.1f} m {name}" for name, value in sorted(metres.items(), key=lambda entry: -entry[1]) if value > 0.05
-    ]
-    return f"no segments: {sum(metres.values()):.1f} m driven, of them {', '.join(lost) or 'nothing: the robot never moved'}"
+def _find_why_none(metres: dict[str, float], run_id: str) -> Finding:
+    """Return the finding that a run has no segment, with the largest loss."""
+    driven_m, reason = sum(metres.values()), max(metres, key=lambda entry: metres[entry])
+    if driven_m < threshold("no-segments", "min_driven_m"):
+        return make_finding("robot-did-not-move", Subject("run", run_id), driven_m=driven_m)
+    lost_m = metres[reason]
+    return make_finding(
+        "no-segments", Subject("run", run_id), names={"reason": reason}, driven_m=driven_m, lost_m=lost_m
+    )

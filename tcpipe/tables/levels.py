@@ -19,7 +19,7 @@ Frames follow REP-103 and REP-105: base_link is x forward, y left, z up; the tra
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -28,7 +28,8 @@ import pyarrow as pa
 from tcpipe.errors import TableError
 from tcpipe.tables.bits import DropReason, Quality
 from tcpipe.tables.columns import Column, TableSchema
-from tcpipe.tables.findings import NOTHING_FOUND, Findings, RunFacts
+from tcpipe.tables.facts import NOTHING_FOUND, RunFacts
+from tcpipe.tables.findings import Finding, StageReport
 from tcpipe.tables.segment_columns import LINE_COLUMN, MOTION_COLUMNS, POINT_COLUMN, STANDING_COLUMNS
 
 DATA_MODEL_VERSION = "2.2"
@@ -377,7 +378,7 @@ class Streams:
     gnss_crs: str = "EPSG:4326"
     power_averaged: bool = False
     """The source averages power over its message period (right-endpoint rectangle) rather than sampling it."""
-    findings: Findings[RunFacts] = NOTHING_FOUND
+    report: StageReport[RunFacts] = NOTHING_FOUND
 
     def __post_init__(self) -> None:
         """Check every table against its role's schema."""
@@ -411,7 +412,7 @@ class TrackInfo:
     datum: Datum | None
     rate_hz: float
     estimator: str
-    findings: Findings[RunFacts] = NOTHING_FOUND
+    report: StageReport[RunFacts] = NOTHING_FOUND
 
 
 @dataclass(frozen=True, slots=True)
@@ -466,9 +467,9 @@ class LabelledSegments:
         LABELLED_SEGMENTS.check(self.table)
 
 
-def with_findings(info: TrackInfo, warnings: tuple[str, ...], facts: RunFacts) -> TrackInfo:
-    """Return ``info`` with one more stage's warnings, and the facts with that stage's."""
-    return replace(info, findings=Findings(info.findings.warnings + warnings, facts))
+def add_findings(info: TrackInfo, findings: Iterable[Finding], facts: RunFacts) -> TrackInfo:
+    """Return ``info`` with one more stage's findings, and the facts with that stage's."""
+    return replace(info, report=StageReport((*info.report.findings, *findings), facts))
 
 
 def with_metadata(table: pa.Table, metadata: Mapping[str, Any]) -> pa.Table:

@@ -78,16 +78,16 @@ def assert_labels_hold(labelled: LabelledSegments, truth: Truth, *, at_least: in
 
 
 def fused(labelled: LabelledSegments) -> set[str]:
-    return set(labelled.info.findings.facts.fuse.sensors)
+    return set(labelled.info.report.facts.fuse.sensors)
 
 
 def refused(labelled: LabelledSegments) -> set[str]:
-    return set(labelled.info.findings.facts.sensor_checks.refused)
+    return set(labelled.info.report.facts.sensor_checks.refused)
 
 
 def cure(labelled: LabelledSegments, role: str) -> ReadConfig:
     """Read the recipe line out of the warning, as a person would."""
-    (warning,) = [w for w in labelled.info.findings.warnings if w.startswith(f"{role}: ") and "is not fused" in w]
+    (warning,) = [w for w in labelled.info.report.findings if w.startswith(f"{role}: ") and "is not fused" in w]
     return recipe_that_follows(warning).read
 
 
@@ -121,7 +121,7 @@ def test_an_imu_that_feels_nothing_is_not_used_and_said(drive, tmp_path):
     mute = drive.changed("imu", lambda c: {n: 0.0 * v for n, v in c.items() if n.startswith("linear_acceleration.")})
     labelled = run(mute, tmp_path)
     assert refused(labelled) == {"imu"}
-    assert any("its specific force is zero throughout" in line for line in labelled.info.findings.warnings)
+    assert any("its specific force is zero throughout" in line for line in labelled.info.report.findings)
     assert_labels_hold(labelled, drive.truth)
 
 
@@ -137,7 +137,7 @@ def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path, when, wit
     few = drive.without(*without)
     slow, none = run(heard(few, "imu", when), tmp_path), run(few.without("imu"), tmp_path)
     assert refused(slow) == {"imu"}
-    assert "too far apart to be integrated" in slow.info.findings.facts.sensor_checks.refused["imu"]
+    assert "too far apart to be integrated" in slow.info.report.facts.sensor_checks.refused["imu"]
     assert_labels_hold(slow, drive.truth)
     for name in ("start_ns", "duration_s", "energy_joule", "duration_std_s"):
         np.testing.assert_array_equal(slow.table[name].to_numpy(), none.table[name].to_numpy())
@@ -174,9 +174,7 @@ def test_an_imu_that_leads_the_track_astray_is_left_out(drive, tmp_path, recipe,
 
     labelled = run(drive.without(*without).changed("imu", loosened), tmp_path, recipe=recipe)
     assert refused(labelled) == {"imu"}
-    assert (
-        "the track moves otherwise than every sensor says" in labelled.info.findings.facts.sensor_checks.refused["imu"]
-    )
+    assert "the track moves otherwise than every sensor says" in labelled.info.report.facts.sensor_checks.refused["imu"]
     assert sum(labelled.ledger_m.values()) == pytest.approx(63.0, rel=0.08)
     assert_labels_hold(labelled, drive.truth, within=0.04)
 
@@ -271,7 +269,7 @@ def test_a_sensor_that_is_unlike_the_rest_is_refused(drive, tmp_path, what):
     labelled = run(other, tmp_path)
     role = {"wheels": "wheel_odometry", "visual": "visual_odometry"}.get(sensor, sensor)
     assert refused(labelled) == {role}
-    (why,) = [w for w in labelled.info.findings.warnings if "is not fused" in w]
+    (why,) = [w for w in labelled.info.report.findings if "is not fused" in w]
     assert word in why
     without = run(other, tmp_path, recipe_that_follows(why).read)
     assert not refused(without)
@@ -372,20 +370,20 @@ def test_fixes_at_zero_zero_are_no_places(drive, tmp_path):
 
     labelled = run(drive.changed("gnss", somewhere), tmp_path)
     assert_labels_hold(labelled, drive.truth)
-    assert any("null_island" in warning for warning in labelled.info.findings.warnings)
+    assert any("null_island" in warning for warning in labelled.info.report.findings)
 
 
 def test_a_current_with_an_offset_is_said(drive, tmp_path):
     other = drive.changed("power", lambda c: {n: v + 50.0 for n, v in c.items() if "current" in n})
-    (warning,) = [w for w in run(other, tmp_path).info.findings.warnings if w.startswith("power: ")]
+    (warning,) = [w for w in run(other, tmp_path).info.report.findings if w.startswith("power: ")]
     assert "are drawn while standing" in warning
-    assert not any("while standing" in w for w in run(drive, tmp_path).info.findings.warnings)
+    assert not any("while standing" in w for w in run(drive, tmp_path).info.report.findings)
 
 
 def test_fixes_without_altitude_still_say_where(drive, tmp_path):
     labelled = run(drive.changed("gnss", lambda c: {"altitude": np.full_like(c["altitude"], np.nan)}), tmp_path)
     assert labelled.info.datum is not None
-    assert any("have no altitude" in warning for warning in labelled.info.findings.warnings)
+    assert any("have no altitude" in warning for warning in labelled.info.report.findings)
     assert_labels_hold(labelled, drive.truth)
 
 
@@ -394,7 +392,7 @@ def test_a_receiver_that_never_had_a_fix_leaves_a_local_frame(drive, tmp_path):
     labelled = run(nowhere, tmp_path)
     assert labelled.info.datum is None
     assert labelled.table["start_lon_deg"].null_count == labelled.table.num_rows
-    assert any("null_island" in warning for warning in labelled.info.findings.warnings)
+    assert any("null_island" in warning for warning in labelled.info.report.findings)
 
 
 @pytest.mark.parametrize("share", [0.1, 1.0])
@@ -407,7 +405,7 @@ def test_stamps_at_zero_are_taken_from_the_recorder(drive, tmp_path, sensor, sha
     labelled = run(drive.changed(sensor, unset), tmp_path)
     assert_labels_hold(labelled, drive.truth)
     if share == 1.0:
-        assert any("log time rules" in warning for warning in labelled.info.findings.warnings)
+        assert any("log time rules" in warning for warning in labelled.info.report.findings)
 
 
 def test_two_robots_in_one_log_are_one_question(drive, tmp_path):
@@ -427,18 +425,18 @@ def test_two_robots_in_one_log_are_one_question(drive, tmp_path):
 def test_a_log_that_never_moves_has_no_segments_and_says_why(tmp_path, without):
     labelled = run(make((Pause(40.0),)).without(*without), tmp_path)
     assert labelled.table.num_rows == 0
-    assert any(warning.startswith("no segments: ") for warning in labelled.info.findings.warnings)
-    assert labelled.info.findings.facts.segment.odometer_m < 2.0
+    assert any(warning.startswith("no segments: ") for warning in labelled.info.report.findings)
+    assert labelled.info.report.facts.segment.odometer_m < 2.0
 
 
 def test_power_that_repeats_slow_readings_is_labelled_as_the_readings_are(drive, tmp_path):
     measured = ("measured_voltages", "measured_currents")
     held = drive.changed("power", lambda c: {name: c[name][np.arange(len(c[name])) // 5 * 5] for name in measured})
     labelled = run(held, tmp_path)
-    (rail,) = labelled.info.findings.facts.label.rails["0"]
+    (rail,) = labelled.info.report.facts.label.rails["0"]
     assert rail.current.rate_hz == rail.voltage.rate_hz == pytest.approx(4.0)
     assert_labels_hold(labelled, drive.truth)
-    assert labelled.info.findings.facts.label.quality["low_power_rate"] == labelled.table.num_rows
+    assert labelled.info.report.facts.label.quality["low_power_rate"] == labelled.table.num_rows
     found = preflight(tmp_path / "run.mcap", recipe=Recipe())
     assert any("messages at 20 Hz repeat readings at 4 Hz" in line for line in found.mend)
 
@@ -458,7 +456,7 @@ def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_co
     other = drive.without("imu", "visual", "command").changed("gnss", coarse)
     other = other.changed("wheels", lambda c: {names[0]: 0.43 * c[names[0]], names[1]: 0.0 * c[names[1]]})
     labelled = run(other, tmp_path)
-    found = labelled.info.findings
+    found = labelled.info.report
     assert fused(labelled) == {"gnss", "wheel_odometry"}
     assert found.facts.mounting.odometry_scale["wheel_odometry"] == pytest.approx(0.43, rel=0.2)
     assert sum(labelled.ledger_m.values()) == pytest.approx(drive.truth.distance_m[-1], rel=0.15)
@@ -492,7 +490,7 @@ POSE_TOPIC = "/tracker/pose"
 
 
 def clock_warnings(labelled: LabelledSegments) -> list[str]:
-    return [line for line in labelled.info.findings.warnings if "its stamps seem" in line]
+    return [line for line in labelled.info.report.findings if "its stamps seem" in line]
 
 
 @pytest.mark.parametrize("sensor", ["gnss", "imu", "wheels", "visual", "power", "pose"])
@@ -528,13 +526,13 @@ def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_war
         read(other, tmp_path, parse_recipe(merged(topics, {"read": {"time_offset_s": {"gnss": -0.3}}}), where="").read)
     placed = {"read": {"placement": {"gnss": {"xyz_m": [0.1, 0.0, 0.5]}}}}
     found = read(other, tmp_path, parse_recipe(merged(topics, placed), where="").read)
-    assert any("read.placement.gnss: no topic of this log plays gnss" in line for line in found.findings.warnings)
+    assert any("read.placement.gnss: no topic of this log plays gnss" in line for line in found.report.findings)
 
 
 def test_currents_of_the_other_sign_are_cured_by_the_line_as_it_is_printed(drive, tmp_path):
     other = drive.changed("power", lambda c: {name: -values for name, values in c.items() if "current" in name})
     labelled = run(other, tmp_path)
-    (line,) = [line for line in labelled.info.findings.warnings if line.startswith("power refused")]
+    (line,) = [line for line in labelled.info.report.findings if line.startswith("power refused")]
     cured = run(other, tmp_path, recipe_that_follows(line).read)
-    assert not [line for line in cured.info.findings.warnings if line.startswith("power refused")]
+    assert not [line for line in cured.info.report.findings if line.startswith("power refused")]
     assert_labels_hold(cured, drive.truth)

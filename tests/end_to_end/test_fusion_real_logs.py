@@ -34,8 +34,8 @@ def test_warthog_on_grass_follows_fixes_that_come_late():
     assert np.count_nonzero(~measured) < 40
     energy_joule = np.trapezoid(watt[measured], time_s[measured])
     assert energy_joule == pytest.approx(69_365.3, rel=0.005)
-    assert any("jittered" in warning for warning in track.info.findings.warnings)
-    assert track.info.findings.facts.fuse.rejected["gnss"] < 0.1 * streams.tables["gnss"].num_rows
+    assert any("jittered" in warning for warning in track.info.report.findings)
+    assert track.info.report.facts.fuse.rejected["gnss"] < 0.1 * streams.tables["gnss"].num_rows
     # It ends where it was fixed last, having stood there.
     assert floats(table, "forward_velocity_mps")[-20:] == pytest.approx(np.zeros(20), abs=0.02)
 
@@ -61,7 +61,7 @@ def test_husky_with_an_imu_mounted_on_its_side_and_sbas():
     assert np.abs(floats(table, "pitch_rad")).max() < 0.15
     moving = floats(table, "wheel_velocity_mps") > 0.5
     assert np.median(floats(table, "forward_velocity_mps")[moving]) == pytest.approx(0.98, abs=0.1)
-    assert track.info.findings.facts.fuse.stretches[0].heading_from == "course over ground"
+    assert track.info.report.facts.fuse.stretches[0].heading_from == "course over ground"
 
 
 @pytest.mark.parametrize("name", ["robot_localization/test2.bag", "robot_localization/test1_2014.bag"])
@@ -70,7 +70,7 @@ def test_logs_without_gnss_give_a_local_track(name):
     assert track.info.datum is None
     assert track.table.num_rows > 1000
     assert np.isfinite(floats(track.table, "x_m")).all()
-    assert any("local frame" in warning for warning in track.info.findings.warnings)
+    assert any("local frame" in warning for warning in track.info.report.findings)
 
 
 def test_a_metre_of_the_wheels_stays_one_where_nothing_else_tells_it():
@@ -79,4 +79,4 @@ def test_a_metre_of_the_wheels_stays_one_where_nothing_else_tells_it():
     own_m = np.sum(np.abs(floats(wheels, "velocity_x_mps")[1:]) * np.diff(integers(wheels, "stamp_ns")) * 1e-9)
     assert path_m(track.table) == pytest.approx(own_m, rel=0.02)  # an accelerometer had made half of it
     assert np.isnan(floats(wheels, "velocity_y_mps")).all()
-    assert any("how long a metre" in warning for warning in track.info.findings.warnings)
+    assert any("how long a metre" in warning for warning in track.info.report.findings)

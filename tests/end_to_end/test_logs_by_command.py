@@ -61,7 +61,7 @@ def test_what_has_no_checksum_and_which_clock_is_simulated_is_said(tmp_path):
     found = run_json(tmp_path / "tcpipe-store")
     assert found["damage"] == []
     assert ["unchecked: a .db3 carries no checksum" in line for line in found["remarks"]] == [True]
-    assert any("count simulated time and rule" in line for line in found["findings"]["warnings"])
+    assert any("count simulated time and rule" in line for line in found["report"]["findings"])
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])

@@ -126,7 +126,7 @@ def test_a_preflight_promises_what_ingesting_gives(work):
     manifest = json.loads(made.read_text())
     done = tcpipe("preflight", log, "--json", "--quiet", cwd=work)
     found = json.loads(done.stdout)
-    promise, label = found["promise"], manifest["info"]["findings"]["facts"]["label"]
+    promise, label = found["promise"], manifest["info"]["report"]["facts"]["label"]
     assert done.returncode == 3  # half a minute is too short for a prediction
     assert [line[:7] for line in found["mend"]] == ["the log"]
     assert promise["segments"] == manifest["counts"]["segments"] == 10

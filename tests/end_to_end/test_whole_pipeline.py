@@ -99,7 +99,7 @@ def test_the_kept_track_knows_its_speed_and_yaw(site: SimulatedSite, run: RunDir
 
 def test_whole_run_energy_and_odometer(site: SimulatedSite, run: RunDirectory) -> None:
     truth = read_truth(site.truths[0])
-    facts = run.manifest.info.findings.facts
+    facts = run.manifest.info.report.facts
     assert facts.label.energy_joule == pytest.approx(truth.energy_joule[-1], rel=0.005)
     assert sum(run.manifest.ledger_m.values()) == pytest.approx(truth.distance_m[-1], rel=0.005)
 

@@ -31,8 +31,8 @@ def test_the_energy_of_a_real_warthog(robot: str | None) -> None:
     reference = json.loads((path.parent / "reference.json").read_text())
     found = read(path, robot)
     assert found.robot == (robot or "generic")
-    assert found.findings.facts.left_out.keys() == {"/icp_odom"}
-    assert found.findings.facts.power.current_sign == "drawn_positive (mean)"
+    assert found.report.facts.left_out.keys() == {"/icp_odom"}
+    assert found.report.facts.power.current_sign == "drawn_positive (mean)"
     assert sorted(found.tables["power"]["rail"].unique().to_pylist()) == list(_DRIVES)
     with tcpipe.read_log(path) as log:
         messages = log.tables(_DRIVES)
@@ -62,7 +62,7 @@ def test_a_real_husky_without_power() -> None:
     assert found.robot == "husky"
     rows = {role: table.num_rows for role, table in found.tables.items()}
     assert rows == {"gnss": 989, "imu": 11865, "wheel_odometry": 3952}
-    assert found.findings.warnings[0].startswith("no topic plays power")
+    assert found.report.findings[0].startswith("no topic plays power")
     assert [sensor.placed_by for sensor in found.sensors.values()] == ["assumed", "recipe", "same frame"]
     assert found.sensors["gnss"].frame_id == "gps"
     # Turned by its mounting, the IMU's specific force points up.
@@ -86,7 +86,7 @@ def test_four_containers_give_the_same_streams(tmp_path: Path) -> None:
         assert list(other.tables) == list(first.tables), path
         assert all(other.tables[role].equals(first.tables[role], check_metadata=True) for role in first.tables), path
         assert other.sensors == first.sensors
-        assert other.findings == first.findings
+        assert other.report == first.report
 
 
 def test_a_jackal_in_simulated_time() -> None:
@@ -95,7 +95,7 @@ def test_a_jackal_in_simulated_time() -> None:
     stamps = found.tables["imu"]["stamp_ns"].to_numpy()
     assert 47e9 < stamps[0] < 48e9
     assert found.sensors["wheel_odometry"].time_source == "header"
-    assert found.findings.facts.epochs == 1
+    assert found.report.facts.epochs == 1
 
 
 def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
@@ -106,9 +106,9 @@ def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
         "wheel_odometry": "/wheel_odometry",
         "visual_odometry": "/stereo_odometer/odometry",
     }
-    assert found.findings.facts.epochs == 1
+    assert found.report.facts.epochs == 1
     worse = read(path, topics={"imu": ["/my_odometry2imu/imu_data"]})
-    facts = worse.findings.facts.roles["imu"].topics["/my_odometry2imu/imu_data"]
+    facts = worse.report.facts.roles["imu"].topics["/my_odometry2imu/imu_data"]
     assert facts.messages == 13333
     assert sum(facts.dropped.values()) == 347
     assert facts.notes["sorted"] >= 31
@@ -117,7 +117,7 @@ def test_duplicates_and_backward_stamps_of_an_old_recording() -> None:
 
 def test_a_battery_that_says_nothing_and_stamps_in_whole_seconds() -> None:
     found = read(shared_data("peers/ros_amr_interop/rosbag_demo.bag"))
-    text = "\n".join(found.findings.warnings)
+    text = "\n".join(found.report.findings)
     assert "/battery: the voltage and the current are zero on all 111 rows" in text
     assert "/velocity: log time rules, since 98 % of its messages repeat the header stamp" in text
     assert found.tables["wheel_odometry"].num_rows == 5270

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from tcpipe.formats.layer_descriptions import Description
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.terrain.classes import TerrainClass
 
 

@@ -37,7 +37,7 @@ from tcpipe.formats.maps.map_facts import MapFacts, MapSummary
 from tcpipe.formats.seals import prove_files, read_checksums
 from tcpipe.formats.shards import DESCRIPTION, Fetched, ShardedArray, open_sharded
 from tcpipe.formats.zarr_arrays import add_array, consolidate, create_group
-from tcpipe.tables.findings import LEFT_OUT
+from tcpipe.tables.facts import LEFT_OUT
 from tcpipe.terrain.classes import ClassScheme, ClassTable, TerrainClass
 from tcpipe.terrain.grid import MapGrid
 from tcpipe.terrain.layers import LAYERS, PAPER_LAYERS, Layer, Pixels, missing

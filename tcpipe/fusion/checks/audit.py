@@ -37,7 +37,7 @@ from tcpipe.fusion.process import DOPPLER_LASTS_S, VISUAL_SCALE_STD, WHEEL_SCALE
 from tcpipe.fusion.signals import in_gap, interval_means, median_period_ns, seconds
 from tcpipe.fusion.trajectory import DISPLACEMENT_LAGS_S, Trajectory
 from tcpipe.geometry.rotation import matrix_from_quat, quat_from_matrix, rotation_vector_from_quat
-from tcpipe.tables.findings import Disagreement
+from tcpipe.tables.facts import Disagreement
 
 Floats = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -30,7 +30,7 @@ from tcpipe.fusion.checks.plausibility import (
 from tcpipe.fusion.checks.windows import liveliest_ns
 from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InertialMeasurements, Measurements, Positions
 from tcpipe.fusion.signals import hold_last
-from tcpipe.tables.findings import AxisFacts, SensorChecks, vector
+from tcpipe.tables.facts import AxisFacts, SensorChecks, vector
 
 _SMOOTH_S = 0.1
 _IN_G = (0.8, 1.25)

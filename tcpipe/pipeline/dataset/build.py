@@ -77,7 +77,7 @@ from tcpipe.splits.assignment import SPLITS
 from tcpipe.splits.audit import HeldOut, audit_lines
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
-from tcpipe.tables.findings import EnergyBudget
+from tcpipe.tables.facts import EnergyBudget
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
 
 logger = logging.getLogger("tcpipe")

@@ -119,7 +119,7 @@ def dataset_card(
 
 
 def _label(recipe: Recipe, inputs: Inputs) -> LabelColumns:
-    told = (run.manifest.info.findings.facts.power for run in inputs.runs)
+    told = (run.manifest.info.report.facts.power for run in inputs.runs)
     includes = tuple(sorted({what for power in told if power is not None for what in power.includes}))
     velocity = recipe.label.velocity
     return LabelColumns(("power_watt", VELOCITY_COLUMN[velocity]), velocity, includes)

@@ -9,7 +9,7 @@ import pyarrow as pa
 
 from tcpipe.formats.dataset_card import Doubtful, RunFinding, RunSource
 from tcpipe.tables.bits import Quality, name_of
-from tcpipe.tables.findings import by_cause
+from tcpipe.tables.facts import by_cause
 
 _MOST_SHOWN = 8
 

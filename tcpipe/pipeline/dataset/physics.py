@@ -9,7 +9,7 @@ import pyarrow.compute as pc
 from tcpipe.cost.held_out import physics_of
 from tcpipe.cost.physics import ALL, Metres
 from tcpipe.tables.columns import floats
-from tcpipe.tables.findings import PhysicsFit
+from tcpipe.tables.facts import PhysicsFit
 
 PHYSICS_COLUMNS = ("start_ns", "start_z_m", "end_z_m", "chord_m", "turn_rate_radps", "standing_power_watt")
 """Columns of samples.parquet that the fit reads, beside those of the labels."""

@@ -80,7 +80,7 @@ def test_kept_and_lost_are_what_was_driven_and_drawn(given_drives):
         assert min(entries.values()) >= 0.0
         assert sum(entries.values()) == pytest.approx(true_m, rel=1e-3, abs=1e-3)
         assert entries["kept"] == pytest.approx(floats(found.table, "arc_length_m").sum(), rel=1e-9, abs=1e-9)
-        facts = found.info.findings.facts.label
+        facts = found.info.report.facts.label
         assert facts.distance_m == pytest.approx(sum(entries.values()), rel=1e-12)
         if not track.table["epoch"].to_numpy().any():  # power is of the first epoch alone
             assert sum(facts.energy_by_entry_joule.values()) == pytest.approx(drawn_joule, rel=1e-3)

@@ -52,8 +52,8 @@ def test_a_kept_document_is_read_whole_and_written_as_it_was(kept, pattern, cls)
         (("counts", "segments"), "counts.segments: wanted a whole number, got a list"),
         (("ledger_m", "kept"), "ledger_m[...]: wanted a number, got a list"),
         (
-            ("info", "findings", "facts", "fuse", "rows"),
-            "info.findings.facts.fuse.rows: wanted a whole number, got a list",
+            ("info", "report", "facts", "fuse", "rows"),
+            "info.report.facts.fuse.rows: wanted a whole number, got a list",
         ),
         (("info", "datum"), "info.datum: wanted an object or null, got a list"),
     ],

@@ -10,7 +10,7 @@ from tcpipe.motion.remedies import REMEDIES
 from tcpipe.pipeline.preflight import Promise, RoleTopic, _hourly_std, _mend, _missing_roles, _unplaced, record_command
 from tcpipe.recipe import ReadConfig
 from tcpipe.tables.bits import DropReason, Loss, name_of
-from tcpipe.tables.findings import EnergyBudget
+from tcpipe.tables.facts import EnergyBudget
 
 
 def topic(name, type_name="std_msgs/msg/String", encoding="cdr"):

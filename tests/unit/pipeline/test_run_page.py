@@ -17,7 +17,8 @@ from tcpipe.report.run_report import run_report
 from tcpipe.report.run_sensors import sensor_sections
 from tcpipe.simulation import Faults, simulate, tiny
 from tcpipe.store import Store
-from tcpipe.tables.findings import AuditFacts, Disagreement, Findings
+from tcpipe.tables.facts import AuditFacts, Disagreement
+from tcpipe.tables.findings import StageReport
 
 
 @pytest.fixture(scope="module")
@@ -114,7 +115,7 @@ def test_where_streams_are_gone_the_track_is_drawn_and_the_page_says_so(store, t
 
 def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
     run, html = page(store)
-    facts = run.manifest.info.findings.facts
+    facts = run.manifest.info.report.facts
     trust = html.split("<h2>How far each sensor was believed</h2>")[1].split("<h2>")[0]
     for role, nis in facts.fuse.nis_mean.items():
         (row,) = [row for row in trust.split("<tr>") if f"<td>{role.replace('_', ' ')}</td>" in row]
@@ -130,10 +131,10 @@ def test_trust_refusals_clocks_and_the_noise_floor_are_on_the_page(store):
 def test_where_sensors_disagree_with_the_track_is_on_the_page(store):
     run, html = page(store)
     assert "Where sensors disagree" not in html
-    info, start_ns = run.manifest.info, run.manifest.info.findings.facts.fuse.stretches[0].start_ns
+    info, start_ns = run.manifest.info, run.manifest.info.report.facts.fuse.stretches[0].start_ns
     each = Disagreement(start_ns + 10**10, start_ns + 2 * 10**10, "gnss", "position", 0.49, "m", 0.016, alone=False)
-    facts = replace(info.findings.facts, audit=AuditFacts((each,)))
-    told = replace(run.manifest, info=replace(info, findings=Findings((), facts)))
+    facts = replace(info.report.facts, audit=AuditFacts((each,)))
+    told = replace(run.manifest, info=replace(info, report=StageReport((), facts)))
     (section,) = [s for s in sensor_sections(None, told, run.rejections()) if "disagree" in s.title]
     assert section.rows == [
         ("gnss", "position", "10 to 20 s", "0.49 m", "0.016 m", "deviations are raised, segments flagged")

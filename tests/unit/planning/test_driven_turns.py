@@ -13,7 +13,7 @@ from tcpipe.simulation.robot import SimulatedRobot
 from tcpipe.simulation.route import Leg
 from tcpipe.simulation.site import Site
 from tcpipe.simulation.world import World
-from tcpipe.tables.findings import PhysicsFit, PhysicsTerm
+from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 FLAT = World(site=Site(), base_m=598.0)

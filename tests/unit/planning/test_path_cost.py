@@ -10,7 +10,7 @@ from planning_worlds import lonlat, plane
 from tcpipe.errors import ModelError, PathError
 from tcpipe.planning.path_cost import cost_of_path
 from tcpipe.planning.reasons import Reason
-from tcpipe.tables.findings import PhysicsFit, PhysicsTerm
+from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES, ClassTable
 
 MODEL = PhysicsModel()

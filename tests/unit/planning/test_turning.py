@@ -13,7 +13,7 @@ from tcpipe.planning.search import Steps, least_cost_path
 from tcpipe.planning.survey import new_survey
 from tcpipe.planning.turning import turning_of, turns_between
 from tcpipe.planning.turning_search import least_turning_path
-from tcpipe.tables.findings import PhysicsFit, PhysicsTerm
+from tcpipe.tables.facts import PhysicsFit, PhysicsTerm
 from tcpipe.terrain.classes import PAPER_CLASSES
 
 USUAL_RADPM = 0.05

@@ -12,7 +12,7 @@ from tcpipe.report.run_plots import time_plots
 from tcpipe.report.run_report import run_report
 from tcpipe.report.run_series import gate_spans, rail_series, speed_series, thinned, timeline_of
 from tcpipe.store import open_store
-from tcpipe.tables.findings import ClockStep, RunFacts
+from tcpipe.tables.facts import ClockStep, RunFacts
 from tcpipe.tables.levels import POWER, REJECTIONS, Sensor
 
 EVIL = "</script><script>alert(1)</script>\x1b[31m\u202e\"'&"

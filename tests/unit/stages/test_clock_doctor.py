@@ -11,7 +11,7 @@ from tcpipe.recipe import FuseConfig, ReadConfig
 from tcpipe.simulation import scenario
 from tcpipe.stages.clock_doctor import clock_findings, with_offset_cost
 from tcpipe.stages.fuse_inputs import prepare_inputs
-from tcpipe.tables.findings import ClockFacts
+from tcpipe.tables.facts import ClockFacts
 
 LATE_S = {"gnss": 0.25, "wheel_odometry": 0.15, "imu": -0.10, "visual_odometry": 0.20, "power": 0.25}
 WITHIN_S = {"gnss": 0.020, "wheel_odometry": 0.020, "imu": 0.020, "visual_odometry": 0.020, "power": 0.050}

@@ -144,7 +144,7 @@ def test_power_command_and_wheels_stand_at_the_tracks_stamps(track, truth):
 
 
 def test_findings_and_rejections(track):
-    facts = track.info.findings.facts.fuse
+    facts = track.info.report.facts.fuse
     assert facts.sensors == ("gnss", "imu", "visual_odometry", "wheel_odometry")
     assert facts.rows == track.table.num_rows
     assert facts.stretches[0].heading_from == "course over ground"
@@ -185,7 +185,7 @@ def test_fixes_at_null_island_are_listed_as_invalid(streams):
     track = fuse_run(replace(streams, tables={**streams.tables, "gnss": broken}), FuseConfig(), run_id="r")
     assert track.rejections["reason"].to_pylist()[:3] == ["invalid"] * 3
     assert track.rejections["normalized_innovation_squared"].null_count == 3
-    assert "gnss: 3 rows without a usable value" in track.info.findings.warnings
+    assert "gnss: 3 rows without a usable value" in track.info.report.findings
     assert abs(track.info.datum.lon_deg - SITE[0]) < 0.01
 
 

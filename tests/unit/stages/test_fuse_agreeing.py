@@ -10,13 +10,14 @@ from tcpipe.recipe import FuseConfig
 from tcpipe.stages import fuse_agreeing
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
-from tcpipe.tables.findings import Findings, SensorChecks
+from tcpipe.tables.facts import SensorChecks
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Sensor, Streams
 
 STAMP_NS = np.arange(5, dtype=np.int64)
 ROLES = ("gnss", "imu", "wheel_odometry", "visual_odometry")
 STREAMS = Streams({}, {role: Sensor(f"/{role}", "x/msg/Y", role, "why") for role in ROLES}, "husky")
-NOTHING = Findings((), SensorChecks())
+NOTHING = StageReport((), SensorChecks())
 
 
 def odometry():

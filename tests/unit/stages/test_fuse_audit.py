@@ -8,7 +8,7 @@ from tcpipe.fusion.measurements import BodyVelocities, Measurements
 from tcpipe.stages.fuse_audit import audit_findings
 from tcpipe.stages.fuse_inputs import FusionInputs
 from tcpipe.stages.fuse_stretches import Fused
-from tcpipe.tables.findings import Disagreement, StretchFacts
+from tcpipe.tables.facts import Disagreement, StretchFacts
 from tcpipe.tables.levels import STREAMS, Streams
 
 SECOND_NS = 1_000_000_000

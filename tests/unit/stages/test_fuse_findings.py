@@ -10,7 +10,7 @@ from tcpipe.fusion.measurements import InertialMeasurements, InitialState, Measu
 from tcpipe.fusion.stretches import Stretch
 from tcpipe.stages.fuse_findings import fuse_facts, fuse_warnings, stretch_facts
 from tcpipe.stages.fuse_inputs import FusionInputs
-from tcpipe.tables.findings import Reopening, StretchFacts
+from tcpipe.tables.facts import Reopening, StretchFacts
 
 PLACE = (15.0, 47.0, 400.0)
 ALL = ("gnss", "imu", "wheel_odometry")

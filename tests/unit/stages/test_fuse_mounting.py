@@ -117,7 +117,7 @@ def test_a_scale_that_is_off_throughout_is_taken_out_and_the_recipe_line_states_
     stamp_ns = np.arange(5, dtype=np.int64)
     wheels = BodyVelocities(stamp_ns, np.full((5, 3), 1.3), np.ones((5, 3)), np.zeros(5), np.ones(5))
     log = streams("tf_static")
-    given = replace(log.findings, facts=replace(log.findings.facts, odometry_scale={"wheel_odometry": 0.5}))
+    given = replace(log.report, facts=replace(log.report.facts, odometry_scale={"wheel_odometry": 0.5}))
     evidence = Fused(ratios=[{"wheel_odometry": np.linspace(1.29, 1.31, 21)}])
     found = fuse_mounting._mended(FusionInputs(None, {0: Measurements(wheels=wheels)}), evidence, log)
     assert found.measurements[0].wheels.velocity_mps == pytest.approx(np.ones((5, 3)))

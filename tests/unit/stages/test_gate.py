@@ -11,7 +11,8 @@ from tcpipe.recipe import GateConfig, SegmentConfig
 from tcpipe.stages.gate import gate_track
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import DropReason
-from tcpipe.tables.findings import AuditFacts, Findings, FuseFacts, StretchFacts
+from tcpipe.tables.facts import AuditFacts, FuseFacts, StretchFacts
+from tcpipe.tables.findings import StageReport
 
 T = np.arange(0, 60, 0.05)
 
@@ -52,7 +53,7 @@ def test_start_and_stop_without_commands():
     kept = gated.table["dropped_by"].to_numpy() == 0
     assert kept[(T > 6.5) & (T < 48.5)].all()
     assert not kept[(T < 5.9) | (T > 49.2)].any()
-    assert "no command topic" in gated.info.findings.warnings[0]
+    assert "no command topic" in gated.info.report.findings[0]
 
 
 def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
@@ -66,11 +67,11 @@ def test_a_robot_that_coasts_to_a_halt_under_a_standing_command():
 def test_the_top_command_of_a_run_is_its_limit_where_most_is_driven_at_it(share, limit):
     commanded = np.where(60 * share > T, 0.7, 0.35)
     gated = gate(straight_track(commanded - 0.1, commanded_mps=commanded))
-    assert gated.info.findings.facts.gate.max_velocity_mps == pytest.approx(limit)
+    assert gated.info.report.facts.gate.max_velocity_mps == pytest.approx(limit)
     below = rows_of(gated, DropReason.BELOW_LIMIT)
     assert below[60 * share + 1 < T].all()
     assert below[60 * share - 1 > T].all() == (limit == 1.0)
-    said = gated.info.findings.warnings
+    said = gated.info.report.findings
     assert any("70% of the moving track was commanded at 0.70 m/s" in line for line in said) == (limit == 0.7)
     assert any("its top command, 0.70 m/s, was held for 30% of it" in line for line in said) == (limit == 1.0)
 
@@ -82,9 +83,9 @@ def test_below_the_limit_unless_it_is_unknown_or_allowed():
     assert not rows_of(gate(track, config=GateConfig(require_full_speed=False)), DropReason.BELOW_LIMIT).any()
     unknown = gate(track, limit_mps=None)
     assert not rows_of(unknown, DropReason.BELOW_LIMIT).any()
-    assert "under [gate]: max_velocity_mps = " in unknown.info.findings.warnings[0]
+    assert "under [gate]: max_velocity_mps = " in unknown.info.report.findings[0]
     assert not rows_of(gate(track, config=GateConfig(max_velocity_mps=0.7)), DropReason.BELOW_LIMIT).any()
-    assert "100% of the moving track" in gate(track).info.findings.warnings[0]
+    assert "100% of the moving track" in gate(track).info.report.findings[0]
 
 
 def test_stuck_has_its_own_reason():
@@ -108,7 +109,7 @@ def test_a_power_gap_is_a_gap_and_a_run_without_power_is_none():
     )
     assert not rows_of(gate(straight_track(np.full(len(T), 0.9))), DropReason.GAP).any()
     rare = gate(straight_track(np.full(len(T), 0.9), power_watt=np.where(T > 50, 150.0, np.nan)))
-    assert "there is none on 83% of the moving track" in rare.info.findings.warnings[0]
+    assert "there is none on 83% of the moving track" in rare.info.report.findings[0]
 
 
 def test_a_jump_is_a_gap_and_not_driven():
@@ -119,14 +120,14 @@ def test_a_jump_is_a_gap_and_not_driven():
     velocity = np.tile([0.9, 0.0, 0.0], (len(T), 1))
     gated = gate(make_track(position, velocity))
     assert np.flatnonzero(rows_of(gated, DropReason.GAP)).tolist() == [599, 600]
-    assert gated.info.findings.facts.gate.gap_rows == {
+    assert gated.info.report.facts.gate.gap_rows == {
         "without_power": 0,
         "uncertain": 0,
         "jumps": 2,
         "contradicted": 0,
         "implausible": 0,
     }
-    assert "jumps 1 times, the furthest by 1000000.0 m" in gated.info.findings.warnings[0]
+    assert "jumps 1 times, the furthest by 1000000.0 m" in gated.info.report.findings[0]
     segments = segment_track(gated, SegmentConfig())
     assert sum(segments.ledger_m.values()) == pytest.approx(0.9 * T[-1], rel=1e-6)
     assert segments.table.num_rows == 52
@@ -138,7 +139,7 @@ def test_relative_not_absolute_position_error_makes_a_gap():
     assert not rows_of(far_off, DropReason.GAP).any()
     unsure = gate(straight_track(speed, std_m=2.0, velocity_std_mps=0.12))
     assert rows_of(unsure, DropReason.GAP).all()
-    assert "is not known to 0.1 m (recipe key gate.max_relative_position_std_m)" in unsure.info.findings.warnings[0]
+    assert "is not known to 0.1 m (recipe key gate.max_relative_position_std_m)" in unsure.info.report.findings[0]
 
 
 def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
@@ -147,22 +148,22 @@ def test_an_error_of_scale_that_a_run_has_in_common_makes_no_gap():
     stamp_ns = track.table["stamp_ns"].to_numpy()
     ends = {"start_ns": int(stamp_ns[0]), "end_ns": int(stamp_ns[-1])}
     stretch = StretchFacts({}, {}, {}, 0, common_scale_std=0.12, **ends)
-    facts = replace(track.info.findings.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (stretch,)))
-    known = gate(replace(track, info=replace(track.info, findings=Findings((), facts))))
+    facts = replace(track.info.report.facts, fuse=FuseFacts(200, (), {}, {}, {}, {}, 0.0, (stretch,)))
+    known = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
     assert not rows_of(known, DropReason.GAP).any()
 
 
 def test_a_run_whose_sensors_contradict_each_other_undecided_is_all_gap():
     track = straight_track(np.full(200, 0.9))
-    facts = replace(track.info.findings.facts, audit=AuditFacts((), ("gnss",)))
-    gated = gate(replace(track, info=replace(track.info, findings=Findings((), facts))))
+    facts = replace(track.info.report.facts, audit=AuditFacts((), ("gnss",)))
+    gated = gate(replace(track, info=replace(track.info, report=StageReport((), facts))))
     assert rows_of(gated, DropReason.GAP).all()
-    assert gated.info.findings.facts.gate.gap_rows["contradicted"] == 200
+    assert gated.info.report.facts.gate.gap_rows["contradicted"] == 200
 
 
 def test_rows_and_reasons_are_counted():
     gated = gate(straight_track(start_and_stop(), commanded_mps=np.where((T >= 5) & (T < 49.1), 1.0, 0.0)))
-    facts = gated.info.findings.facts.gate
+    facts = gated.info.report.facts.gate
     dropped_by = gated.table["dropped_by"].to_numpy()
     assert facts.rows == len(T)
     assert facts.rows_kept == (dropped_by == 0).sum()
@@ -182,8 +183,8 @@ def test_a_track_faster_than_plausible_bears_no_segment_there():
     assert segments.table.num_rows > 30
     spans_s = (segments.table["end_ns"].to_numpy() - segments.table["start_ns"].to_numpy()) * 1e-9
     assert (segments.table["chord_m"].to_numpy() / spans_s).max() < 2.0
-    assert gated.info.findings.facts.gate.gap_rows["implausible"] == pytest.approx(200, abs=3)
-    (said,) = [line for line in gated.info.findings.warnings if "faster than 15 m/s" in line]
+    assert gated.info.report.facts.gate.gap_rows["implausible"] == pytest.approx(200, abs=3)
+    (said,) = [line for line in gated.info.report.findings if "faster than 15 m/s" in line]
     assert said.endswith("set recipe key gate.max_plausible_mps")
     assert not rows_of(gate(straight_track(speed), config=GateConfig(max_plausible_mps=50.0)), DropReason.GAP)[450]
 

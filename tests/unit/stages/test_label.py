@@ -13,15 +13,15 @@ from tcpipe.stages.label import label_segments
 from tcpipe.stages.segment import segment_track
 from tcpipe.tables.bits import Quality
 from tcpipe.tables.columns import floats, integers
-from tcpipe.tables.findings import (
+from tcpipe.tables.facts import (
     AuditFacts,
     Disagreement,
-    Findings,
     FuseFacts,
     Reopening,
     RunFacts,
     StretchFacts,
 )
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Sensor, Streams
 
 T = np.arange(0, 60, 0.05)
@@ -69,13 +69,13 @@ def test_constant_power_on_a_straight_line():
 def test_whole_run_energy_and_where_it_went():
     speed = np.clip(np.minimum(T - 5, 50 - T), 0, 0.8)
     labelled = label(straight_track(speed), power_streams({"drive": record()}))
-    facts = labelled.info.findings.facts.label
+    facts = labelled.info.report.facts.label
     stamp_ns, _, _ = record()
     assert facts.energy_joule == pytest.approx(144.0 * (stamp_ns[-1] - stamp_ns[0]) * 1e-9)
     entries = facts.energy_by_entry_joule
     assert sum(entries.values()) == pytest.approx(facts.energy_joule)
     assert entries["standing"] == pytest.approx(144 * 15, rel=0.02)
-    seconds = labelled.info.findings.facts.segment.ledger_s
+    seconds = labelled.info.report.facts.segment.ledger_s
     for name in ("standing", "accelerating"):
         assert entries[name] == pytest.approx(144 * seconds[name], rel=1e-9)
     assert entries["steady"] == pytest.approx(144 * sum(seconds[n] for n in ("kept", "curved", "leftover")), rel=1e-9)
@@ -125,7 +125,7 @@ def test_averaged_sources_are_right_endpoint_rectangles():
     start, end = ((integers(labelled.table, name) - ZERO) * 1e-9 for name in ("start_ns", "end_ns"))
     wanted = 24 * ((6 * end + end**2) - (6 * start + start**2))
     assert floats(labelled.table, "energy_joule") == pytest.approx(wanted, abs=24 * 2 * 0.5**2 / 4 + 1e-6)
-    assert labelled.info.findings.facts.label.integration == "averaged"
+    assert labelled.info.report.facts.label.integration == "averaged"
     assert not flagged(labelled, Quality.LOW_POWER_RATE).any()
 
 
@@ -134,7 +134,7 @@ def test_a_run_without_power_has_null_labels():
     table = labelled.table
     assert table["energy_joule"].null_count == table["power_std_watt"].null_count == table.num_rows > 0
     assert floats(table, "duration_s") == pytest.approx(1.25, abs=1e-8)
-    assert labelled.info.findings.facts.label.energy_joule is None
+    assert labelled.info.report.facts.label.energy_joule is None
 
 
 def test_segments_beyond_the_record_have_null_labels_and_a_warning():
@@ -143,7 +143,7 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
     labelled = label(straight_track(SPEED), power_streams({"drive": (stamp_ns[short], volt[short], amp[short])}))
     unknown = np.isnan(floats(labelled.table, "energy_joule"))
     assert unknown.tolist() == (integers(labelled.table, "end_ns") > stamp_ns[short][-1]).tolist()
-    assert any("have no label" in text for text in labelled.info.findings.warnings)
+    assert any("have no label" in text for text in labelled.info.report.findings)
 
 
 @pytest.mark.parametrize(
@@ -152,7 +152,7 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
 def test_low_power_rate(period_s, averaged, low):
     labelled = label(straight_track(SPEED), power_streams({"drive": record(period_s)}, averaged=averaged))
     assert flagged(labelled, Quality.LOW_POWER_RATE).all() == low
-    assert any("the current is measured at" in text for text in labelled.info.findings.warnings) == low
+    assert any("the current is measured at" in text for text in labelled.info.report.findings) == low
 
 
 def test_voltage_out_of_range_where_it_is():
@@ -183,7 +183,7 @@ def test_slip_weak_position_curve_and_command():
     assert flagged(labelled, Quality.HIGH_SLIP)[late].all()
     assert not flagged(labelled, Quality.HIGH_SLIP)[~late][:-1].any()
     assert not flagged(labelled, Quality.NO_COMMAND).any()
-    assert sum("wheels and ground differ" in text for text in labelled.info.findings.warnings) == 1
+    assert sum("wheels and ground differ" in text for text in labelled.info.report.findings) == 1
 
     weak = label(straight_track(SPEED, std_m=0.2), power_streams({"drive": record()}))
     assert flagged(weak, Quality.WEAK_GNSS).all()
@@ -202,8 +202,8 @@ def test_segments_that_touch_a_time_in_which_sensors_disagree_undecided_are_flag
 
     track = straight_track(SPEED)
     audit = AuditFacts((between(20, 30), between(40, 50, alone=True), between(5, 10, epoch=1)))
-    facts = replace(track.info.findings.facts, audit=audit)
-    told = replace(track, info=replace(track.info, findings=Findings((), facts)))
+    facts = replace(track.info.report.facts, audit=audit)
+    told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))
     touched = (integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
         integers(labelled.table, "end_ns") >= ZERO + 20e9
@@ -218,8 +218,8 @@ def test_segments_in_which_the_gate_of_the_fixes_reopened_are_flagged():
 
     track = straight_track(SPEED)
     stretch = StretchFacts({}, {}, {}, 0, reopenings=(refused("gnss", 20, 30), refused("wheel_odometry", 40, 50)))
-    facts = replace(track.info.findings.facts, fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, (stretch,)))
-    told = replace(track, info=replace(track.info, findings=Findings((), facts)))
+    facts = replace(track.info.report.facts, fuse=FuseFacts(0, (), {}, {}, {}, {}, 0.0, (stretch,)))
+    told = replace(track, info=replace(track.info, report=StageReport((), facts)))
     labelled = label(told, power_streams({"drive": record()}))
     touched = (integers(labelled.table, "start_ns") <= ZERO + 30e9) & (
         integers(labelled.table, "end_ns") >= ZERO + 20e9
@@ -244,7 +244,7 @@ def test_not_at_the_limit_where_slower_than_full_speed_was_kept():
 def test_error_budget_adds_up_to_the_deviations():
     rough = lambda t: 6 + np.random.default_rng(0).normal(0, 1, len(t))  # noqa: E731
     labelled = label(straight_track(SPEED, std_m=1.0), power_streams({"drive": record(0.2, amp=rough)}))
-    budget = labelled.info.findings.facts.label.energy_budget
+    budget = labelled.info.report.facts.label.energy_budget
     energy, std = floats(labelled.table, "energy_joule"), floats(labelled.table, "energy_std_joule")
     assert budget.total == pytest.approx(np.sqrt(np.mean(std**2)) / energy.mean())
     assert budget.total**2 == pytest.approx(sum(getattr(budget, cause) ** 2 for cause in CAUSES))
@@ -269,7 +269,7 @@ def test_clock_doubtful_when_the_recorder_stamped_what_counts(role, doubtful):
     sensors = {role: Sensor("/t", "x/msg/Y", "f", "why", time_source="log")}
     streams = power_streams({"drive": record()}, sensors=sensors)
     assert flagged(label(straight_track(SPEED), streams), Quality.CLOCK_DOUBTFUL).all() == doubtful
-    stepped = replace(streams, sensors={}, findings=Findings((), RunFacts(epochs=2)))
+    stepped = replace(streams, sensors={}, report=StageReport((), RunFacts(epochs=2)))
     assert flagged(label(straight_track(SPEED), stepped), Quality.CLOCK_DOUBTFUL).all()
 
 
@@ -303,6 +303,6 @@ def test_deviations_grow_with_their_causes():
 def test_a_run_without_any_current_has_no_relative_deviation_and_divides_by_nothing():
     """No energy is the share of no energy: a raw RuntimeWarning reached the terminal."""
     labelled = label(straight_track(SPEED), power_streams({"drive": record(amp=lambda t: 0 * t)}))
-    told = labelled.info.findings.facts.label.relative_std_median
+    told = labelled.info.report.facts.label.relative_std_median
     assert (told["power"], told["energy"]) == (None, None)
     assert told["duration"] > 0.0

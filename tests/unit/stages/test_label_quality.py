@@ -9,18 +9,18 @@ from made_tracks import stamps
 
 from tcpipe.stages.label_quality import clock_doubtful, motion_flags
 from tcpipe.tables.bits import DropReason, Quality
-from tcpipe.tables.findings import (
+from tcpipe.tables.facts import (
     AuditFacts,
     ClockFacts,
     ClockOffset,
     Disagreement,
-    Findings,
     FuseFacts,
     GateFacts,
     Reopening,
     RunFacts,
     StretchFacts,
 )
+from tcpipe.tables.findings import StageReport
 from tcpipe.tables.levels import Sensor, Streams, TrackInfo
 
 STAMPS = stamps(200)  # at 20 Hz and 1 m/s: five centimetres a row
@@ -61,7 +61,7 @@ def cut(count=1, **said):
 
 
 def info(**facts):
-    return TrackInfo("run-0", "husky", None, 20.0, "smoother", Findings((), RunFacts(**{"gate": GATED} | facts)))
+    return TrackInfo("run-0", "husky", None, 20.0, "smoother", StageReport((), RunFacts(**{"gate": GATED} | facts)))
 
 
 def flags(segment, track=None, about=None):
@@ -151,7 +151,7 @@ def test_fixes_that_were_off_dispute_a_segment(role, disputed):
 
 def streams(*, epochs=1, **time_sources):
     sensors = {role: Sensor(f"/{role}", "x/msg/Y", role, "why", time_source=at) for role, at in time_sources.items()}
-    return Streams({}, sensors, "husky", findings=Findings((), RunFacts(epochs=epochs)))
+    return Streams({}, sensors, "husky", report=StageReport((), RunFacts(epochs=epochs)))
 
 
 def clocks(role, *, noted=False, drifts=False, heading_offset_s=None):

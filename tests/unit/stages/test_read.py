@@ -192,8 +192,8 @@ def test_a_whole_husky() -> None:
     assert found.sensors["wheel_odometry"].placed_by == "same frame"
     assert found.sensors["command"].time_source == "log"
     assert found.tables["wheel_odometry"]["velocity_var_x_m2ps2"][0].as_py() == 0.01
-    assert len(found.findings.warnings) == 1  # the current's sign
-    facts = found.findings.facts
+    assert len(found.report.findings) == 1  # the current's sign
+    facts = found.report.facts
     assert facts.epochs == 1
     assert facts.roles["imu"].topics["/imu/data"].rows == 500
     assert abs(facts.roles["imu"].topics["/imu/data"].rate_hz - 50.0) < 1e-6
@@ -211,7 +211,7 @@ def test_the_rails_keep_their_names_and_their_sum_is_the_robots_current() -> Non
 def test_the_same_log_gives_the_same_bytes() -> None:
     one, two = read(husky()), read(husky())
     assert all(one.tables[role].equals(two.tables[role], check_metadata=True) for role in one.tables)
-    assert one.findings == two.findings
+    assert one.report == two.report
     assert one.sensors == two.sensors
 
 
@@ -230,7 +230,7 @@ def test_a_latched_tf_places_what_tf_static_does_not() -> None:
     found = read(topics)
     assert found.sensors["gnss"].xyz_m == (0.0, 0.0, 2.0)
     assert found.sensors["imu"].placed_by == "assumed"
-    warning = next(text for text in found.findings.warnings if "imu_link" in text)
+    warning = next(text for text in found.report.findings if "imu_link" in text)
     assert "[read.placement]: imu = {xyz_m" in warning
 
 
@@ -244,7 +244,7 @@ def test_the_recipe_places_over_tf() -> None:
 def test_missing_gnss_and_power_are_warnings() -> None:
     found = read({"/odom": odometry()})
     assert set(found.tables) == {"wheel_odometry"}
-    assert ["gnss" in found.findings.warnings[0], "power" in found.findings.warnings[1]] == [True, True]
+    assert ["gnss" in found.report.findings[0], "power" in found.report.findings[1]] == [True, True]
 
 
 def test_power_that_cannot_be_believed_is_a_warning_too() -> None:
@@ -252,7 +252,7 @@ def test_power_that_cannot_be_believed_is_a_warning_too() -> None:
     dead = ("sensor_msgs/msg/BatteryState", message_table(rows, 1.0, voltage=full(rows, 0.0), current=full(rows, 0.0)))
     found = read({"/odom": odometry(), "/battery": dead})
     assert "power" not in found.tables
-    assert any("zero on all 60 rows" in text for text in found.findings.warnings)
+    assert any("zero on all 60 rows" in text for text in found.report.findings)
 
 
 def test_topics_without_messages_play_no_part_even_where_the_index_cannot_tell() -> None:
@@ -280,8 +280,8 @@ def test_nmea_sentences_play_gnss_on_their_own_time() -> None:
     gnss = found.tables["gnss"]
     assert gnss["stamp_ns"].to_pylist() == stamps.tolist()
     assert set(gnss["alt_m"].to_pylist()) == {400.0}
-    assert found.findings.facts.roles["gnss"].topics["/nmea_sentence"].dropped == {"not_gga": 20}
-    assert not any("not used" in text for text in found.findings.warnings)
+    assert found.report.facts.roles["gnss"].topics["/nmea_sentence"].dropped == {"not_gga": 20}
+    assert not any("not used" in text for text in found.report.findings)
 
 
 def test_one_topic_of_sentences_plays_two_roles_each_on_its_own_time() -> None:
@@ -300,7 +300,7 @@ def test_one_topic_of_sentences_plays_two_roles_each_on_its_own_time() -> None:
     assert velocity["up_velocity_mps"].null_count == velocity["east_var_m2ps2"].null_count == 20
     assert set(velocity["fix_status"].to_pylist()) == {2}
     assert found.sensors["gnss_velocity"].placed_by == "not needed"
-    assert not any("gnss_velocity" in line for line in found.findings.warnings)
+    assert not any("gnss_velocity" in line for line in found.report.findings)
 
 
 @pytest.mark.parametrize(("frame", "rows"), [("gps", 50), ("base_link", 0), ("robot/base_footprint", 0)])
@@ -314,7 +314,7 @@ def test_a_receivers_twist_in_the_bodys_frame_stays_out_unless_the_recipe_names_
     topics = {"/gps/fix": fix(), "/gps/vel": ("geometry_msgs/msg/TwistWithCovarianceStamped", twist)}
     found = read(topics)
     assert (found.tables["gnss_velocity"].num_rows if rows else len(set(found.tables) - {"gnss"})) == rows
-    assert any("nobody can tell" in line for line in found.findings.warnings) == (not rows)
+    assert any("nobody can tell" in line for line in found.report.findings) == (not rows)
     named = ReadConfig(topics={"gnss_velocity": ["/gps/vel"]})
     told = read_run(MemoryLog(topics), named, robot=None, known=shipped_profiles())
     assert told.tables["gnss_velocity"].num_rows == 50
@@ -326,7 +326,7 @@ def test_a_topic_that_cannot_be_decoded_plays_no_part() -> None:
     )
     assert "gnss" not in found.tables
     assert "power" not in found.tables  # one side alone is not the robot's power
-    text = "\n".join(found.findings.warnings)
+    text = "\n".join(found.report.findings)
     assert "/fix cannot be decoded" in text
     assert "power refused" in text
 
@@ -352,7 +352,7 @@ def test_visual_odometry_without_twist_keeps_its_pose() -> None:
     assert table["velocity_x_mps"].null_count == table.num_rows == 500
     assert table["x_m"].null_count == 0
     assert found.sensors["visual_odometry"].frame_id == "zed_camera"
-    assert any("only its pose is used" in text for text in found.findings.warnings)
+    assert any("only its pose is used" in text for text in found.report.findings)
 
 
 def test_settings_of_the_recipe_reach_their_role() -> None:
@@ -378,7 +378,7 @@ def test_settings_of_the_recipe_reach_their_role() -> None:
     ):
         expected = factor * plain[column].to_numpy(zero_copy_only=False)
         np.testing.assert_array_equal(scaled[column].to_numpy(zero_copy_only=False), expected)
-    assert found.findings.facts.odometry_scale == {"wheel_odometry": 0.5}
+    assert found.report.facts.odometry_scale == {"wheel_odometry": 0.5}
     assert found.power_averaged
     assert found.gnss_crs == "EPSG:7844"
 
@@ -397,11 +397,11 @@ def with_step(table: pa.Table) -> pa.Table:
 def test_a_step_of_all_clocks_divides_every_table() -> None:
     topics = {name: (kind, with_step(table)) for name, (kind, table) in husky().items()}
     found = read(topics)
-    assert found.findings.facts.epochs == 2
+    assert found.report.facts.epochs == 2
     for role, table in found.tables.items():
         epoch = table["epoch"].to_numpy()
         np.testing.assert_array_equal(epoch == 1, table["log_time_ns"].to_numpy() >= START + 5 * S, err_msg=role)
-    assert any("steps by +7.000 s" in text for text in found.findings.warnings)
+    assert any("steps by +7.000 s" in text for text in found.report.findings)
 
 
 def test_rows_of_power_that_carry_nothing_are_counted() -> None:
@@ -443,7 +443,7 @@ def test_a_counter_of_energy_is_power_by_the_stamps_that_rule(*, stepped: bool) 
     within = np.diff(epoch) == 0
     np.testing.assert_allclose((watt[1:] * np.diff(stamp_s))[within], np.diff(joule)[within], rtol=1e-5)
     assert found.power_averaged
-    assert not any("set aside" in line for line in found.findings.warnings)
+    assert not any("set aside" in line for line in found.report.findings)
 
 
 @pytest.mark.parametrize(("setting", "averaged", "said"), [("auto", False, "nobody knows"), ("yes", True, None)])
@@ -455,7 +455,7 @@ def test_averaging_that_nobody_knows_and_no_motion_tells_is_asked(
     del topics["/left/battery"], topics["/right/battery"]
     found = read(topics, power_averaged=setting)
     assert found.power_averaged == averaged
-    asked = [line for line in found.findings.warnings if "nobody knows whether its values are means" in line]
+    asked = [line for line in found.report.findings if "nobody knows whether its values are means" in line]
     assert bool(asked) == (said is not None)
 
 
@@ -502,10 +502,10 @@ def test_a_pose_is_placed_by_its_crs_and_stands_in_for_the_fixes():
     np.testing.assert_allclose(placed.tables["pose"]["lat_deg"].to_numpy(), lat, atol=1e-11)
     assert placed.tables["pose"]["alt_m"].to_pylist() == [640.0] * 100
     assert placed.tables["pose"]["east_var_m2"].to_pylist() == pytest.approx([0.0004] * 100)
-    assert any("/slam/pose stands in for GNSS" in line for line in placed.findings.warnings)
+    assert any("/slam/pose stands in for GNSS" in line for line in placed.report.findings)
     local = read(topics, topics={"pose": ["/slam/pose"]})
     assert local.tables["pose"]["lon_deg"].null_count == 100
-    assert any("segments, but no samples" in line for line in local.findings.warnings)
+    assert any("segments, but no samples" in line for line in local.report.findings)
     for crs, said in (("EPSG:4326", "not projected"), ("MTM 7", "not a coordinate reference system")):
         with pytest.raises(RecipeError, match=said):
             read(topics, topics={"pose": ["/slam/pose"]}, pose_crs=crs)

@@ -9,7 +9,7 @@ from tcpipe.logs.roles import PlayedRole, RoleAssignment
 from tcpipe.power.readings import PowerReadings
 from tcpipe.stages.read_findings import read_findings
 from tcpipe.stages.read_sources import TopicReadings
-from tcpipe.tables.findings import ClockStep, PowerSign
+from tcpipe.tables.facts import ClockStep, PowerSign
 from tcpipe.tables.levels import Sensor
 
 COUNT = 200

@@ -102,8 +102,8 @@ def test_the_ledger_accounts_for_every_metre_once(seed):
     assert ledger["kept"] == pytest.approx(floats(segments.table, "arc_length_m").sum(), rel=1e-12)
     # Independent odometer: a fine polygon through every row's Hermite cubic, straight lines where stamps or epochs break.
     assert sum(ledger.values()) == pytest.approx(odometer_m(track.table), rel=1e-4)
-    assert sum(ledger.values()) == pytest.approx(segments.info.findings.facts.segment.odometer_m, rel=1e-12)
-    seconds = segments.info.findings.facts.segment.ledger_s
+    assert sum(ledger.values()) == pytest.approx(segments.info.report.facts.segment.odometer_m, rel=1e-12)
+    seconds = segments.info.report.facts.segment.ledger_s
     assert sum(seconds.values()) == pytest.approx(2398 * 0.05 + 2.0, rel=1e-9)  # all but the interval of the clock step
 
 
@@ -157,7 +157,7 @@ def test_mean_command_of_a_segment():
 def test_a_run_that_never_moves_says_so():
     segments = cut(straight_track(np.zeros(len(T))))
     assert segments.table.num_rows == 0
-    assert any("the robot never moved" in text for text in segments.info.findings.warnings)
+    assert any("the robot never moved" in text for text in segments.info.report.findings)
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

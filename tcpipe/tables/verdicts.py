@@ -1,0 +1,47 @@
+"""Verdicts: whether position, time and energy of a run, a dataset, a store or a model are usable, judged from findings alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeAlias
+
+from tcpipe.tables.catalogue import AFFECTED, Affected, Severity, catalogue_version, read_catalogue
+from tcpipe.tables.findings import Finding, sort_findings
+
+Grade: TypeAlias = Literal["usable", "usable with care", "not usable"]
+
+GRADES: tuple[Grade, ...] = ("usable", "usable with care", "not usable")
+_GRADE_OF: Mapping[Severity, Grade] = {"error": "not usable", "warning": "usable with care", "note": "usable"}
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """A grade each for position, time and energy, and the findings that decided, the worst first."""
+
+    position: Grade = "usable"
+    time: Grade = "usable"
+    energy: Grade = "usable"
+    reasons: tuple[Finding, ...] = ()
+    catalogue: str = field(default_factory=catalogue_version)
+    """Version of the catalogue that judged."""
+
+    @property
+    def worst(self) -> Grade:
+        """The worst of the three grades."""
+        return max((self.position, self.time, self.energy), key=GRADES.index)
+
+
+def judge(findings: Iterable[Finding]) -> Verdict:
+    """Return the verdict: each label has the grade of the worst finding that affects it."""
+    catalogue = read_catalogue()
+    grades: dict[Affected, Grade] = dict.fromkeys(AFFECTED, "usable")
+    reasons = []
+    for finding in sort_findings(findings):
+        affected = catalogue[finding.code].affects if finding.code in catalogue else ()
+        grade = _GRADE_OF[finding.severity]
+        if affected and grade != "usable":
+            reasons.append(finding)
+        for name in affected:
+            grades[name] = max(grades[name], grade, key=GRADES.index)
+    return Verdict(**grades, reasons=tuple(reasons))
