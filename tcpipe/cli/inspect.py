@@ -125,6 +125,8 @@ def _print_clocks(log: InspectedLog) -> None:
 
 
 def _print_map(found: InspectedMap) -> None:
+    from tcpipe.formats.finding_lines import list_findings
+
     size = " x ".join(f"{pixels * found.pitch_m:.1f} m" for pixels in (found.cols, found.rows))
     say(f"{found.path}: {size} at {found.pitch_m:g} m a pixel in {found.crs}")
     say("")
@@ -140,11 +142,14 @@ def _print_map(found: InspectedMap) -> None:
     if "terrain" in found.layers:
         say("")
         _print_table(["id", "class", "traversable", "share"], classes)
-    for line in found.warnings:
-        say(f"warning: {line}")
+    for line in list_findings(found.findings):
+        say(line)
 
 
 def _print_dataset(found: InspectedDataset) -> None:
+    from tcpipe.formats.dataset_card import group_dataset_findings
+    from tcpipe.formats.finding_lines import format_verdict, list_mixed_groups
+
     say(
         f"{found.path}: dataset {found.name}, {found.samples} samples of {', '.join(found.robots)}, "
         f"format {found.format}, data model {found.data_model_version}"
@@ -159,8 +164,10 @@ def _print_dataset(found: InspectedDataset) -> None:
     say("")
     say(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
     say(f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}")
-    for line in found.warnings:
-        say(f"warning: {line}")
+    if found.verdict is not None:
+        say(f"verdict: {format_verdict(found.verdict)}")
+    for line in list_mixed_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
+        say(line)
 
 
 def _print_store(found: InspectedStore) -> None:
