@@ -6,11 +6,11 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from tcpipe.recipe.suggestions import recipe_key, suggested
+from tcpipe.recipe.suggestions import RecipeFragment, recipe_key
 from tcpipe.tables.bits import DropReason, Loss, name_of
 
 _SPEED = recipe_key("gate.max_velocity_mps")
-_KEEP_SLOWER = suggested("to keep what was driven slower", {"gate": {"require_full_speed": False}})
+_KEEP_SLOWER = RecipeFragment({"gate": {"require_full_speed": False}}).inline()
 _PLACE, _STD = recipe_key("read.placement"), recipe_key("sample.max_position_std_m")
 
 REMEDIES: Mapping[str, str] = {
@@ -22,7 +22,7 @@ REMEDIES: Mapping[str, str] = {
         DropReason.TURNING_IN_PLACE: "drive wide turns instead of turning on the spot, and longer legs between them",
         DropReason.REVERSING: "drive forwards",
         DropReason.ACCELERATING: "hold one speed over long legs: each start, stop and commanded change costs two seconds",
-        DropReason.BELOW_LIMIT: f"command full speed; if that was its limit, state it ({_SPEED}){_KEEP_SLOWER}",
+        DropReason.BELOW_LIMIT: f"command full speed; if that was its limit, state it ({_SPEED}); to keep slower driving: {_KEEP_SLOWER}",
         Loss.CURVED: "drive straighter lines: a metre whose arc is 2 % longer than its chord is no segment",
         Loss.LEFTOVER: "drive longer steady legs: each ends with up to a metre that is no whole segment",
         Loss.OUTSIDE_MAP: "a map that reaches two metres beyond what is driven",
