@@ -9,6 +9,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from tcpipe.motion.remedies import StoreLoss, loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
 from tcpipe.tables.catalogue import Entry, Severity, read_catalogue
 from tcpipe.tables.findings import Finding, Remedy, sort_findings
@@ -199,3 +200,16 @@ def format_groups(
         lines += [f"{of.severity}: {format_group(of, total, what)}"]
         lines += [f"    {line}" for line in block_lines(of.findings)]
     return lines + _count_rest(len(found) - most, len(groups) - len(found), more)
+
+
+def format_loss(loss: StoreLoss) -> str:
+    """Return a loss of distance as one line, with how to avoid it."""
+    runs = "1 run" if loss.runs == 1 else f"{loss.runs} runs"
+    advice = advise_on_loss(loss.reason)
+    return f"{loss.metres:>9.1f} m ({loss.share:.1%}) {loss.reason.replace('_', ' ')} in {runs}{f': {advice}' if advice else ''}"
+
+
+def advise_on_loss(reason: str) -> str:
+    """Return how to lose less distance for a reason of the breakdown; "" where nothing is to be done."""
+    entry = read_catalogue().get(loss_code(reason))
+    return entry.advice if entry else ""

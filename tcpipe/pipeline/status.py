@@ -14,7 +14,14 @@ from typing import Literal, get_args
 from tcpipe import __version__
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.finding_lines import MOST_LINES, describe_finding, format_count, format_verdict, group_findings
+from tcpipe.formats.finding_lines import (
+    MOST_LINES,
+    describe_finding,
+    format_count,
+    format_loss,
+    format_verdict,
+    group_findings,
+)
 from tcpipe.formats.index_files import RunFacts, uncollected
 from tcpipe.formats.object_storage import is_url, shown_path
 from tcpipe.formats.places import local_output
@@ -109,7 +116,7 @@ class Status:
         lines += [f"{call.state}: {call}" for call in self.begun if call.state != "killed"]
         lines += [f"verdict: {format_verdict(self.verdict)}"] if self.runs else []
         lines += [f"  {format_count(code, count, self.runs)}" for code, count in [*self.findings.items()][:MOST_LINES]]
-        lines += ["losses:", *map(str, self.losses)] if self.losses else []
+        lines += ["losses:", *map(format_loss, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
         return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from tcpipe.errors import StoreError, TableError
+from tcpipe.formats.finding_lines import advise_on_loss
 from tcpipe.formats.json_files import Json
 from tcpipe.formats.parquet import read_table
 from tcpipe.formats.run_documents import Manifest, RunJson
@@ -95,7 +96,7 @@ def run_report(store: Store, run: RunDirectory, of_maps: MutableMapping[str, Pic
 def _losses(ledger_m: Mapping[str, float]) -> Section:
     """Return where the distance went, and how to lose less of it."""
     rows = [
-        (loss.reason.replace("_", " "), f"{loss.metres:.1f}", f"{100 * loss.share:.1f} %", loss.remedy)
+        (loss.reason.replace("_", " "), f"{loss.metres:.1f}", f"{100 * loss.share:.1f} %", advise_on_loss(loss.reason))
         for loss in losses_of([ledger_m])
     ]
     text = "Kept and dropped distances add up to the odometer."

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tcpipe.cost.held_out import PHYSICS_UNITS
-from tcpipe.formats.finding_lines import describe_finding, format_group
+from tcpipe.formats.finding_lines import advise_on_loss, describe_finding, format_group
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.json_files import Json
 from tcpipe.motion.remedies import StoreLoss, losses_of
@@ -153,11 +153,17 @@ def _losses(current: Sequence[StoredRun], losses: Sequence[StoreLoss]) -> list[S
     if not ledger_m:
         return []
     rows = [
-        (loss.reason.replace("_", " "), f"{loss.metres:.0f}", f"{100 * loss.share:.1f} %", loss.runs, loss.remedy)
+        (
+            loss.reason.replace("_", " "),
+            f"{loss.metres:.0f}",
+            f"{100 * loss.share:.1f} %",
+            loss.runs,
+            advise_on_loss(loss.reason),
+        )
         for loss in losses
     ]
-    header = ("lost to", "metres", "of all", "runs", "what wins them back")
-    text = "The largest losses, and what would win them back; 'tcpipe status' says the same."
+    header = ("lost to", "metres", "of all", "runs", "to lose less")
+    text = "The largest losses, and how to lose less; 'tcpipe status' lists the same."
     return [Section("Where every metre went", text, header=header, rows=rows, plots=[waterfall(ledger_m)])]
 
 
