@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from string import Formatter
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from tcpipe.motion.remedies import StoreLoss, loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
-from tcpipe.tables.catalogue import Entry, Severity, read_catalogue
+from tcpipe.tables.catalogue import Entry, Severity, rank_severity, read_catalogue
 from tcpipe.tables.findings import Finding, Remedy, sort_findings
 from tcpipe.tables.verdicts import Verdict
 
@@ -20,7 +19,7 @@ K = TypeVar("K", bound=Hashable)
 _UNITS: Mapping[str, tuple[str, float]] = {
     "_mps2": (" m/s²", 1.0), "_mps": (" m/s", 1.0), "_radps": (" °/s", 180.0 / np.pi), "_rad": ("°", 180.0 / np.pi), "_hz": (" Hz", 1.0),
     "_volt": (" V", 1.0), "_amp": (" A", 1.0), "_watt": (" W", 1.0), "_joule": (" J", 1.0), "_fraction": (" %", 100.0),
-    "_bytes": (" bytes", 1.0), "_px": (" px", 1.0), "_deg": ("°", 1.0), "_m": (" m", 1.0), "_s": (" s", 1.0),
+    "_m2": (" m²", 1.0), "_bytes": (" bytes", 1.0), "_px": (" px", 1.0), "_deg": ("°", 1.0), "_m": (" m", 1.0), "_s": (" s", 1.0),
 }  # fmt: skip
 """Unit as people read it, and the factor to it, by the suffix of a number's name; the first that fits counts."""
 MOST_LINES = 8
@@ -126,6 +125,19 @@ def format_verdict(verdict: Verdict) -> str:
     return f"position {verdict.position}, time {verdict.time}, energy {verdict.energy}"
 
 
+def format_loss(loss: StoreLoss) -> str:
+    """Return a loss of distance as one line, with how to avoid it."""
+    runs = "1 run" if loss.runs == 1 else f"{loss.runs} runs"
+    advice = advise_on_loss(loss.reason)
+    return f"{loss.metres:>9.1f} m ({loss.share:.1%}) {loss.reason.replace('_', ' ')} in {runs}{f': {advice}' if advice else ''}"
+
+
+def advise_on_loss(reason: str) -> str:
+    """Return how to lose less distance for a reason of the breakdown; "" where nothing is to be done."""
+    entry = read_catalogue().get(loss_code(reason))
+    return entry.advice if entry else ""
+
+
 @dataclass(frozen=True, slots=True)
 class FindingGroup(Generic[K]):
     """Findings of one code in several runs, logs or maps."""
@@ -160,28 +172,28 @@ def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[Find
     return sorted(groups, key=lambda group: (order[group.code], -len(group.of)))
 
 
-def format_group(group: FindingGroup[K], total: int, what: str = "runs") -> str:
-    """Return a group as one line, with how many of ``total`` runs it concerns; of one run alone what was observed there."""
+def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") -> str:
+    """Return a group as one line, with how many of ``total`` runs it concerns, if given; of one finding alone what was observed."""
     findings = group.findings
     if len(group.of) == 1 and len(findings) == 1:
-        key = next(iter(group.of))
-        return f"{key}: {format_finding(findings[0])}"
+        key, line = next(iter(group.of)), format_finding(findings[0])
+        return line if key == findings[0].subject.name else f"{key}: {line}"
     subjects = ", ".join(sorted({of.subject.name for of in findings})[:_MOST_SUBJECTS])
     details = "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(group.code), findings))))
     return format_count(group.code, len(group.of), total, what, details)
 
 
-def format_count(code: str, count: int, total: int, what: str = "runs", details: str = "") -> str:
+def format_count(code: str, count: int, total: int | None, what: str = "runs", details: str = "") -> str:
     """Return as one line that ``count`` of ``total`` runs have a finding."""
     entry = read_catalogue().get(code)
     title = entry.title if entry else code.replace("-", " ")
-    return f"{count} of {total} {what}: {title}{f' ({details})' if details else ''} [{code}]"
+    head = "" if total is None else f"{count} of {total} {what}: "
+    return f"{head}{title}{f' ({details})' if details else ''} [{code}]"
 
 
 def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
     """Return the range of the first number that the template names."""
-    fields = Formatter().parse(entry.template) if entry else ()
-    name = next((name for _, name, _, _ in fields if name in findings[0].numbers), None)
+    name = next((of for of in (findings[0].numbers if entry else ()) if entry and of in entry.fields), None)
     if name is None:
         return ""
     values = [of.numbers[name] for of in findings if name in of.numbers]
@@ -190,26 +202,28 @@ def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
 
 
 def format_groups(
-    groups: Iterable[FindingGroup[K]], total: int, what: str = "runs", *, most: int = MOST_LINES, more: str = ""
+    groups: Iterable[FindingGroup[K]], total: int | None, what: str = "runs", *, most: int = MOST_LINES, more: str = ""
 ) -> list[str]:
     """Return at most ``most`` groups as lines, the worst first, then how many others and notes are listed by the command ``more``."""
-    groups = list(groups)
-    found = [of for of in groups if of.severity != "note"]
+    return format_mixed_groups([(group, total, what) for group in groups], most=most, more=more)
+
+
+def format_mixed_groups(
+    groups: Sequence[tuple[FindingGroup[K], int | None, str]], *, most: int = MOST_LINES, more: str = ""
+) -> list[str]:
+    """Return the same of groups of different things, each with the arguments of `format_group`."""
+    found = sorted((of for of in groups if of[0].severity != "note"), key=lambda of: rank_severity(of[0].severity))
+    return _group_lines(found[:most]) + _count_rest(len(found) - most, len(groups) - len(found), more)
+
+
+def list_mixed_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
+    """Return every group as a line, the worst first, notes too."""
+    return _group_lines(sorted(groups, key=lambda of: rank_severity(of[0].severity)))
+
+
+def _group_lines(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[str]:
     lines = []
-    for of in found[:most]:
-        lines += [f"{of.severity}: {format_group(of, total, what)}"]
-        lines += [f"    {line}" for line in block_lines(of.findings)]
-    return lines + _count_rest(len(found) - most, len(groups) - len(found), more)
-
-
-def format_loss(loss: StoreLoss) -> str:
-    """Return a loss of distance as one line, with how to avoid it."""
-    runs = "1 run" if loss.runs == 1 else f"{loss.runs} runs"
-    advice = advise_on_loss(loss.reason)
-    return f"{loss.metres:>9.1f} m ({loss.share:.1%}) {loss.reason.replace('_', ' ')} in {runs}{f': {advice}' if advice else ''}"
-
-
-def advise_on_loss(reason: str) -> str:
-    """Return how to lose less distance for a reason of the breakdown; "" where nothing is to be done."""
-    entry = read_catalogue().get(loss_code(reason))
-    return entry.advice if entry else ""
+    for group, total, what in groups:
+        lines += [f"{group.severity}: {format_group(group, total, what)}"]
+        lines += [f"    {line}" for line in block_lines(group.findings)]
+    return lines

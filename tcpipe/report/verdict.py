@@ -43,10 +43,19 @@ def show_groups(
 ) -> VerdictBox:
     """Return the verdict on ``total`` runs with their findings by code; ``findings`` are of all of them together."""
     lines = _show(sort_findings(findings))
-    for group in groups:
-        recipe = "\n".join(block_lines(group.findings))
-        lines.append(ShownFinding(group.severity, format_group(group, total), recipe))
-    return _make_box(verdict, lines)
+    return _make_box(verdict, [*lines, *_show_groups((group, total, "runs") for group in groups)])
+
+
+def show_mixed_groups(verdict: Verdict, groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> VerdictBox:
+    """Return the verdict on a dataset with its findings by code, each group with the arguments of `format_group`."""
+    return _make_box(verdict, _show_groups(groups))
+
+
+def _show_groups(groups: Iterable[tuple[FindingGroup[K], int | None, str]]) -> list[ShownFinding]:
+    return [
+        ShownFinding(group.severity, format_group(group, total, what), "\n".join(block_lines(group.findings)))
+        for group, total, what in groups
+    ]
 
 
 def _show(findings: Iterable[Finding]) -> list[ShownFinding]:
