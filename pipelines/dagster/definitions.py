@@ -23,7 +23,11 @@ from typing import Any
 
 import dagster as dg
 
+from tcpipe.formats.finding_lines import format_finding
+from tcpipe.formats.json_files import typed
 from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.tables.catalogue import AFFECTED
+from tcpipe.tables.verdicts import Verdict
 
 Answer = Mapping[str, Any]
 
@@ -82,10 +86,18 @@ def _picture(path: Path) -> dict[str, dg.MetadataValue]:
     return {"map": dg.MetadataValue.md(f"![map](data:image/png;base64,{data})")}
 
 
-def _check(name: str, problems: list[str], *, warn: bool = False, **counts: int) -> dg.AssetCheckResult:
+def _check(name: str, problems: list[str], *, warn: bool = False, **more: int | str) -> dg.AssetCheckResult:
     severity = dg.AssetCheckSeverity.WARN if warn else dg.AssetCheckSeverity.ERROR
-    metadata = {"problems": _listed(problems), **counts}
+    metadata = {"problems": _listed(problems), **more}
     return dg.AssetCheckResult(check_name=name, passed=not problems, severity=severity, metadata=metadata)
+
+
+def _judged(result: Answer) -> dg.AssetCheckResult:
+    """Return whether position, time and energy of a run are usable; the reasons are the problems, the worst first."""
+    verdict = typed(result["verdict"], Verdict, "tcpipe ingest --json")
+    lines = [*map(format_finding, verdict.reasons), *result["damage"]]
+    grades = {name: getattr(verdict, name) for name in AFFECTED}
+    return _check("usable", lines, warn=verdict.worst != "not usable", **grades)
 
 
 def _verified(path: str) -> dg.AssetCheckResult:
@@ -101,9 +113,7 @@ def _verified(path: str) -> dg.AssetCheckResult:
     kinds={"parquet"},
     check_specs=[
         dg.AssetCheckSpec("as_written", asset="run", description="Every byte is as it was written (tcpipe verify)."),
-        dg.AssetCheckSpec(
-            "nothing_doubtful", asset="run", description="Nothing is damaged, no sensor is missing or contradicted."
-        ),
+        dg.AssetCheckSpec("usable", asset="run", description="Position, time and energy are usable without care."),
     ],
 )
 def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
@@ -130,7 +140,7 @@ def run(context: dg.AssetExecutionContext) -> dg.MaterializeResult:
         },
         check_results=[
             _verified(f"{_place('TCPIPE_STORE', 'tcpipe-store')}/runs/{result['run_id']}"),
-            _check("nothing_doubtful", [*result["damage"], *result["warnings"]], warn=True),
+            _judged(result),
         ],
     )
 

@@ -76,7 +76,7 @@ def ingest(
 
     A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, or a folder of such, searched downward, or the s3:// URL of
     one. What is in the store already (same content, same recipe) is left alone, and what failed for its content is not
-    tried again. A line is printed as each log ends; of several logs, warnings follow by cause.
+    tried again. A line is printed as each log ends; of several logs, findings follow by code.
 
     Exit code 3: some logs failed, are damaged, or give no segment though the robot drove, and that is news: it was not
     told before, and not accepted (tcpipe accept).
@@ -127,7 +127,7 @@ def ingest(
             if as_json:
                 print_json_line(recast(result, LogLine))
             else:
-                for line in _of_one(result, several=several):
+                for line in _of_one(result, store, several=several):
                     shown.result(line)
             for problem in result.problems if result.is_news else ():
                 shown.problem(problem)
@@ -154,58 +154,57 @@ def ingest(
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))
     else:
         if several:
-            _print_warnings(summary)
+            _print_findings(summary)
         _print_sum(summary)
     return summary.exit_code
 
 
-def _of_one(result: IngestResult, *, several: bool) -> Iterator[str]:
-    """Yield what became of a log: of one alone with its warnings, of several one line each, and what is broken."""
+def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterator[str]:
+    """Yield what became of a log: of one alone with its findings, of several one line each, and what is broken."""
     from tcpipe.cost.budget import in_words
+    from tcpipe.formats.finding_lines import describe_finding, format_findings, format_verdict
+    from tcpipe.tables.findings import select_problems
 
     aside = " (accepted)" if result.accepted else ""
-    warnings = result.warnings if result.status != "unchanged" else ()
-    budget = result.energy_budget if result.status != "unchanged" else None
+    is_new = result.status != "unchanged"
+    budget = result.energy_budget if is_new else None
+    problems = select_problems(result.findings)
     if result.status in ("failed", "waiting"):
         known = " (known, not tried again)" if result.known else ""
         yield f"{result.status:<10} {result.log}{aside or known}"
     else:
-        wrong = "damaged" if result.damage else "empty" if result.why_empty else ""
+        wrong = "damaged" if result.damage else "empty" if problems else ""
         known = f" ({wrong}, known)" if wrong and not result.is_news else ""
-        told = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
-        told += f", {len(warnings)} warning{'s' * (len(warnings) > 1)}" if several and warnings else ""
+        more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
+        more += f", {result.verdict.worst}" if several and is_new and result.verdict else ""
         yield (
             f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
-            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{told}{aside or known}"
+            f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{more}{aside or known}"
         )
-    if result.why_empty and (result.is_news or result.status != "unchanged"):
-        yield f"  {result.why_empty}"
-    if result.no_power and not several and result.status != "unchanged":
-        yield f"  {result.no_power.why}"
-        yield from (f"    {line}" for line in result.no_power.recipe.splitlines())
     if result.same_as:
         yield f"  {result.log} is the same recording as {result.same_as}: one run"
     if budget is not None and not several:
         yield f"  {in_words(budget)}"
     yield from (f"  {note}" for note in result.notes)
     yield from (f"  damage:  {line}" for line in result.damage if result.is_news or result.status == "damaged")
-    said = result.no_power.why if result.no_power else ""
-    yield from (f"  warning: {line}" for line in warnings if not several and line not in said)
+    if result.verdict is None:
+        return
+    if is_new and not several:
+        yield f"  verdict: {format_verdict(result.verdict)}"
+        where = f"tcpipe inspect {store}/runs/{result.run_id}"
+        yield from (f"  {line}" for line in format_findings(result.findings, more=where))
+    elif is_new or result.is_news:
+        yield from (f"  {describe_finding(of)} [{of.code}]" for of in problems if of.code != "log-damaged")
 
 
-def _print_warnings(summary: IngestSummary) -> None:
-    """Print a line for each cause of warnings, that of most runs first."""
-    from tcpipe.tables.facts import by_cause
+def _print_findings(summary: IngestSummary) -> None:
+    """Print the findings of several runs by code."""
+    from tcpipe.formats.finding_lines import format_groups, group_findings
 
     made = [result for result in summary.results if result.run_id and result.status != "unchanged"]
-    for line in dict.fromkeys(line for of in made if of.no_power for line in (of.no_power.recipe,) if line):
-        say("power that no topic plays or that is refused (below) is read by this recipe, where it is of the drives:")
-        for part in line.splitlines():
-            say(f"  {part}")
-    causes = by_cause((str(result.run_id), result.warnings) for result in made)
-    for told in sorted(causes, key=lambda of: -len(of)):
-        run, line = next(iter(told.items()))
-        say(f"warning: {f'{len(told)} runs' if len(told) > 1 else run}: {line}")
+    groups = group_findings((str(result.run_id), result.findings) for result in made)
+    for line in format_groups(groups, len(made), more=f"tcpipe report {summary.store}"):
+        say(line)
 
 
 def _print_sum(summary: IngestSummary) -> None:

@@ -9,10 +9,9 @@ from __future__ import annotations
 import gc
 import logging
 import math
-import re
 from collections.abc import Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
@@ -24,9 +23,10 @@ from tcpipe.formats.parquet import parquet_of, write_table
 from tcpipe.formats.place import Entry, Place
 from tcpipe.formats.record_files import Sighting
 from tcpipe.formats.run_documents import LogOrigin, Manifest, RunJson
-from tcpipe.motion.remedies import REMEDIES
 from tcpipe.tables.arrays import column_of
-from tcpipe.tables.facts import EnergyBudget, NoPower, PhysicsFit
+from tcpipe.tables.facts import EnergyBudget, PhysicsFit
+from tcpipe.tables.findings import Finding, select_findings
+from tcpipe.tables.verdicts import Verdict, judge_again
 
 T = TypeVar("T")
 
@@ -35,14 +35,8 @@ logger = logging.getLogger("tcpipe")
 RUNS, LOGS = "runs.parquet", "logs.parquet"
 
 _ABOUT = b"tcpipe_index"
-_VERSION = b"5"
+_VERSION = b"6"
 """Of these tables: those of another are made again."""
-
-
-_DROVE_M = 5.0
-"""Who went less far was moved about, not driven."""
-_NO_SEGMENTS = re.compile(r"(?!^)no segments")
-"""Warnings that say why there are none; the line that begins so only sums up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +77,8 @@ class RunFacts:
     segments: int
     driven_m: float
     kept_m: float
-    warnings: tuple[str, ...]
+    findings: tuple[Finding, ...]
+    verdict: Verdict
     damage: tuple[str, ...]
     energy_budget: EnergyBudget | None
     segments_sha256: str
@@ -106,20 +101,13 @@ class RunFacts:
     """Where every metre went [m], by entry."""
     standing_watt: float | None = None
     """What the robot draws while it stands."""
-    no_power: NoPower | None = None
-    """Why there is no power, and what would read it."""
     physics: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Terms of the fit of power and their standard deviations, in SI, by ``term`` or, of one class of terrain, ``term on terrain``."""
 
     @property
-    def why_empty(self) -> str:
-        """Why there is no segment though the robot drove, the main cause in one line; "" of any other run."""
-        if self.segments or self.driven_m < _DROVE_M:
-            return ""
-        name = max(self.ledger_m, key=lambda entry: self.ledger_m[entry])
-        lost = f"{self.ledger_m[name]:.1f} m {name.replace('_', ' ')}: {REMEDIES.get(name, '')}"
-        cause = next((line for line in self.warnings if _NO_SEGMENTS.search(line)), lost)
-        return f"no segment from {self.driven_m:.1f} m driven: {cause}"
+    def is_empty(self) -> bool:
+        """Whether there is no segment though the robot drove."""
+        return bool(select_findings(self.findings, "no-segments"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,7 +151,8 @@ def facts_of(manifest: Manifest, state: str) -> RunFacts:
         driven_m=math.fsum(manifest.ledger_m.values()),
         kept_m=manifest.ledger_m.get("kept", 0.0),
         energy_budget=None if label is None else label.energy_budget,
-        no_power=manifest.info.report.facts.no_power,
+        findings=manifest.info.report.findings,
+        verdict=judge_again(manifest.verdict, manifest.info.report.findings),
         segments_sha256=manifest.checksums[named["segments.parquet"]].sha256,
         segments_file=f"{place}/{named['segments.parquet']}",
         track_file=f"{place}/{named['track.parquet']}",
@@ -204,7 +193,8 @@ _ROW = "row"
 _RUN_SCHEMA = pa.schema({
     "run_id": _TEXT, "recipe_id": _TEXT, "data_model_version": _TEXT, "tcpipe_version": _TEXT, "robot": _TEXT,
     "tags": pa.map_(_TEXT, _TEXT), "segments": pa.int64(), "driven_m": pa.float64(), "kept_m": pa.float64(),
-    "warnings": _TEXTS, "damage": _TEXTS, "start_ns": pa.int64(), "end_ns": pa.int64(),
+    "findings": pa.list_(pa.struct({"code": _TEXT, "severity": _TEXT})), "damage": _TEXTS,
+    "verdict": pa.struct({"position": _TEXT, "time": _TEXT, "energy": _TEXT}), "start_ns": pa.int64(), "end_ns": pa.int64(),
     "log": pa.struct({"source": pa.struct({"paths": _TEXTS, "sha256": _TEXT, "size_bytes": pa.int64()})}),
     "superseded_by": _TEXT, "segments_file": _TEXT, "track_file": _TEXT, _ROW: _TEXT,
 })  # fmt: skip
@@ -213,7 +203,10 @@ _LOG_SCHEMA = pa.schema({"lineage": _TEXT, _ROW: _TEXT})
 
 def read_runs(place: Place) -> dict[tuple[str, str], RunFacts]:
     """Return the rows of ``runs.parquet``, by run and recipe; none where there is no such index, or it cannot be read."""
-    return {(row.run_id, row.recipe_id): row for row in _rows(place, RUNS, RunFacts)}
+    return {
+        (row.run_id, row.recipe_id): replace(row, verdict=judge_again(row.verdict, row.findings))
+        for row in _rows(place, RUNS, RunFacts)
+    }
 
 
 def read_logs(place: Place) -> dict[tuple[str, str], SeenLog]:

@@ -19,6 +19,7 @@ from tcpipe.formats.recipe_toml import read_key
 from tcpipe.formats.run_documents import Manifest, ManifestHead
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, wrong_checksum
 from tcpipe.tables.levels import LABELLED_SEGMENTS, GatedTrack
+from tcpipe.tables.verdicts import judge_again
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +168,9 @@ def refuse_earlier(place: Place, there: Mapping[str, int], states: str) -> None:
 
 @lru_cache(maxsize=64)
 def _manifest(place: Place, state: str) -> Manifest:
-    """Return the manifest whose file is in this state, which begins with its name."""
-    return read_as_at(place, state.rsplit("-", 2)[0], Manifest)
+    """Return the manifest whose file is in this state, which begins with its name; judged by this version's catalogue."""
+    manifest = read_as_at(place, state.rsplit("-", 2)[0], Manifest)
+    return replace(manifest, verdict=judge_again(manifest.verdict, manifest.info.report.findings))
 
 
 def with_span(row: RunFacts, place: Place, manifest: Manifest) -> RunFacts:

@@ -28,6 +28,7 @@ from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
 from tcpipe.pipeline.known_runs import KnownRuns, known_runs
 from tcpipe.pipeline.known_trouble import Trouble, trouble_of_run
+from tcpipe.pipeline.log_findings import find_failure
 from tcpipe.pipeline.log_sources import (
     FoundLogs,
     LogSource,
@@ -209,7 +210,9 @@ def _results(
 ) -> Iterator[tuple[int, LogSource | None, IngestResult]]:
     """Yield what became of each path that holds no log, and of each log as it ends, by its place; what needs no work is told first."""
     for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
-        yield index, None, IngestResult(plain_line(path), "failed", problems=lines, transient=True)
+        name = plain_line(path)
+        findings = find_failure(name, "LogError")
+        yield index, None, IngestResult(name, "failed", findings=findings, problems=lines, transient=True)
     runs = store.run_ids_by_hash()
     for turn in in_turns([task.source for task in tasks]):
         todo = []
@@ -272,7 +275,7 @@ def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
     content = result.sha256 or source.files_digest
     if result.status == "failed":
         return Trouble(content, result.problems, source.origins, kind="failed")
-    return trouble_of_run(result.run_id, result.why_empty, result.damage, content=content, log=source.origins)
+    return trouble_of_run(result.run_id, result.findings, result.damage, content=content, log=source.origins)
 
 
 def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult, known: KnownRuns) -> None:

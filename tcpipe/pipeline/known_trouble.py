@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,14 +15,14 @@ from tcpipe.formats.record_files import record_name
 from tcpipe.pipeline.begun_calls import BegunCall, begun_calls
 from tcpipe.pipeline.log_sources import LogSource, find_sources, lineage_of
 from tcpipe.store import Store, open_store
-from tcpipe.tables.facts import LEFT_OUT
+from tcpipe.tables.findings import LEFT_OUT, Finding, select_problems
 
 _MOST_CANDIDATES = 10
 
 
 @dataclass(frozen=True, slots=True)
 class Trouble:
-    """What is wrong with a content, wherever that lies: lines of damage, why it failed, or why its run is empty."""
+    """What is wrong with a content, wherever that lies: codes of findings, lines of damage, or why it failed."""
 
     content: str
     """The sha256 of the log; where nothing could be read, a hash of where it lies, sizes and times."""
@@ -62,10 +62,11 @@ class Trouble:
 
 
 def trouble_of_run(
-    run_id: str | None, why_empty: str, damage: tuple[str, ...], *, content: str, log: tuple[str, ...]
+    run_id: str | None, findings: Iterable[Finding], damage: tuple[str, ...], *, content: str, log: tuple[str, ...]
 ) -> Trouble | None:
-    """Return what is wrong with a run that is in the store, None where nothing is."""
-    lines = (why_empty, *damage) if why_empty else damage
+    """Return what is wrong with a run that is in the store, None where nothing is: codes of its problems, and lines of damage."""
+    codes = dict.fromkeys(of.code for of in select_problems(findings) if of.code != "log-damaged")
+    lines = (*codes, *damage)
     return Trouble(content, lines, log, run_id, "damaged" if damage else "empty") if lines else None
 
 
@@ -129,7 +130,7 @@ def known_trouble(store: Store, runs: Sequence[RunFacts]) -> list[Trouble]:
     known = [replace(told, kind=kind) for kind in kinds for told in store.records(kind, Trouble)]
     for run in runs:
         of = run.log.source if run.log else None
-        found = trouble_of_run(run.run_id, run.why_empty, run.damage, content=of.sha256, log=of.paths) if of else None
+        found = trouble_of_run(run.run_id, run.findings, run.damage, content=of.sha256, log=of.paths) if of else None
         known += [found] if found else []
     return list({(trouble.content, trouble.lines): trouble for trouble in reversed(known)}.values())
 

@@ -14,6 +14,14 @@ from typing import Literal, get_args
 from tcpipe import __version__
 from tcpipe.errors import UsageError, plain_lines
 from tcpipe.formats.atomic import scratch_directory
+from tcpipe.formats.finding_lines import (
+    MOST_LINES,
+    describe_finding,
+    format_count,
+    format_loss,
+    format_verdict,
+    group_findings,
+)
 from tcpipe.formats.index_files import RunFacts, uncollected
 from tcpipe.formats.object_storage import is_url, shown_path
 from tcpipe.formats.places import local_output
@@ -26,8 +34,11 @@ from tcpipe.pipeline.ingest_task import IngestTask, too_young
 from tcpipe.pipeline.known_runs import KnownRuns, known_runs
 from tcpipe.pipeline.known_trouble import Trouble, trouble_of_call, trouble_of_run, trouble_of_waiting
 from tcpipe.pipeline.log_sources import FoundLogs, definitions_key, find_sources, in_shard, remembered
+from tcpipe.pipeline.store_verdict import judge_runs
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import select_findings
+from tcpipe.tables.verdicts import Verdict
 
 State = Literal[
     "done", "partial", "empty", "pending", "outdated", "growing", "failed_permanent", "failed_transient", "quarantined", "superseded"
@@ -84,6 +95,12 @@ class Status:
     """Calls that have begun and not ended: they run, perhaps run, or were killed and nobody accepted that."""
     history: tuple[Call, ...]
     """The latest calls, the last one first."""
+    verdict: Verdict
+    """On the runs under the ruling recipe together; of each code the worst finding is a reason."""
+    runs: int
+    """Under the ruling recipe."""
+    findings: Mapping[str, int]
+    """Of those, how many have a finding, by code: what is no note, the worst first."""
     losses: tuple[StoreLoss, ...]
     """The ten largest, over the runs under the ruling recipe."""
     exit_code: int
@@ -97,7 +114,9 @@ class Status:
         lines += [f"of earlier calls: {line}" for line in self.gone]
         lines += [f"{self.superseded_runs} superseded runs"] if self.superseded_runs else []
         lines += [f"{call.state}: {call}" for call in self.begun if call.state != "killed"]
-        lines += ["losses:", *map(str, self.losses)] if self.losses else []
+        lines += [f"verdict: {format_verdict(self.verdict)}"] if self.runs else []
+        lines += [f"  {format_count(code, count, self.runs)}" for code, count in [*self.findings.items()][:MOST_LINES]]
+        lines += ["losses:", *map(format_loss, self.losses)] if self.losses else []
         lines += ["history:"] if self.history else []
         return plain_lines([*lines, *(_told(call) for call in self.history[:_MOST_CALLS])])
 
@@ -167,7 +186,7 @@ def status(
         _group(*of, tasks)
         for of, tasks in sorted(groups.items(), key=lambda item: (STATES.index(item[0][0]), -len(item[1])))
     )
-    ledgers_m = (run.facts.ledger_m for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling))
+    current = [run.facts for run in known.runs.finished if run.facts.ingest_key == ingest_key(ruling)]
     waiting = list[tuple[State, IngestTask]]()
     if (
         not create
@@ -190,7 +209,16 @@ def status(
         jobs=jobs,
         more=(*_waiting_too_long(waiting, opened), *killed),
     )
-    return replace(summed, losses=losses_of(ledgers_m), gone=gone, begun=tuple(begun))
+    by_code = group_findings((run.run_id, run.findings) for run in current)
+    return replace(
+        summed,
+        verdict=judge_runs(current),
+        runs=len(current),
+        findings={of.code: len(of.of) for of in by_code if of.severity != "note"},
+        losses=losses_of(run.ledger_m for run in current),
+        gone=gone,
+        begun=tuple(begun),
+    )
 
 
 def _waiting_too_long(tasks: Iterable[tuple[State, IngestTask]], store: Store) -> Iterator[str]:
@@ -262,13 +290,15 @@ def _standing_of(made: RunFacts, task: IngestTask, store: Store) -> tuple[State,
     if made.superseded_by:
         return "superseded", "a longer recording has taken its place"
     trouble = trouble_of_run(
-        made.run_id, made.why_empty, made.damage, content=str(task.source.sha256), log=task.source.origins
+        made.run_id, made.findings, made.damage, content=str(task.source.sha256), log=task.source.origins
     )
     if trouble is None:
         return "done", ""
     if trouble.is_accepted(store):
         return "done", f"{trouble.kind}, accepted"
-    return "empty" if made.why_empty else "partial", _cause(trouble.lines[0], task)
+    if made.is_empty:
+        return "empty", describe_finding(select_findings(made.findings, "no-segments")[0])
+    return "partial", _cause(trouble.lines[0], task)
 
 
 def _why_pending(task: IngestTask, store: Store, known: KnownRuns, failures: Mapping[str, Sequence[Trouble]]) -> str:
@@ -354,6 +384,9 @@ def _summed(
         superseded_runs=len(known.runs.superseded),
         begun=(),
         history=tuple(calls),
+        verdict=Verdict(),
+        runs=0,
+        findings={},
         losses=(),
         exit_code=3 if trouble or problems else 0,
     )

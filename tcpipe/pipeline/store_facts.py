@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tcpipe.formats.dataset_files import REPORT
+from tcpipe.formats.finding_lines import group_findings
 from tcpipe.formats.object_storage import is_url
 from tcpipe.formats.record_files import DatasetMade
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
@@ -14,9 +15,9 @@ from tcpipe.pipeline.calls import latest_calls
 from tcpipe.pipeline.known_trouble import Trouble, known_trouble
 from tcpipe.pipeline.prune import is_replaced
 from tcpipe.pipeline.status import failed_for_now
-from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts
+from tcpipe.pipeline.store_verdict import find_changes, judge_runs
+from tcpipe.report.store_runs import FailedLog, StoredDataset, StoreFacts, ruling_key
 from tcpipe.store import Store
-from tcpipe.tables.facts import by_cause
 
 
 def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirectory] = ()) -> StoreFacts:
@@ -25,14 +26,17 @@ def store_facts(store: Store, found: Ingestions, *, will_be: Sequence[RunDirecto
     pages = {(parts[0], parts[1]) for parts in here if len(parts) == 3 and parts[2] == REPORT}
     trouble = known_trouble(store, [run.facts for run in found.finished])
     accepted = {of.run_id for of in trouble if of.kind != "failed" and of.run_id and of.is_accepted(store)}
-    causes = by_cause((run.run_id, run.facts.warnings) for run in found.finished)
+    key = ruling_key(found)
+    current = [run.facts for run in found.finished if run.facts.ingest_key == key]
     return StoreFacts(
         where=str(store.root),
         found=found,
         accepted=frozenset(accepted),
         pages=frozenset(pages | {(run.run_id, run.recipe_id) for run in will_be}),
         datasets=tuple(_dataset(store, made) for made in store.records("datasets", DatasetMade)),
-        causes=tuple(sorted(causes, key=lambda of: -len(of))),
+        verdict=judge_runs(current),
+        changes=find_changes(current),
+        groups=tuple(group_findings((run.run_id, run.findings) for run in current)),
         failed=tuple(_failed(store, found, trouble)),
     )
 
