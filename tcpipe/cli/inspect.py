@@ -130,8 +130,6 @@ def _print_clocks(log: InspectedLog) -> None:
 
 
 def _print_map(found: InspectedMap) -> None:
-    from tcpipe.formats.finding_lines import list_findings
-
     size = " x ".join(f"{pixels * found.pitch_m:.1f} m" for pixels in (found.cols, found.rows))
     say(f"{found.path}: {size} at {found.pitch_m:g} m a pixel in {found.crs}")
     say("")
@@ -147,8 +145,7 @@ def _print_map(found: InspectedMap) -> None:
     if "terrain" in found.layers:
         say("")
         _print_table(["id", "class", "traversable", "share"], classes)
-    for line in list_findings(found.findings):
-        say(line)
+    _print_findings(found.findings)
 
 
 def _print_dataset(found: InspectedDataset) -> None:

@@ -182,11 +182,11 @@ def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") 
     details = "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(group.code), findings))))
     shared = findings[0].remedies if all(of.remedies == findings[0].remedies for of in findings) else ()
     remedy = "; ".join(describe_remedy(findings[0], of) for of in shared)
-    return format_count(group.code, len(group.of), total, what, details, remedy)
+    return format_count(group.code, len(group.of), total, what, details, remedy=remedy)
 
 
 def format_count(
-    code: str, count: int, total: int | None, what: str = "runs", details: str = "", remedy: str = ""
+    code: str, count: int, total: int | None, what: str = "runs", details: str = "", *, remedy: str = ""
 ) -> str:
     """Return as one line that ``count`` of ``total`` runs have a finding."""
     entry = read_catalogue().get(code)

@@ -68,16 +68,14 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
     older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
     others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
     left_out = {*damaged, *gone, *others, *older}
+    otherwise = {run_id: {"what": "recipe", "has": of} for run_id, of in others.items()}
+    otherwise |= {run_id: {"what": "data_model", "has": of} for run_id, of in older.items()}
+    nothing: dict[str, str] = {}
     missing = (
-        *_find_left_out(store, "run-gone", {run_id: {} for run_id in gone}),
-        *_find_left_out(
-            store, "run-ingested-otherwise", {run_id: {"what": "recipe", "has": of} for run_id, of in others.items()}
-        ),
-        *_find_left_out(
-            store, "run-ingested-otherwise", {run_id: {"what": "data_model", "has": of} for run_id, of in older.items()}
-        ),
+        *_find_left_out(store, "run-gone", dict.fromkeys(gone, nothing)),
+        *_find_left_out(store, "run-ingested-otherwise", otherwise),
     )
-    broken = tuple(_find_left_out(store, "run-damaged", {run_id: {} for run_id in damaged}, force=True))
+    broken = tuple(_find_left_out(store, "run-damaged", dict.fromkeys(damaged, nothing), force=True))
     superseded = frozenset(left_out | found.superseded.keys())
     return Chosen(tuple(runs), logs, missing, broken, superseded, tuple(_find_expected(found)))
 
