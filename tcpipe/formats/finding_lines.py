@@ -68,7 +68,7 @@ def format_finding(finding: Finding) -> str:
     entry = read_catalogue().get(finding.code)
     advice = entry.advice if entry else ""
     remedy = "; ".join(describe_remedy(finding, of) for of in finding.remedies) or advice
-    return f"{describe_finding(finding)}{f'; {remedy}' if remedy else ''} [{finding.code}]"
+    return f"{describe_finding(finding)}{f'; {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
 
 
 def recipe_lines(finding: Finding) -> list[str]:
