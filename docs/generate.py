@@ -158,6 +158,7 @@ def _finding(code: str, entry: Entry) -> str:
     more += [f"quality bit `{entry.flag}`"] if entry.flag else []
     more += ["exit code 3 of `tcpipe ingest` until it is acknowledged"] if entry.is_problem else []
     lines = [f"### {entry.title} `[{code}]`\n", f"> {describe_finding(example_finding(code))}\n"]
+    lines += [f"Template: `{entry.template}`\n"] if entry.fields else []
     lines += [f"*{'; '.join(more)}.*\n", f"{_sentence(entry.cause)}\n"]
     remedies = [*([_sentence(entry.advice)] if entry.advice else [])]
     remedies += [f"{_sentence(text)} `tcpipe inspect` prints the keys." for text in entry.remedies.values()]
@@ -172,7 +173,8 @@ def example_finding(code: str) -> Finding:
     """Return a finding with typical values: numbers by their suffix, names by their key."""
     entry = read_catalogue()[code]
     numbers = {
-        name: next((value for suffix, value in _NUMBERS.items() if name.endswith(suffix)), None) for name in entry.fields
+        name: next((value for suffix, value in _NUMBERS.items() if name.endswith(suffix)), None)
+        for name in entry.fields
     }
     names = {name: _NAMES.get(name, name.replace("_", " ")) for name in entry.fields if numbers[name] is None}
     role = next((role for role in _ROLES if code.startswith(role.split("_")[0])), "gnss")
@@ -182,6 +184,7 @@ def example_finding(code: str) -> Finding:
 
 _ROLES = ("imu", "power", "odometry", "pose", "velocity")
 _NUMBERS = {
+    "wanted_hz": 20.0, "at_20_hz_fraction": 0.041, "length_s": 30.0, "driven_m": 84.0, "limit_mps": 1.0,
     "_count": 12.0, "_fraction": 0.123, "_ratio": 1.05, "_rad": 0.0524, "_hz": 9.87, "_mps2": 9.81, "_mps": 0.95, "_m2": 12.3, "_std": 0.004,
     "_volt": 25.6, "_amp": 12.3, "_watt": 123.0, "_s": 0.123, "_m": 1.23, "before": 84.1, "after": 96.2, "scale": 1.053,
 }  # fmt: skip
