@@ -135,11 +135,11 @@ def _bits(column: str, flags: type[IntFlag]) -> str:
 
 _TROUBLESHOOTING = """# Findings: troubleshooting
 
-What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this page
-for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
+What tcpipe reports about logs, maps, runs and datasets. Each line of a report ends with a code in brackets, as `[no-gnss]`; search this
+page for the code, or for words such as dropout, lever arm, time offset, drift, multipath, no power.
 
-An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict. `tcpipe inspect RUN`
-lists all findings of a run with their remedies; `--json` gives them as data. Figures below are examples.
+An **error** makes the labels that it affects not usable, a **warning** usable with care; a **note** changes no verdict.
+`tcpipe inspect RUN` lists all findings of a run with their remedies; `--json` gives them as data. Figures below are examples.
 """
 
 
@@ -185,7 +185,8 @@ def example_finding(code: str) -> Finding:
 _ROLES = ("imu", "power", "odometry", "pose", "velocity")
 _NUMBERS = {
     "wanted_hz": 20.0, "at_20_hz_fraction": 0.041, "length_s": 30.0, "driven_m": 84.0, "limit_mps": 1.0,
-    "_count": 12.0, "_fraction": 0.123, "_ratio": 1.05, "_rad": 0.0524, "_hz": 9.87, "_mps2": 9.81, "_mps": 0.95, "_m2": 12.3, "_std": 0.004,
+    "_count": 12.0, "_fraction": 0.123, "_ratio": 1.05, "_rad": 0.0524, "_hz": 9.87, "_mps2": 9.81, "_mps": 0.95, "_m2": 12.3,
+    "_std": 0.004,
     "_volt": 25.6, "_amp": 12.3, "_watt": 123.0, "_s": 0.123, "_m": 1.23, "before": 84.1, "after": 96.2, "scale": 1.053,
 }  # fmt: skip
 _NAMES = {
