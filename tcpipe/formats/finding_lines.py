@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from string import Formatter
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -193,7 +194,8 @@ def format_count(code: str, count: int, total: int | None, what: str = "runs", d
 
 def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
     """Return the range of the first number that the template names."""
-    name = next((of for of in (findings[0].numbers if entry else ()) if entry and of in entry.fields), None)
+    fields = Formatter().parse(entry.template) if entry else ()
+    name = next((name for _, name, _, _ in fields if name in findings[0].numbers), None)
     if name is None:
         return ""
     values = [of.numbers[name] for of in findings if name in of.numbers]
