@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from string import Formatter
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -68,7 +69,7 @@ def format_finding(finding: Finding) -> str:
     entry = read_catalogue().get(finding.code)
     advice = entry.advice if entry else ""
     remedy = "; ".join(describe_remedy(finding, of) for of in finding.remedies) or advice
-    return f"{describe_finding(finding)}{f'; {remedy}' if remedy else ''} [{finding.code}]"
+    return f"{describe_finding(finding)}{f'; {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
 
 
 def recipe_lines(finding: Finding) -> list[str]:
@@ -197,7 +198,8 @@ def format_count(
 
 def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:
     """Return the range of the first number that the template names."""
-    name = next((of for of in (findings[0].numbers if entry else ()) if entry and of in entry.fields), None)
+    fields = Formatter().parse(entry.template) if entry else ()
+    name = next((name for _, name, _, _ in fields if name in findings[0].numbers), None)
     if name is None:
         return ""
     values = [of.numbers[name] for of in findings if name in of.numbers]

@@ -10,7 +10,7 @@ from synthetic_store import add_run, add_world, lanes, segments
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.record_files import Call
-from tcpipe.motion.remedies import REMEDIES, losses_of
+from tcpipe.motion.remedies import losses_of
 from tcpipe.pipeline import calls
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.known_trouble import Trouble, accept
@@ -197,5 +197,4 @@ def test_losses_add_up_over_runs():
     found = losses_of([{"kept": 50.0, "gap": 30.0, "standing": 0.01}, {"kept": 10.0, "gap": 10.0}])
     assert [(loss.reason, loss.metres, loss.runs) for loss in found] == [("gap", 40.0, 2)]
     assert found[0].share == pytest.approx(0.4, abs=1e-3)
-    assert found[0].remedy == REMEDIES["gap"]
     assert losses_of([]) == ()
