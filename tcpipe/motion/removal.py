@@ -12,9 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tcpipe.tables.catalogue import read_catalogue
+from tcpipe.tables.catalogue import threshold
 
 _STRETCH_M = 5.0
+_BIAS = "selection-bias"
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +57,8 @@ def uneven(groups: Sequence[Group]) -> list[Group]:
 
     Chance: so many standard deviations of a share over stretches of 5 m.
     """
-    least_m, apart, sigmas = read_catalogue()["selection-bias"].thresholds.values()
+    least_m, sigmas = threshold(_BIAS, "min_driven_m"), threshold(_BIAS, "min_sigmas")
+    apart = threshold(_BIAS, "min_difference_fraction")
     driven_m, used_m = sum(g.driven_m for g in groups), sum(g.used_m for g in groups)
     found = []
     for group in groups:

@@ -22,6 +22,7 @@ from tcpipe.terrain.grid import MapGrid
 FloatArray = NDArray[np.float64]
 
 _MAX_SCALE_ERROR = 0.02
+_PIXELS_DIFFER = "patch-pixels-unlike-map"
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,5 +107,5 @@ def chord_px(frames: PatchFrames, grid: MapGrid, *, chord_m: FloatArray, points:
 
 def has_other_pixels(patch_pixel_m: float, map_pixel_m: float) -> bool:
     """Return whether patches ask for finer or much coarser pixels than the map's level has."""
-    least, most = (threshold("patch-pixels-unlike-map", f"{end}_ratio") for end in ("min", "max"))
+    least, most = threshold(_PIXELS_DIFFER, "min_ratio"), threshold(_PIXELS_DIFFER, "max_ratio")
     return not least * map_pixel_m <= patch_pixel_m <= most * map_pixel_m

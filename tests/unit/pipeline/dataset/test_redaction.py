@@ -208,7 +208,7 @@ def test_a_redacted_finding_keeps_its_code_and_what_is_public(built):
     assert grades[0] == grades[1]
 
 
-PRIVATE = "anna@nas03:/home/anna"
+PRIVATE = "anna@nas03:/data/anna"
 KINDS = [kind for of in get_args(SubjectKind) for kind in (of if isinstance(of, tuple) else (of,))]
 
 
