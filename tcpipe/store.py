@@ -75,7 +75,7 @@ from tcpipe.formats.stored_runs import (
     below,
     local_file,
     put_tables,
-    refuse_earlier,
+    refuse_lost,
     told_of,
     with_lost,
     with_span,
@@ -235,10 +235,8 @@ class Store:
         """
         place, name = of.runs.below(f"{of.run_id}/{recipe_id}"), name_of("manifest", number)
         state = state_of(of.files[f"{recipe_id}/{name}"])
-        refuse_earlier(place, {"manifest": number}, "" if row is None else row.state)
+        refuse_lost(of, recipe_id, row)
         if row is None or row.state != state:
-            # Copied, it has another time; of what is gone the index knows all the same.
-            self._refuse_earlier_log(row, of)
             where = place.where(name)
             document = read_sealed_at(place, name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
             if document.get("data_model_version") not in READ_VERSIONS:
@@ -264,19 +262,12 @@ class Store:
         state = " ".join(state_of(of.files[name]) for name in last)
         if row.log is not None and row.log.state == state:
             return row
-        self._refuse_earlier_log(row, of)
         try:
             known = self.run_json(row.run_id, of.numbers)
         except StoreError:
             known = None
         tags = known.tags if known and len(last) > 1 else row.tags
         return replace(row, log=known_log(known, state) if known else None, tags=tags)
-
-    @staticmethod
-    def _refuse_earlier_log(row: RunFacts | None, of: Listed) -> None:
-        """Raise `StoreError` where a run's document or tags are gone that the index has seen."""
-        seen = "" if row is None or row.log is None else row.log.state
-        refuse_earlier(of.runs.below(of.run_id), of.numbers, seen)
 
     @property
     def index_place(self) -> Place:
