@@ -75,7 +75,7 @@ def _find_clock(source: TopicReadings, timeline: Timeline, *, is_simulated: bool
         yield make_finding("stamps-replaced", role, names=names, stamps_count=count)
     for epoch, moved_s in enumerate(timeline.moved_s):
         if moved_s and not by_simulation:
-            yield make_finding("clock-differs", role, names=names, moved_s=moved_s, clock_epoch=epoch)
+            yield make_finding("topic-clock-offset", role, names=names, moved_s=moved_s, clock_epoch=epoch)
 
 
 def _find_step(step: ClockStep, start_ns: int) -> Finding:

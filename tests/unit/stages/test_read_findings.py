@@ -84,7 +84,7 @@ def test_a_topic_whose_time_is_the_recorders_says_why_if_it_has_stamps():
 def test_stamps_that_were_replaced_or_moved_are_told():
     replaced, moved = read(source(), timeline(notes={"stamps_replaced": 4}, moved_s=(0.0, -0.5))).findings
     assert (replaced.code, replaced.numbers) == ("stamps-replaced", {"stamps_count": 4.0})
-    assert (moved.code, moved.numbers) == ("clock-differs", {"moved_s": -0.5, "clock_epoch": 1.0})
+    assert (moved.code, moved.numbers) == ("topic-clock-offset", {"moved_s": -0.5, "clock_epoch": 1.0})
     assert read(source(), timeline(notes={"stamps_replaced": 0})).findings == ()
 
 
