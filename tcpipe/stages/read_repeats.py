@@ -80,22 +80,22 @@ def _rate_hz(at_ns: NDArray[np.int64]) -> float:
 
 
 def find_repeats(repeats: Sequence[Repeats], *, averaged: bool) -> Iterator[Finding]:
-    """Yield a finding for each quantity that is repeated, and one where a current is read too slowly.
+    """Yield the finding that messages repeat readings, by the slowest of them, and one where a current is read too slowly.
 
     Parameters
     ----------
     averaged : whether a reading is the mean since the one before it.
     """
-    for quantity in _QUANTITIES:
-        if not (alike := [of for of in repeats if of.quantity == quantity]):
-            continue
-        slowest = min(alike, key=lambda of: of.reading_hz)
-        names = {"quantity": quantity, "rails": ", ".join(of.rail for of in alike)}
-        message_hz, reading_hz = slowest.message_hz, slowest.reading_hz
-        yield make_finding("power-readings-repeated", _POWER, names=names, message_hz=message_hz, reading_hz=reading_hz)
-        if quantity == "current" and is_too_slow(reading_hz, averaged=averaged):
-            wanted_hz = wanted_rate_hz(averaged=averaged)
-            yield make_finding("power-too-slow", _POWER, names=names, rate_hz=reading_hz, wanted_hz=wanted_hz)
+    if not repeats:
+        return
+    slowest = min(repeats, key=lambda of: of.reading_hz)
+    names = {of: ", ".join(dict.fromkeys(getattr(each, of) for each in repeats)) for of in ("quantity", "rail")}
+    message_hz, reading_hz = slowest.message_hz, slowest.reading_hz
+    yield make_finding("power-readings-repeated", _POWER, names=names, message_hz=message_hz, reading_hz=reading_hz)
+    current_hz = min((of.reading_hz for of in repeats if of.quantity == "current"), default=np.inf)
+    if is_too_slow(current_hz, averaged=averaged):
+        wanted_hz, names = wanted_rate_hz(averaged=averaged), {"quantity": "current"}
+        yield make_finding("power-too-slow", _POWER, names=names, rate_hz=current_hz, wanted_hz=wanted_hz)
 
 
 _POWER = Subject("role", "power")
