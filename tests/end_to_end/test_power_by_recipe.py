@@ -90,12 +90,13 @@ def test_currents_in_milliamperes_come_first_and_are_cured_by_the_recipe_as_it_i
     log = tmp_path / "run.mcap"
     write_mcap(log, other)
     told = run("ingest", log, "--store", tmp_path / "without").output
-    first = told.split("robot ", 1)[1].splitlines()[1]
+    first = told.split("robot ", 1)[1].splitlines()[2]  # after the verdict
     assert "[power-rejected]" in first
     run("report", tmp_path / "without")
     (page,) = (tmp_path / "without" / "runs").rglob("report.html")
     verdict = page.read_text().split('class="verdict"')[1].split("</section>")[0]
-    assert verdict.index("ower refused") < verdict.index("<b>Good</b>")
+    assert "energy <b>not usable</b>" in verdict
+    assert "[power-rejected]" in verdict
     assert "current_scale = 0.001" in verdict
     assert "Record voltage and current" not in verdict
     (tmp_path / "tcpipe.toml").write_text(block_of(told) + "\n")
