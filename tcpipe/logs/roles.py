@@ -15,13 +15,13 @@ from typing import TypeVar
 
 from tcpipe.logs.coverage import LITTLE_SPAN, LITTLE_SPAN_OF_POWER, coverage, covering_little
 from tcpipe.logs.robots import find_robot
+from tcpipe.logs.role_findings import find_left_out, find_missing_roles, find_undecodable
 from tcpipe.logs.several_robots import namespaces_of_robots, which_robot
-from tcpipe.logs.topic_texts import LISTED, listing, short_list
+from tcpipe.logs.topic_texts import LISTED, list_undecodable, listing, short_list
 from tcpipe.logs.topics import Topic
 from tcpipe.power.sources import BATTERY_STATE, FLOAT_TYPES, is_corrected, quantity, rail_of
 from tcpipe.recipe.suggestions import RecipeFragment, suggest
 from tcpipe.robots.profiles import Profiles
-from tcpipe.tables.catalogue import Severity
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 NAV_SAT_FIX = "sensor_msgs/msg/NavSatFix"
@@ -194,9 +194,9 @@ def assign_roles(
         tuple(problems),
         (
             *find_missing_roles({*decided.roles, *decided.undecided}),
-            *_find_left_out(decided),
+            *find_left_out(decided.passed_over),
             *proposed,
-            *_find_undecodable(decided, listed.values()),
+            *find_undecodable(listed.values(), {of for types in decided.types.values() for of in types}),
         ),
     )
 
@@ -578,51 +578,11 @@ def _find_no_motion(decided: _Decisions, topics: Sequence[Topic]) -> tuple[list[
             names, remedies = {"role": role, "reason": "name"}, suggest("use", {"read.topics": {role: [name]}})
             subject = Subject("topic", name)
             findings.append(make_finding("topic-left-out", subject, severity="warning", names=names, remedies=remedies))
-    return [*lines, *_list_undecodable(topics), f"the log holds {listing(topics)}"], findings
-
-
-def _list_undecodable(topics: Iterable[Topic]) -> Iterable[str]:
-    """Yield one line of the topics that hold data that cannot be decoded, by the reason."""
-    by_reason: dict[str, list[Topic]] = {}
-    for topic in topics:
-        if topic.problem is not None and topic.message_count != 0:
-            by_reason.setdefault(topic.problem, []).append(topic)
-    if by_reason:
-        reasons = "; ".join(f"{short_list(topics)}: {why}" for why, topics in list(by_reason.items())[:LISTED])
-        more = f"; {len(by_reason) - LISTED} more reasons" if len(by_reason) > LISTED else ""
-        yield f"topics that hold data which cannot be decoded: {reasons}{more}"
+    return [*lines, *list_undecodable(topics), f"the log holds {listing(topics)}"], findings
 
 
 def _motion_role(type_name: str) -> str | None:
     return next((role for role in MOTION_ROLES if type_name in ROLE_TYPES[role]), None)
-
-
-def find_missing_roles(roles: Collection[str]) -> tuple[Finding, ...]:
-    """Return a finding for each role that is not among ``roles`` and without which labels or checks are missing."""
-    present = {*roles, "gnss"} if "pose" in roles else roles
-    return tuple(make_finding(code, Subject("role", role)) for code, role in _MISSING.items() if role not in present)
-
-
-_MISSING = {"no-gnss": "gnss", "no-power": "power", "no-imu": "imu", "no-wheel-odometry": "wheel_odometry"}
-
-
-def _find_left_out(decided: _Decisions) -> Iterable[Finding]:
-    for (role, name), reason in decided.passed_over.items():
-        yield make_finding("topic-left-out", Subject("topic", name), names={"role": role, "reason": reason})
-
-
-def _find_undecodable(decided: _Decisions, topics: Iterable[Topic]) -> Iterable[Finding]:
-    """Yield a finding for each topic that holds data that cannot be decoded: a warning where it could be used as a role."""
-    usable = {type_name for types in decided.types.values() for type_name in types}
-    for topic in topics:
-        if topic.problem is not None and topic.message_count != 0:
-            yield topic_not_decoded(topic, severity="warning" if topic.type_name in usable else "note")
-
-
-def topic_not_decoded(topic: Topic, *, severity: Severity = "warning") -> Finding:
-    """Return the finding that a topic's messages cannot be decoded."""
-    names = {"type": topic.type_name or "?", "encoding": topic.encoding or "?"}
-    return make_finding("topic-not-decoded", Subject("topic", topic.name), severity=severity, names=names)
 
 
 def _transform_topics(topics: Iterable[Topic], ignored: Sequence[str]) -> tuple[str, ...]:

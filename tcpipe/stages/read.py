@@ -8,7 +8,8 @@ import pyarrow as pa
 
 from tcpipe.errors import RoleError
 from tcpipe.logs.clocks import TopicTimes, settle_clocks
-from tcpipe.logs.roles import MOTION_ROLES, find_missing_roles
+from tcpipe.logs.role_findings import find_missing_roles
+from tcpipe.logs.roles import MOTION_ROLES
 from tcpipe.logs.simulated_clock import CLOCK
 from tcpipe.power.sources import power_lists
 from tcpipe.recipe import ReadConfig
