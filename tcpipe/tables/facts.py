@@ -36,7 +36,7 @@ class RobotChoice:
 
 @dataclass(frozen=True, slots=True)
 class TopicClock:
-    """Which stamp of a topic rules and why, the median of header minus log time, and what was added to its stamps by epoch [s]."""
+    """Which stamp of a topic is used and the reason, the median of header minus log time, and what was added to its stamps by epoch [s]."""
 
     source: str
     why: str
@@ -86,14 +86,6 @@ class PowerSign:
     current_sign: str
     averaged: bool
     includes: tuple[str, ...] = field(default=(), metadata=LEFT_OUT)
-
-
-@dataclass(frozen=True, slots=True)
-class NoPower:
-    """Why a run has no power though its log may tell some, and the recipe (TOML) that would read it; "" where none is known."""
-
-    why: str
-    recipe: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -427,7 +419,6 @@ class RunFacts:
     odometry_scale: Mapping[str, float] | None = field(default=None, metadata=LEFT_OUT)
     """What the recipe multiplies a role's ways and velocities with."""
     power: PowerSign | None = field(default=None, metadata=LEFT_OUT)
-    no_power: NoPower | None = field(default=None, metadata=LEFT_OUT)
     fuse: FuseFacts | None = field(default=None, metadata=LEFT_OUT)
     sensor_checks: SensorChecks | None = field(default=None, metadata=LEFT_OUT)
     mounting: MountingFacts | None = field(default=None, metadata=LEFT_OUT)

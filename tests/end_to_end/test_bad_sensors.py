@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from changed_drives import NAMES, Columns, Drive, make
-from suggested_recipes import merged, recipe_that_follows, suggestions_in
+from suggested_recipes import merged, proposed, recipe_that_follows
 
 from tcpipe.errors import FusionError, RoleError
 from tcpipe.formats.logs.log_file import open_log
@@ -21,6 +21,7 @@ from tcpipe.recipe import FuseConfig, ReadConfig, Recipe
 from tcpipe.simulation import Truth, true_cost
 from tcpipe.simulation.route import Pause
 from tcpipe.stages.read import read_run
+from tcpipe.tables.findings import Finding, select_findings
 from tcpipe.tables.levels import LabelledSegments, Streams
 
 
@@ -373,6 +374,12 @@ def _constant_covariances(m: MessageStream, kind: str) -> MessageStream:
     return replace(m, constants={**m.constants, **{name: covariances(kind, size) for name, size in sizes.items()}})
 
 
+def unused(labelled: LabelledSegments) -> Finding:
+    (found,) = select_findings(labelled.info.report.findings, "messages-unused")
+    assert found.subject.name == "gnss"
+    return found
+
+
 def test_fixes_at_zero_zero_are_no_places(drive, tmp_path):
     def somewhere(columns: Columns) -> Columns:
         hit = scattered(len(columns["latitude"]), 0.2)
@@ -380,7 +387,7 @@ def test_fixes_at_zero_zero_are_no_places(drive, tmp_path):
 
     labelled = run(drive.changed("gnss", somewhere), tmp_path)
     assert_labels_hold(labelled, drive.truth)
-    assert any("null_island" in warning for warning in labelled.info.report.findings)
+    assert unused(labelled).numbers["null_island_count"]
 
 
 def test_a_current_with_an_offset_is_said(drive, tmp_path):
@@ -393,7 +400,7 @@ def test_a_current_with_an_offset_is_said(drive, tmp_path):
 def test_fixes_without_altitude_still_say_where(drive, tmp_path):
     labelled = run(drive.changed("gnss", lambda c: {"altitude": np.full_like(c["altitude"], np.nan)}), tmp_path)
     assert labelled.info.datum is not None
-    assert any("have no altitude" in warning for warning in labelled.info.report.findings)
+    assert select_findings(labelled.info.report.findings, "altitude-missing")
     assert_labels_hold(labelled, drive.truth)
 
 
@@ -402,7 +409,8 @@ def test_a_receiver_that_never_had_a_fix_leaves_a_local_frame(drive, tmp_path):
     labelled = run(nowhere, tmp_path)
     assert labelled.info.datum is None
     assert labelled.table["start_lon_deg"].null_count == labelled.table.num_rows
-    assert any("null_island" in warning for warning in labelled.info.report.findings)
+    assert unused(labelled).numbers["null_island_count"]
+    assert select_findings(labelled.info.report.findings, "no-gnss")
 
 
 @pytest.mark.parametrize("share", [0.1, 1.0])
@@ -415,7 +423,7 @@ def test_stamps_at_zero_are_taken_from_the_recorder(drive, tmp_path, sensor, sha
     labelled = run(drive.changed(sensor, unset), tmp_path)
     assert_labels_hold(labelled, drive.truth)
     if share == 1.0:
-        assert any("log time rules" in warning for warning in labelled.info.report.findings)
+        assert select_findings(labelled.info.report.findings, "log-time-used")
 
 
 def test_two_robots_in_one_log_are_one_question(drive, tmp_path):
@@ -524,9 +532,9 @@ def test_a_pose_that_nobody_names_is_offered_as_what_it_can_be(drive, tmp_path):
     other = with_pose(drive).without("wheels", "visual")
     with pytest.raises(RoleError) as error:
         read(other, tmp_path)
-    (line,) = [line for line in error.value.problems if "to use one all the same" in line]
-    assert suggestions_in(line) == [{"read": {"topics": {"pose": [POSE_TOPIC]}}}]
-    assert "pose" in read(other, tmp_path, recipe_that_follows(line).read).tables
+    (found,) = [of for of in select_findings(error.value.findings, "topic-left-out") if of.remedies]
+    assert proposed(found) == {"read": {"topics": {"pose": [POSE_TOPIC]}}}
+    assert "pose" in read(other, tmp_path, recipe_that_follows(found).read).tables
 
 
 def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_warning(drive, tmp_path):
@@ -536,13 +544,14 @@ def test_an_offset_of_a_role_that_is_not_there_is_an_error_and_a_placement_a_war
         read(other, tmp_path, parse_recipe(merged(topics, {"read": {"time_offset_s": {"gnss": -0.3}}}), where="").read)
     placed = {"read": {"placement": {"gnss": {"xyz_m": [0.1, 0.0, 0.5]}}}}
     found = read(other, tmp_path, parse_recipe(merged(topics, placed), where="").read)
-    assert any("read.placement.gnss: no topic of this log plays gnss" in line for line in found.report.findings)
+    (unused_key,) = select_findings(found.report.findings, "recipe-key-unused")
+    assert unused_key.names == {"key": "read.placement.gnss"}
 
 
 def test_currents_of_the_other_sign_are_cured_by_the_line_as_it_is_printed(drive, tmp_path):
     other = drive.changed("power", lambda c: {name: -values for name, values in c.items() if "current" in name})
     labelled = run(other, tmp_path)
-    (line,) = [line for line in labelled.info.report.findings if line.startswith("power refused")]
-    cured = run(other, tmp_path, recipe_that_follows(line).read)
-    assert not [line for line in cured.info.report.findings if line.startswith("power refused")]
+    (rejected,) = select_findings(labelled.info.report.findings, "power-rejected")
+    cured = run(other, tmp_path, recipe_that_follows(rejected).read)
+    assert not select_findings(cured.info.report.findings, "power-rejected")
     assert_labels_hold(cured, drive.truth)
