@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from tcpipe.fusion.measurements import GNSS, IMU, VISUAL, WHEELS, InitialState
+from tcpipe.fusion.measurements import GNSS, VISUAL, WHEELS, InitialState
 from tcpipe.fusion.stretches import Stretch
 from tcpipe.fusion.trajectory import Trajectory
 from tcpipe.geometry.rotation import rpy_from_quat
@@ -70,8 +70,6 @@ def fuse_findings(inputs: FusionInputs, facts: FuseFacts, *, run: Subject, fixes
         findings += [_find_initial_yaw(of, first_ns, gnss) for of in facts.stretches if of.heading_from != _COURSE]
     findings += _find_reopenings(facts, first_ns)
     findings += _find_scale(inputs, facts)
-    if IMU not in facts.sensors:
-        findings.append(make_finding("attitude-from-path", Subject("role", IMU)))
     findings += _find_rejections(facts, fixes)
     for key, code in (("variances_replaced", "variances-replaced"), ("invalid", "values-unusable")):
         findings += [

@@ -87,12 +87,10 @@ def test_without_fixes_they_would_show_the_scale():
     assert finding.names == {"reason": "no GNSS"}
 
 
-def test_a_track_without_a_place_or_without_an_imu_is_a_finding():
+def test_a_track_without_a_place_is_a_finding():
     assert warned(FusionInputs(None), stretch()) == ()  # a log without fixes was found when it was read
     (finding,) = warned(FusionInputs(None, counts={"gnss": counts()}), stretch())
     assert finding.code == "local-frame"
-    (finding,) = warned(FusionInputs(PLACE), stretch(sensors=("gnss",)))
-    assert finding.code == "attitude-from-path"
 
 
 def test_a_heading_that_the_course_does_not_show_is_a_finding_where_the_track_has_a_place():
