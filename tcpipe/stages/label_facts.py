@@ -103,8 +103,8 @@ def _find_low_rate(facts: LabelFacts) -> Finding:
         for signals in ([rail.current for rail in rails], [rail.voltage for rail in rails])
     )
     wanted_hz = wanted_rate_hz(averaged=facts.integration == "averaged")
-    signal, rate_hz = ("current", current_hz) if current_hz < wanted_hz else ("voltage", voltage_hz)
-    return make_finding("power-rate-low", _POWER, names={"signal": signal}, rate_hz=rate_hz, expected_hz=wanted_hz)
+    quantity, rate_hz = ("current", current_hz) if current_hz < wanted_hz else ("voltage", voltage_hz)
+    return make_finding("power-too-slow", _POWER, names={"quantity": quantity}, rate_hz=rate_hz, wanted_hz=wanted_hz)
 
 
 def _share(part: NDArray[np.float64], whole: NDArray[np.float64]) -> NDArray[np.float64]:

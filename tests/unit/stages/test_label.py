@@ -156,8 +156,8 @@ def test_segments_beyond_the_record_have_null_labels_and_a_warning():
 def test_low_power_rate(period_s, averaged, low):
     labelled = label(straight_track(SPEED), power_streams({"drive": record(period_s)}, averaged=averaged))
     assert flagged(labelled, Quality.LOW_POWER_RATE).all() == low
-    slow = select_findings(labelled.info.report.findings, "power-rate-low")
-    assert [of.names["signal"] for of in slow] == ["current"] * low
+    slow = select_findings(labelled.info.report.findings, "power-too-slow")
+    assert [of.names["quantity"] for of in slow] == ["current"] * low
 
 
 def test_voltage_out_of_range_where_it_is():
