@@ -60,6 +60,7 @@ def _find_offset(found: ClockOffsets, role: str, offset: RoleOffset, streams: St
             names=names,
             offset_s=offset_s,
             offset_2std_s=offset_2std_s,
+            apart_s=abs(offset_s) + (abs(drift_s) / 2 if offset.drifts else 0.0),
             drift_s=drift_s,
             drift_2std_s=drift_2std_s,
         )
@@ -95,7 +96,7 @@ def _told(each: RoleOffset | Pair) -> dict[str, Any]:
 
 def _means(found: ClockOffsets, role: str) -> str:
     """Return by what the role was compared."""
-    return " and ".join(dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against}))
+    return ", ".join(dict.fromkeys(p.by for p in found.pairs if p.determined and role in {p.late, p.against}))
 
 
 def with_offset_cost(track: pa.Table, clocks: ClockFacts) -> pa.Table:

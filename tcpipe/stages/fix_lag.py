@@ -36,9 +36,10 @@ def with_lag_of_fixes(clocks: StageReport[ClockFacts], lag: tuple[float, float] 
         "clocks-differ",
         Subject("role", GNSS),
         action="inflated",
-        names={"reference": "odometry", "by": "change of speed along the path"},
+        names={"reference": "odometry", "by": "path"},
         offset_s=lag_s,
         offset_2std_s=2 * std_s,
+        apart_s=abs(lag_s),
     )
     offset = ClockOffset(lag_s, std_s, True, None, None, False, blamed=False)
     facts = replace(clocks.facts, offsets={**clocks.facts.offsets, GNSS: offset}, position_offset_s=abs(lag_s))

@@ -93,7 +93,7 @@ def _find_scale(inputs: FusionInputs, facts: FuseFacts) -> list[Finding]:
     if std <= threshold("odometry-scale-unobservable", "min_scale_std_fraction"):
         return []
     role = WHEELS if WHEELS in facts.sensors or VISUAL not in facts.sensors else VISUAL
-    names = {"reason": "GNSS is too coarse or too short" if GNSS in facts.sensors or inputs.scales else "no GNSS"}
+    names = {"reason": "coarse-gnss" if GNSS in facts.sensors or inputs.scales else "no-gnss"}
     subject = Subject("role", role)
     return [make_finding("odometry-scale-unobservable", subject, names=names, scale_std_fraction=std)]
 

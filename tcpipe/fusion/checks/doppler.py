@@ -77,9 +77,9 @@ def _frame(by_fixes: NDArray[np.complex128], by_velocity: NDArray[np.complex128]
     if size < _STANDS:
         return refuse_frozen(DOPPLER, "velocity", messages)
     if off(1j * np.conj(by_velocity)) <= _OFF:
-        return Refusal(DOPPLER, "velocity-frame", {"frame": "north, east, down"})
+        return Refusal(DOPPLER, "velocity-frame", {"frame": "north-east-down"})
     if abs(size - 1.0) <= _OFF:
-        return Refusal(DOPPLER, "velocity-frame", {"frame": "another frame"})
+        return Refusal(DOPPLER, "velocity-frame", {"frame": "unknown"})
     return Refusal(DOPPLER, "distance-contradicted", {"reference": GNSS}, {"distance_ratio": size})
 
 
@@ -103,7 +103,7 @@ def _lateness(m: Measurements) -> Refusal | None:
 
 
 def _refuse_late(code: str, reference: str, lag: Lag, *, late_s: float | None = None) -> Refusal:
-    numbers = {"offset_s": lag.offset_s, "offset_2std_s": 2 * lag.std_s}
+    numbers = {"offset_s": lag.offset_s, "offset_2std_s": 2 * lag.std_s, "apart_s": abs(lag.offset_s)}
     return Refusal(DOPPLER, code, {"reference": reference}, numbers, late_s=late_s)
 
 

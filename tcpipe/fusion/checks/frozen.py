@@ -24,7 +24,7 @@ def frozen_sensors(m: Measurements, found: Distances) -> dict[str, Refusal]:
             refusals[role] = refuse_frozen(role, "velocity", source.stamp_ns.size)
     if m.imu is not None and any(np.nanmax(chord, initial=0.0) > found.least_m for chord in found.chord_m.values()):
         for what, values in (
-            ("angular velocity", m.imu.angular_velocity_radps),
+            ("angular_velocity", m.imu.angular_velocity_radps),
             ("acceleration", m.imu.specific_force_mps2),
         ):
             if _one_value(values):

@@ -325,7 +325,8 @@ def _check_directions(
 
 def _refuse_yaw(looks: Mapping[str, float], turned_by: Floats) -> Refusal:
     """Return the refusal of an IMU that looks elsewhere by the accelerations of odometries, by yaw [rad]."""
-    names, numbers = {"evidence": f"accelerations of {join_names(looks)}"}, {"off_rad": next(iter(looks.values()))}
+    names = {"evidence": "acceleration", "reference": join_names(looks)}
+    numbers = {"off_rad": next(iter(looks.values()))}
     return Refusal(IMU, "imu-rotated", names, numbers, turned_by=turned_by)
 
 

@@ -17,7 +17,7 @@ def test_a_lag_that_only_the_path_tells_is_said_and_costs_what_is_driven_in_it()
     assert not found.facts.offsets["gnss"].blamed
     assert found.findings[0] == before
     assert (found.findings[1].code, found.findings[1].subject.name) == ("clocks-differ", "gnss")
-    assert found.findings[1].numbers == {"offset_s": 0.12, "offset_2std_s": 0.04}
+    assert found.findings[1].numbers == {"offset_s": 0.12, "offset_2std_s": 0.04, "apart_s": 0.12}
     told = ClockOffset(0.1, 0.01, True, None, None, False)
     by_signals = StageReport((), ClockFacts(0, "imu", (), {"gnss": told}))
     assert with_lag_of_fixes(by_signals, (0.12, 0.02)) is by_signals

@@ -78,13 +78,13 @@ def test_rejections_are_a_finding_beyond_a_tenth(rejected, said):
 def test_a_scale_that_nothing_shows_is_a_finding_beyond_two_hundredths(common, said):
     found = warned(FusionInputs(PLACE), stretch(common_scale_std=common), stretch(common_scale_std=0.01))
     assert [of.numbers["scale_std_fraction"] for of in found] == said
-    assert all(of.names == {"reason": "GNSS is too coarse or too short"} for of in found)
+    assert all(of.names == {"reason": "coarse-gnss"} for of in found)
 
 
 def test_without_fixes_they_would_show_the_scale():
     (finding,) = warned(FusionInputs(PLACE), stretch(common_scale_std=0.03, sensors=("imu", "wheel_odometry")))
     assert (finding.code, finding.subject.name) == ("odometry-scale-unobservable", "wheel_odometry")
-    assert finding.names == {"reason": "no GNSS"}
+    assert finding.names == {"reason": "no-gnss"}
 
 
 def test_a_track_without_a_place_is_a_finding():

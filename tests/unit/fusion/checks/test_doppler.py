@@ -54,8 +54,8 @@ def test_fixes_of_metres_take_longer_windows_and_still_tell(truth):
     ("change", "code", "said"),
     [
         (lambda v: 0.0 * v, "frozen", {"quantity": "velocity"}),
-        (lambda v: v[:, [1, 0, 2]] * [1.0, 1.0, -1.0], "velocity-frame", {"frame": "north, east, down"}),
-        (lambda v: np.hypot(v[:, :1], v[:, 1:2]) * [1.0, 0.0, 0.0], "velocity-frame", {"frame": "another frame"}),
+        (lambda v: v[:, [1, 0, 2]] * [1.0, 1.0, -1.0], "velocity-frame", {"frame": "north-east-down"}),
+        (lambda v: np.hypot(v[:, :1], v[:, 1:2]) * [1.0, 0.0, 0.0], "velocity-frame", {"frame": "unknown"}),
         (lambda v: 3.6 * v, "distance-contradicted", {"reference": "gnss"}),
     ],
 )
