@@ -473,8 +473,11 @@ def test_power_that_repeats_slow_readings_is_labelled_as_the_readings_are(drive,
     assert rail.current.rate_hz == rail.voltage.rate_hz == pytest.approx(4.0)
     assert_labels_hold(labelled, drive.truth)
     assert labelled.info.report.facts.label.quality["low_power_rate"] == labelled.table.num_rows
-    (repeated,) = select_findings(preflight(tmp_path / "run.mcap", recipe=Recipe()).findings, "power-readings-repeated")
-    assert repeated.numbers == {"message_hz": pytest.approx(20.0), "reading_hz": pytest.approx(4.0)}
+    found = preflight(tmp_path / "run.mcap", recipe=Recipe()).findings
+    repeated = {of.names["quantity"]: of.numbers for of in select_findings(found, "power-readings-repeated")}
+    rates = {"message_hz": pytest.approx(20.0), "reading_hz": pytest.approx(4.0)}
+    assert repeated == {"voltage": rates, "current": rates}
+    assert select_findings(found, "power-too-slow")
 
 
 def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_coarse_fixes(drive, tmp_path):
