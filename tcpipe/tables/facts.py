@@ -163,7 +163,7 @@ class AxisFacts:
 
 @dataclass(frozen=True, slots=True)
 class SensorChecks:
-    """What the sensors were held against, and why those that were refused were.
+    """What the sensors were held against, and the codes of the findings on those that are not fused.
 
     ``distance_m`` are median chords over ten seconds, ``up`` is gravity in the robot's axes, ``looks_rad`` the yaw of the IMU by each
     odometry and how sure it is, ``specific_force_median`` in the unit that the IMU tells.
@@ -236,9 +236,9 @@ class ClockPair:
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.RoleOffset`), and the recipe lines that would correct it.
+    """How late a sensor's stamps are (`tcpipe.fusion.checks.clock_offsets.RoleOffset`).
 
-    Where it is not ``blamed``, only that it and the reference differ is known, and there are no lines.
+    Where it is not ``blamed``, only that it and the reference differ is known.
     """
 
     offset_s: float | None
@@ -247,7 +247,6 @@ class ClockOffset:
     drift_s_per_h: float | None
     drift_std_s_per_h: float | None
     drifts: bool
-    recipe: str
     blamed: bool = True
 
 

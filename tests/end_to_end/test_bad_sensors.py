@@ -87,9 +87,15 @@ def refused(labelled: LabelledSegments) -> set[str]:
 
 
 def cure(labelled: LabelledSegments, role: str) -> ReadConfig:
-    """Read the recipe line out of the warning, as a person would."""
-    (warning,) = [w for w in labelled.info.report.findings if w.startswith(f"{role}: ") and "is not fused" in w]
-    return recipe_that_follows(warning).read
+    """Follow the remedy of the finding on an excluded sensor, as a person would."""
+    return recipe_that_follows(exclusion(labelled, role)).read
+
+
+def exclusion(labelled: LabelledSegments, role: str) -> Finding:
+    code = labelled.info.report.facts.sensor_checks.refused[role]
+    (finding,) = [of for of in select_findings(labelled.info.report.findings, code) if of.subject.name == role]
+    assert finding.action == "excluded"
+    return finding
 
 
 def test_the_drive_as_it_is_raises_no_doubt(drive, tmp_path):
@@ -122,7 +128,7 @@ def test_an_imu_that_feels_nothing_is_not_used_and_said(drive, tmp_path):
     mute = drive.changed("imu", lambda c: {n: 0.0 * v for n, v in c.items() if n.startswith("linear_acceleration.")})
     labelled = run(mute, tmp_path)
     assert refused(labelled) == {"imu"}
-    assert any("its specific force is zero throughout" in line for line in labelled.info.report.findings)
+    assert exclusion(labelled, "imu").code == "imu-no-acceleration"
     assert_labels_hold(labelled, drive.truth)
 
 
@@ -138,7 +144,7 @@ def test_an_imu_too_slow_to_integrate_changes_nothing(drive, tmp_path, when, wit
     few = drive.without(*without)
     slow, none = run(heard(few, "imu", when), tmp_path), run(few.without("imu"), tmp_path)
     assert refused(slow) == {"imu"}
-    assert "too far apart to be integrated" in slow.info.report.facts.sensor_checks.refused["imu"]
+    assert exclusion(slow, "imu").code == "imu-too-slow"
     assert_labels_hold(slow, drive.truth)
     for name in ("start_ns", "duration_s", "energy_joule", "duration_std_s"):
         np.testing.assert_array_equal(slow.table[name].to_numpy(), none.table[name].to_numpy())
@@ -185,7 +191,7 @@ def test_an_imu_that_leads_the_track_astray_is_left_out(drive, tmp_path, recipe,
 
     labelled = run(drive.without(*without).changed("imu", loosened), tmp_path, recipe=recipe)
     assert refused(labelled) == {"imu"}
-    assert "the track moves otherwise than every sensor says" in labelled.info.report.facts.sensor_checks.refused["imu"]
+    assert exclusion(labelled, "imu").code == "misleads-track"
     assert sum(labelled.ledger_m.values()) == pytest.approx(63.0, rel=0.08)
     assert_labels_hold(labelled, drive.truth, within=0.04)
 
@@ -260,29 +266,50 @@ def astray(columns: Columns) -> Columns:
 
 
 UNLIKE = {
-    "fixes that go astray": ("gnss", astray, "the others contradict it"),
-    "fixes that never change": ("gnss", constant(("latitude", "longitude", "altitude")), "same place"),
-    "places in radians": ("gnss", lambda c: {n: np.radians(c[n]) for n in ("latitude", "longitude")}, "radians?"),
-    "exchanged axes": ("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]}, "exchanged?"),
-    "wheels that never change": ("wheels", constant("twist.twist"), "on all of its"),
-    "wheels in km/h": ("wheels", lambda c: {"twist.twist.linear.x": 3.6 * c["twist.twist.linear.x"]}, "km/h?"),
-    "a dead camera": ("visual", constant("twist.twist", 0.0), "is 0 m/s on all"),
-    "a dead IMU": ("imu", constant(("angular_velocity.", "linear_acceleration."), 0.0), "never changes"),
+    "fixes that go astray": ("gnss", astray, "contradicted-by-others", {}),
+    "fixes that never change": (
+        "gnss",
+        constant(("latitude", "longitude", "altitude")),
+        "frozen",
+        {"quantity": "position"},
+    ),
+    "places in radians": (
+        "gnss",
+        lambda c: {n: np.radians(c[n]) for n in ("latitude", "longitude")},
+        "unit-suspected",
+        {"unit": "radians"},
+    ),
+    "exchanged axes": ("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]}, "path-mirrored", {}),
+    "wheels that never change": ("wheels", constant("twist.twist"), "frozen", {"quantity": "velocity"}),
+    "wheels in km/h": (
+        "wheels",
+        lambda c: {"twist.twist.linear.x": 3.6 * c["twist.twist.linear.x"]},
+        "unit-suspected",
+        {"unit": "km/h"},
+    ),
+    "a dead camera": ("visual", constant("twist.twist", 0.0), "frozen", {"quantity": "velocity"}),
+    "a dead IMU": (
+        "imu",
+        constant(("angular_velocity.", "linear_acceleration."), 0.0),
+        "frozen",
+        {"quantity": "acceleration"},
+    ),
 }
 
 
 @pytest.mark.parametrize("what", UNLIKE)
 def test_a_sensor_that_is_unlike_the_rest_is_refused(drive, tmp_path, what):
-    sensor, change, word = UNLIKE[what]
+    sensor, change, code, names = UNLIKE[what]
     other = drive.changed(sensor, change)
     if sensor == "visual":  # its pose too, or the velocities would be taken from that
         other = other.changed(sensor, lambda c: {**constant("twist.twist", 0.0)(c), **constant("pose.pose")(c)})
     labelled = run(other, tmp_path)
     role = {"wheels": "wheel_odometry", "visual": "visual_odometry"}.get(sensor, sensor)
     assert refused(labelled) == {role}
-    (why,) = [w for w in labelled.info.report.findings if "is not fused" in w]
-    assert word in why
-    without = run(other, tmp_path, recipe_that_follows(why).read)
+    why = exclusion(labelled, role)
+    assert why.code == code
+    assert why.names.items() >= names.items()
+    without = run(other, tmp_path, cure(labelled, role))
     assert not refused(without)
     assert role not in fused(without)
     assert (labelled.info.datum is None) == (sensor == "gnss")
@@ -295,7 +322,8 @@ def test_two_that_contradict_each_other_are_both_refused(drive, tmp_path):
     other = alone.changed("gnss", lambda c: {"latitude": c["longitude"], "longitude": c["latitude"]})
     with pytest.raises(FusionError) as error:
         run(other, tmp_path)
-    assert sum("nothing tells which of the two is right" in line for line in error.value.problems) == 2
+    suspects = {of.subject.name: of.names["suspect"] for of in error.value.findings if "suspect" in of.names}
+    assert suspects == {"gnss": "wheel_odometry", "wheel_odometry": "gnss"}
 
 
 def scattered(size: int, share: float = 0.05) -> np.ndarray:
@@ -392,9 +420,9 @@ def test_fixes_at_zero_zero_are_no_places(drive, tmp_path):
 
 def test_a_current_with_an_offset_is_said(drive, tmp_path):
     other = drive.changed("power", lambda c: {n: v + 50.0 for n, v in c.items() if "current" in n})
-    (warning,) = [w for w in run(other, tmp_path).info.report.findings if w.startswith("power: ")]
-    assert "are drawn while standing" in warning
-    assert not any("while standing" in w for w in run(drive, tmp_path).info.report.findings)
+    (finding,) = select_findings(run(other, tmp_path).info.report.findings, "idle-power-high")
+    assert finding.numbers["idle_watt"] > 0.5 * finding.numbers["driving_watt"]
+    assert not select_findings(run(drive, tmp_path).info.report.findings, "idle-power-high")
 
 
 def test_fixes_without_altitude_still_say_where(drive, tmp_path):
@@ -443,7 +471,7 @@ def test_two_robots_in_one_log_are_one_question(drive, tmp_path):
 def test_a_log_that_never_moves_has_no_segments_and_says_why(tmp_path, without):
     labelled = run(make((Pause(40.0),)).without(*without), tmp_path)
     assert labelled.table.num_rows == 0
-    assert any(warning.startswith("no segments: ") for warning in labelled.info.report.findings)
+    assert select_findings(labelled.info.report.findings, "robot-did-not-move")
     assert labelled.info.report.facts.segment.odometer_m < 2.0
 
 
@@ -455,8 +483,11 @@ def test_power_that_repeats_slow_readings_is_labelled_as_the_readings_are(drive,
     assert rail.current.rate_hz == rail.voltage.rate_hz == pytest.approx(4.0)
     assert_labels_hold(labelled, drive.truth)
     assert labelled.info.report.facts.label.quality["low_power_rate"] == labelled.table.num_rows
-    found = preflight(tmp_path / "run.mcap", recipe=Recipe())
-    assert any("messages at 20 Hz repeat readings at 4 Hz" in line for line in found.mend)
+    found = preflight(tmp_path / "run.mcap", recipe=Recipe()).findings
+    repeated = {of.names["quantity"]: of.numbers for of in select_findings(found, "power-readings-repeated")}
+    rates = {"message_hz": pytest.approx(20.0), "reading_hz": pytest.approx(4.0, rel=0.01)}
+    assert repeated == {"voltage": rates, "current": rates}
+    assert select_findings(found, "power-too-slow")
 
 
 def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_coarse_fixes(drive, tmp_path):
@@ -478,9 +509,9 @@ def test_wheels_that_go_too_short_a_way_and_tell_no_turn_rate_are_rescaled_by_co
     assert fused(labelled) == {"gnss", "wheel_odometry"}
     assert found.facts.mounting.odometry_scale["wheel_odometry"] == pytest.approx(0.43, rel=0.2)
     assert sum(labelled.ledger_m.values()) == pytest.approx(drive.truth.distance_m[-1], rel=0.15)
-    (line,) = [w for w in found.warnings if "times as far as the track" in w]
-    assert "m by its speed" in line
-    assert any("that of the orientation is used" in w for w in found.warnings)
+    (scale,) = select_findings(found.findings, "odometry-scale")
+    assert scale.numbers["driven_m"] > 0.0
+    assert select_findings(found.findings, "rate-from-orientation")
 
 
 LATE_S = 0.3
@@ -507,12 +538,12 @@ def with_pose(drive: Drive) -> Drive:
 POSE_TOPIC = "/tracker/pose"
 
 
-def clock_warnings(labelled: LabelledSegments) -> list[str]:
-    return [line for line in labelled.info.report.findings if "its stamps seem" in line]
+def time_offsets(labelled: LabelledSegments) -> list[Finding]:
+    return select_findings(labelled.info.report.findings, "time-offset")
 
 
 @pytest.mark.parametrize("sensor", ["gnss", "imu", "wheels", "visual", "power", "pose"])
-def test_a_late_clock_is_cured_by_the_line_as_it_is_printed(drive, tmp_path, sensor):
+def test_a_late_clock_is_corrected_by_the_lines_as_they_are_printed(drive, tmp_path, sensor):
     config = {"read": {"topics": {"pose": [POSE_TOPIC]}}} if sensor == "pose" else {}
     other = with_pose(drive) if sensor == "pose" else drive
     topic = POSE_TOPIC if sensor == "pose" else NAMES[sensor]
@@ -520,12 +551,12 @@ def test_a_late_clock_is_cured_by_the_line_as_it_is_printed(drive, tmp_path, sen
         replace(m, columns={**m.columns, **late(m.columns)}) if m.topic == topic else m for m in other.messages
     )
     off = Drive(drive.truth, messages)
-    (line,) = clock_warnings(run(off, tmp_path, parse_recipe(config, where="test").read))
+    (finding,) = time_offsets(run(off, tmp_path, parse_recipe(config, where="test").read))
     role = {"wheels": "wheel_odometry", "visual": "visual_odometry"}.get(sensor, sensor)
-    ((role_said, offset_s),) = suggestions_in(line)[0]["read"]["time_offset_s"].items()
-    assert (line.split(":")[0], role_said) == (role, role)
+    ((role_said, offset_s),) = proposed(finding)["read"]["time_offset_s"].items()
+    assert (finding.subject.name, role_said) == (role, role)
     assert offset_s == pytest.approx(-LATE_S, abs=0.03)
-    assert not clock_warnings(run(off, tmp_path, recipe_that_follows(line, before=config).read))
+    assert not time_offsets(run(off, tmp_path, recipe_that_follows(finding, before=config).read))
 
 
 def test_a_pose_that_nobody_names_is_offered_as_what_it_can_be(drive, tmp_path):
