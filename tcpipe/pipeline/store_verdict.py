@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import Severity, threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import Verdict, judge
 
@@ -39,7 +40,7 @@ def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
 def _find_changes(series: Iterable[tuple[tuple[str, str, str], Sequence[float]]]) -> Iterator[Finding]:
     for (robot, measure, unit), values in series:
         if (shift := shift_of(values)) is not None:
-            severity = "note" if measure == _USED else None
+            severity: Severity | None = "note" if measure == _USED else None
             names = {"robot": robot, "unit": unit}
             yield make_finding(_CHANGE, Subject("column", measure), severity=severity, names=names, **shift)
 
@@ -60,7 +61,7 @@ def _measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 
-def shift_of(values: Sequence[float]) -> dict[str, float] | None:
+def shift_of(values: Sequence[float]) -> dict[str, Any] | None:
     """Return the medians of a series' latest values and of those before, and how many there are of each; None where they do not differ.
 
     The latest quarter of the values, at most 20, is compared with those before: the medians must differ by more than three robust standard
