@@ -23,10 +23,12 @@ from typing import Any
 
 import dagster as dg
 
-from tcpipe.formats.finding_lines import format_finding
+from tcpipe.formats.finding_lines import format_finding, list_findings
 from tcpipe.formats.json_files import typed
+from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.tables.catalogue import AFFECTED
+from tcpipe.tables.findings import Finding, select_findings
 from tcpipe.tables.verdicts import Verdict
 
 Answer = Mapping[str, Any]
@@ -164,12 +166,9 @@ def dataset() -> dg.MaterializeResult:
     out = _place("TCPIPE_DATASET", "dataset")
     region = os.environ.get("TCPIPE_SPLIT")
     (made,) = _answers("build-dataset", out, *(["--split", region] if region else []))
-    doubtful = made["doubtful"]
-    shared = [
-        f"{part['overlapping_pairs']} patches of {part['split']} overlap one of train"
-        for part in made["audit"]
-        if part["overlapping_pairs"]
-    ]
+    doubtful, findings = made["doubtful"], typed(made["findings"], tuple[Finding, ...], "tcpipe build-dataset --json")
+    problems = [format_finding(finding) for finding in findings if is_problem(finding)]
+    shared = [format_finding(finding) for finding in select_findings(findings, "split-leakage")]
     return dg.MaterializeResult(
         metadata={
             "status": made["status"],
@@ -177,13 +176,13 @@ def dataset() -> dg.MaterializeResult:
             **{f"{name}_samples": count for name, count in made["splits"].items()},
             **({"doubtful_share": doubtful["share"]} if doubtful else {}),
             "where_every_metre_went": _ledger(made["ledger_m"]),
-            "warnings": _listed(made["warnings"]),
+            "findings": _listed(list_findings(findings)),
             "page": dg.MetadataValue.path(str(Path(out).absolute() / "report.html")),
             **_picture(Path(out) / "overview.png"),
         },
         check_results=[
             _verified(out),
-            _check("as_asked_for", made["problems"], warn=True),
+            _check("as_asked_for", problems, warn=True),
             _check("held_out", shared, warn=True),
         ],
     )

@@ -79,7 +79,7 @@ def _holdout(context: click.Context, parameter: click.Parameter, value: str | No
     "--min-runs",
     type=click.IntRange(1, 1_000_000),
     metavar="N",
-    help="Build nothing from fewer runs; so many are enough: that others are left out or gone is a warning then.",
+    help="Build nothing from fewer runs; so many are enough: that others are left out or gone is a note then.",
 )
 @click.option(
     "--redact",
@@ -122,7 +122,7 @@ def build_dataset(
     A dataset that is there is built again from the runs of today if its options are the same; with others it is refused
     unless --force is given.
 
-    Exit code 3: runs that belong in are left out or gone, or a split that was asked for is empty; each is a line that says what mends it.
+    Exit code 3: runs that belong in are left out or gone, or a split that was asked for is empty; each is a line with its remedy.
     """
     from dataclasses import replace
 
@@ -153,10 +153,9 @@ def build_dataset(
             force=force,
             dry_run=dry_run,
         )
-        for problem in result.problems:
-            shown.problem(problem)
+        shown.problem(*result.problem_lines())
     if as_json:
         print_json(replace(result, recipe=source))
     else:
-        say_lines(replace(result, problems=()))
+        say_lines(result.without_problems())
     return result.exit_code

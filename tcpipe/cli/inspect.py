@@ -145,11 +145,13 @@ def _print_map(found: InspectedMap) -> None:
     if "terrain" in found.layers:
         say("")
         _print_table(["id", "class", "traversable", "share"], classes)
-    for line in found.warnings:
-        say(f"warning: {line}")
+    _print_findings(found.findings)
 
 
 def _print_dataset(found: InspectedDataset) -> None:
+    from tcpipe.formats.dataset_card import group_dataset_findings
+    from tcpipe.formats.finding_lines import format_verdict, list_mixed_groups
+
     say(
         f"{found.path}: dataset {found.name}, {found.samples} samples of {', '.join(found.robots)}, "
         f"format {found.format}, data model {found.data_model_version}"
@@ -164,8 +166,10 @@ def _print_dataset(found: InspectedDataset) -> None:
     say("")
     say(f"layers: {', '.join(found.layers)}; labels: {', '.join(found.label.columns)}")
     say(f"runs: {', '.join(run.run_id for run in found.runs)}; map: {', '.join(entry.name for entry in found.maps)}")
-    for line in found.warnings:
-        say(f"warning: {line}")
+    if found.verdict is not None:
+        say(f"verdict: {format_verdict(found.verdict)}")
+    for line in list_mixed_groups(group_dataset_findings(found.findings, found.findings_by_run, found.findings_by_map)):
+        say(line)
 
 
 def _print_store(found: InspectedStore) -> None:

@@ -181,15 +181,19 @@ def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") 
         return line if key == findings[0].subject.name else f"{key}: {line}"
     subjects = ", ".join(sorted({of.subject.name for of in findings})[:_MOST_SUBJECTS])
     details = "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(group.code), findings))))
-    return format_count(group.code, len(group.of), total, what, details)
+    shared = findings[0].remedies if all(of.remedies == findings[0].remedies for of in findings) else ()
+    remedy = "; ".join(describe_remedy(findings[0], of) for of in shared)
+    return format_count(group.code, len(group.of), total, what, details, remedy=remedy)
 
 
-def format_count(code: str, count: int, total: int | None, what: str = "runs", details: str = "") -> str:
+def format_count(
+    code: str, count: int, total: int | None, what: str = "runs", details: str = "", *, remedy: str = ""
+) -> str:
     """Return as one line that ``count`` of ``total`` runs have a finding."""
     entry = read_catalogue().get(code)
     title = entry.title if entry else code.replace("-", " ")
     head = "" if total is None else f"{count} of {total} {what}: "
-    return f"{head}{title}{f' ({details})' if details else ''} [{code}]"
+    return f"{head}{title}{f' ({details})' if details else ''}{f'; {remedy}' if remedy else ''} [{code}]"
 
 
 def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:

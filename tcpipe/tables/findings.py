@@ -16,7 +16,8 @@ from tcpipe.tables.catalogue import Action, Severity, rank_severity, read_catalo
 F = TypeVar("F")
 
 SubjectKind: TypeAlias = Literal[
-    "role", "topic", "frame", "layer", "run", "class", "slope", "file", "log", "map", "dataset", "column", "tag", "call", "model"
+    "role", "topic", "frame", "layer", "run", "class", "slope", "file", "log", "map", "dataset", "column", "tag", "call", "model", "robot",
+    "split",
 ]  # fmt: skip
 
 LEFT_OUT: Mapping[str, tuple[object, ...]] = {"json": (None, {}, [], ())}

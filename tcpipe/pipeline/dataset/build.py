@@ -7,7 +7,7 @@ import shlex
 import shutil
 from collections.abc import Container, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pyarrow as pa
@@ -18,7 +18,7 @@ from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, pla
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
 from tcpipe.formats.croissant import croissant
-from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, RunFinding
+from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, group_dataset_findings
 from tcpipe.formats.dataset_files import (
     CARD,
     CLASSES,
@@ -35,6 +35,7 @@ from tcpipe.formats.dataset_files import (
     read_current_card,
     read_samples,
 )
+from tcpipe.formats.finding_lines import format_mixed_groups, format_verdict
 from tcpipe.formats.geojson import read_regions
 from tcpipe.formats.hub_card import hub_card
 from tcpipe.formats.json_files import digest, write_json
@@ -54,7 +55,7 @@ from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
 from tcpipe.pipeline.dataset.content import gather_content
-from tcpipe.pipeline.dataset.findings import doubt_in_words, findings_in_words
+from tcpipe.pipeline.dataset.findings import is_problem
 from tcpipe.pipeline.dataset.inputs import Inputs, choose_inputs, earlier_splits
 from tcpipe.pipeline.dataset.physics import PHYSICS_COLUMNS
 from tcpipe.pipeline.dataset.redaction import (
@@ -65,20 +66,21 @@ from tcpipe.pipeline.dataset.redaction import (
     redaction_of,
 )
 from tcpipe.pipeline.dataset.replacing import BuildOptions, find_other_options
-from tcpipe.pipeline.dataset.runs import gone_runs
+from tcpipe.pipeline.dataset.runs import CHOICE_CODES, find_gone_runs
 from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
-from tcpipe.pipeline.dataset.splitting import empty_splits
 from tcpipe.pipeline.dataset.writing import write_patches
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
 from tcpipe.splits.assignment import SPLITS
-from tcpipe.splits.audit import HeldOut, audit_lines
+from tcpipe.splits.audit import HeldOut
 from tcpipe.splits.regions import Regions
 from tcpipe.store import Store, open_store
 from tcpipe.tables.facts import EnergyBudget
+from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.verdicts import Verdict
 
 logger = logging.getLogger("tcpipe")
 
@@ -95,9 +97,11 @@ class BuildResult:
     splits: Mapping[str, int]
     ledger_m: Mapping[str, float]
     audit: tuple[HeldOut, ...]
-    warnings: tuple[str, ...]
-    problems: tuple[str, ...] = ()
-    """Runs that belong in and are left out, and splits that were asked for and are empty: the dataset is not what it should be."""
+    findings: tuple[Finding, ...]
+    """Of the dataset itself: runs that belong in and are left out and splits that are empty, too."""
+    findings_by_run: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
+    findings_by_map: Mapping[str, tuple[Finding, ...]] = field(default_factory=dict, metadata=LEFT_OUT)
+    verdict: Verdict | None = None
     energy_budget: EnergyBudget | None = None
     exit_code: int = 0
     """3 if the dataset is not what it should be."""
@@ -105,19 +109,32 @@ class BuildResult:
     """Which recipe ruled, as a command found it."""
     doubtful: Doubtful | None = None
     """How many samples carry a quality flag."""
-    findings: tuple[RunFinding, ...] = ()
-    """What ingest found of the runs, by cause."""
     redacted: bool = False
     """Whether names and places are not told."""
     estimate: Estimate | None = None
     """What a dry run expects of the work: of all segments, as if each became a sample."""
 
     def __str__(self) -> str:
-        """Return counts, the share of doubtful samples, the audit, where the metres went and how wrong a label may be, as plain lines."""
+        """Return counts, where the metres went, how wrong a label may be, the verdict and findings, as plain lines."""
+        return plain_lines((*self._facts(), *self.problem_lines(), *self._lines(problems=False), *self._closing()))
+
+    def without_problems(self) -> str:
+        """Return the same without the lines of problems, which a command prints as errors."""
+        return plain_lines((*self._facts(), *self._lines(problems=False), *self._closing()))
+
+    def problem_lines(self) -> list[str]:
+        """Return a line for each code that makes the exit code 3."""
+        return self._lines(problems=True)
+
+    def _lines(self, *, problems: bool) -> list[str]:
+        own = [finding for finding in self.findings if is_problem(finding) == problems]
+        by_run = dict.fromkeys(self.findings_by_run, ()) if problems else self.findings_by_run
+        groups = group_dataset_findings(own, by_run, {} if problems else self.findings_by_map)
+        return format_mixed_groups(groups, more=f"tcpipe inspect {shlex.quote(self.path)}")
+
+    def _facts(self) -> list[str]:
         if self.estimate is not None:
-            return plain_lines(
-                (f"{self.path}: would be made of at most {self.estimate}", *(f"warning: {w}" for w in self.warnings))
-            )
+            return [f"{self.path}: would be made of at most {self.estimate}"]
         counts = ", ".join(f"{self.splits[name]} {name}" for name in SPLITS)
         head = f"{self.path}: {self.samples} samples ({counts})"
         if self.status == "unchanged":
@@ -127,12 +144,12 @@ class BuildResult:
         ledger = f"{sum(self.ledger_m.values()):.0f} m driven: {self.ledger_m[KEPT]:.0f} m in samples"
         ledger += "".join(f", {metres:.0f} m {name.replace('_', ' ')}" for name, metres in lost)
         floor = [] if self.energy_budget is None else [in_words(self.energy_budget)]
-        doubt = [] if self.doubtful is None else [doubt_in_words(self.doubtful, self.samples)]
-        said = [f"{kind}: {text}" for kind in ("problem", "warning") for text in getattr(self, f"{kind}s")]
-        said += findings_in_words(self.findings)
+        judged = [] if self.verdict is None else [f"verdict: {format_verdict(self.verdict)}"]
+        return [head, ledger, *floor, *judged]
+
+    def _closing(self) -> list[str]:
         publish = f"to publish it: hf upload OWNER/NAME {shlex.quote(self.path)} . --repo-type dataset"
-        told = [*Redacted().lines(), publish] if self.redacted else []
-        return plain_lines((head, *doubt, *audit_lines(self.audit), ledger, *floor, *said, *told))
+        return [*Redacted().lines(), publish] if self.redacted else []
 
 
 def build_dataset(
@@ -159,7 +176,7 @@ def build_dataset(
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
     Runs that are not as they were written are left out; those, runs that have to be ingested again, runs of the dataset that is replaced
-    that are gone, and empty splits are the result's ``problems``.
+    that are gone, and empty splits are findings that make the exit code 3.
 
     Parameters
     ----------
@@ -191,7 +208,7 @@ def build_dataset(
     covariates
         Tables (CSV or Parquet) whose columns are joined to the samples by time, as the recipe's section ``covariates`` says.
     min_runs
-        Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere warnings, damage aside.
+        Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere notes, damage aside.
     redact
         For the public: everything is moved by one offset that is kept nowhere, and no log, topic, path, host or user is named.
     force
@@ -229,16 +246,16 @@ def build_dataset(
     inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if redact else inputs
     keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
     options = BuildOptions(ruling, regions, tags or {}, file_format, redact, keep_split is not None, keeps_own)
-    problems, warnings = _left_out(
+    left_out = _find_left_out(
         inputs,
         None if known is not None and known.redaction else known,
         robot=robot,
         tags=tags or {},
         min_runs=min_runs,
     )
-    inputs = replace(inputs, problems=problems, warnings=(*warnings, *inputs.warnings))
+    inputs = replace(inputs, findings=(*left_out, *inputs.findings))
     if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
-        card, result = known, _result(place, "unchanged", known, problems)
+        card, result = known, _result(place, "unchanged", known, left_out)
     elif dry_run:
         _refuse_other_options(place, known, options, inputs, force=force)
         if isinstance(place, str):
@@ -267,7 +284,7 @@ def build_dataset(
             _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
         for entry in workers.waiting.entries():
             workers.waiting.delete(entry.name)
-        result = _result(place, "done", card, problems)
+        result = _result(place, "done", card, left_out)
     if not dry_run:
         _remember(opened, watch, result, inputs, jobs, size=sum(of.size_bytes for of in card.checksums.values()))
         if known is not None and known.inputs != inputs.digest:
@@ -300,8 +317,8 @@ def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> B
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
     expected = estimate(latest_calls(store), BUILD, most, jobs=jobs)
-    code, told = 3 if inputs.problems else 0, (inputs.warnings, inputs.problems)
-    return BuildResult(str(place), "planned", most, {}, {}, (), *told, exit_code=code, estimate=expected)
+    code = 3 if any(map(is_problem, inputs.findings)) else 0
+    return BuildResult(str(place), "planned", most, {}, {}, (), inputs.findings, exit_code=code, estimate=expected)
 
 
 def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Inputs, jobs: int, *, size: int) -> None:
@@ -331,18 +348,19 @@ def _absolute(place: Path | str) -> str:
     return str(place).rstrip("/") if is_url(place) else str(Path(place).absolute())
 
 
-def _left_out(
+def _find_left_out(
     inputs: Inputs, known: DatasetCard | None, *, robot: str | None, tags: Mapping[str, str], min_runs: int | None
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return what is wrong with the choice of runs, and what is worth a warning; `DatasetError` where there are too few."""
+) -> tuple[Finding, ...]:
+    """Return what is wrong with the choice of runs, as notes where ``min_runs`` are enough; `DatasetError` where there are too few."""
     chosen = inputs.chosen
-    fewer = (*chosen.missing, *(() if known is None else gone_runs(known.runs, chosen, robot=robot, tags=tags)))
+    fewer = (*chosen.missing, *(() if known is None else find_gone_runs(known.runs, chosen, robot=robot, tags=tags)))
     if min_runs is None:
-        return (*chosen.damaged, *fewer), ()
+        return (*chosen.damaged, *fewer)
     if len(inputs.runs) < min_runs:
         count = f"{len(inputs.runs)} runs, wanted {min_runs} or more (--min-runs); nothing is written"
-        raise DatasetError(count, *chosen.damaged, *fewer)
-    return chosen.damaged, fewer
+        groups = group_dataset_findings((*chosen.damaged, *fewer), {run.run_id: () for run in inputs.runs})
+        raise DatasetError(count, *format_mixed_groups(groups))
+    return (*chosen.damaged, *(replace(finding, severity="note") for finding in fewer))
 
 
 def _is_all_there(place: Path | str, card: DatasetCard) -> bool:
@@ -362,8 +380,10 @@ def _card_in_bucket(url: str) -> tuple[DatasetCard | None, bool]:
     return card, card.data_model_version in READ_VERSIONS
 
 
-def _result(place: Path | str, status: str, card: DatasetCard, problems: Sequence[str]) -> BuildResult:
-    said = (*problems, *empty_splits(card))
+def _result(place: Path | str, status: str, card: DatasetCard, left_out: Sequence[Finding]) -> BuildResult:
+    """Return what became of a dataset: runs that are left out are those of now, whatever the card has of them."""
+    lasting = (finding for finding in card.findings if finding.code not in CHOICE_CODES)
+    findings = (*left_out, *lasting)
     return BuildResult(
         path=str(place),
         status=status,
@@ -371,12 +391,13 @@ def _result(place: Path | str, status: str, card: DatasetCard, problems: Sequenc
         splits={name: card.splits[name] for name in SPLITS},
         ledger_m=card.ledger_m,
         audit=card.split.audit,
-        warnings=card.warnings,
-        problems=said,
+        findings=findings,
+        findings_by_run=card.findings_by_run,
+        findings_by_map=card.findings_by_map,
+        verdict=card.verdict,
         energy_budget=card.energy_budget,
-        exit_code=3 if said else 0,
+        exit_code=3 if any(map(is_problem, findings)) else 0,
         doubtful=card.doubtful,
-        findings=card.findings,
         redacted=card.redaction is not None,
     )
 

@@ -23,6 +23,7 @@ from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
+from tcpipe.tables.findings import select_findings
 
 LOST = {
     "the only manifest": "runs/b/*/manifest-1.json",
@@ -97,8 +98,7 @@ def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, t
     for _ in range(2):  # what the first call writes into the index hides nothing from the next
         result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
         assert result.exit_code == 3
-        assert any(f"/{name}" in line or f": {name};" in line for line in result.problems), result.problems
-        assert not any(f"run {name}:" in line for line in result.warnings)
+        assert [of.subject.name for of in select_findings(result.findings, "run-damaged", "run-gone")] == [name]
         found = status([new], store=root, recipe=Recipe())
         assert (found.exit_code, len(found.problems)) == (3, 1)
         assert verify(root).problems
@@ -133,7 +133,7 @@ def test_a_run_that_a_call_is_making_is_on_its_way_and_no_problem(place, tmp_pat
         assert inspect(root, recipe=Recipe()).unfinished == ("b",)
         result = build_dataset(tmp_path / "out", store=root, recipe=Recipe(), dry_run=True)
         assert result.exit_code == 0
-        assert any("no ingestion of b has finished" in line for line in result.warnings)
+        assert [of.subject.name for of in select_findings(result.findings, "run-unfinished")] == ["b"]
     assert list(list_runs(Store(root)).damaged) == [("b", "")]
 
 
