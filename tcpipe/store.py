@@ -75,7 +75,7 @@ from tcpipe.formats.stored_runs import (
     below,
     local_file,
     put_tables,
-    refuse_earlier,
+    refuse_lost,
     told_of,
     with_lost,
     with_span,
@@ -235,7 +235,7 @@ class Store:
         """
         place, name = of.runs.below(f"{of.run_id}/{recipe_id}"), name_of("manifest", number)
         state = state_of(of.files[f"{recipe_id}/{name}"])
-        refuse_earlier(place, {"manifest": number}, "" if row is None else row.state)
+        refuse_lost(of, recipe_id, row)
         if row is None or row.state != state:
             where = place.where(name)
             document = read_sealed_at(place, name, ours=lambda found: found.get("data_model_version") in READ_VERSIONS)
@@ -262,7 +262,6 @@ class Store:
         state = " ".join(state_of(of.files[name]) for name in last)
         if row.log is not None and row.log.state == state:
             return row
-        refuse_earlier(of.runs.below(of.run_id), of.numbers, "" if row.log is None else row.log.state)
         try:
             known = self.run_json(row.run_id, of.numbers)
         except StoreError:

@@ -155,7 +155,7 @@ class FindingGroup(Generic[K]):
     @property
     def severity(self) -> Severity:
         """The worst of their severities."""
-        return self.findings[0].severity
+        return min((finding.severity for of in self.of.values() for finding in of), key=rank_severity)
 
 
 def group_findings(findings: Iterable[tuple[K, Iterable[Finding]]]) -> list[FindingGroup[K]]:

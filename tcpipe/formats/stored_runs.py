@@ -159,11 +159,18 @@ def with_lost(
     return replace(found, damaged=damaged, lost=lost, unfinished=tuple(sorted(names - there - set(gone))))
 
 
-def refuse_earlier(place: Place, there: Mapping[str, int], states: str) -> None:
-    """Raise `StoreError` where a document is gone that the index has seen, with the states of files, and an earlier one would hold."""
-    for stem, number in numbers(state.rsplit("-", 2)[0] for state in states.split()).items():
-        if number > there.get(stem, 0):
-            raise StoreError(f"{place.where(name_of(stem, number))}: is gone; ingest the log again")
+def refuse_lost(of: Listed, recipe_id: str, row: RunFacts | None) -> None:
+    """Raise `StoreError` where a document is gone that the index has seen, and an earlier one would hold.
+
+    A copy's files may have other times: what is gone is told by numbers alone.
+    """
+    if row is None:
+        return
+    seen = f"{recipe_id}/{row.state} {'' if row.log is None else row.log.state}"
+    for stem, number in numbers(state.rsplit("-", 2)[0] for state in seen.split()).items():
+        if number > of.numbers.get(stem, 0):
+            where = of.runs.where(f"{of.run_id}/{name_of(stem, number)}")
+            raise StoreError(f"{where}: is gone; ingest the log again")
 
 
 @lru_cache(maxsize=64)

@@ -29,7 +29,7 @@ from tcpipe.pipeline.run_stages import run_stages
 from tcpipe.recipe import ReadConfig, Recipe, Role
 from tcpipe.stages.read import read_run
 from tcpipe.stages.read_roles import find_read_config, roles_by
-from tcpipe.tables.catalogue import read_catalogue, threshold
+from tcpipe.tables.catalogue import threshold
 from tcpipe.tables.columns import integers
 from tcpipe.tables.facts import NOTHING_FOUND, EnergyBudget, RunFacts
 from tcpipe.tables.findings import Finding, Subject, make_finding, sort_findings
@@ -278,8 +278,8 @@ def find_missing(roles: Collection[str], read: ReadConfig) -> Iterator[Finding]:
     for role, code in MISSING.items():
         is_needless = role not in ("gnss", "power") and read.topics.get(role) == []
         if role not in present and not is_needless:
-            severity = "error" if read_catalogue()[code].severity == "error" else "warning"
-            yield make_finding(code, Subject("role", role), severity=severity)
+            found = make_finding(code, Subject("role", role))
+            yield replace(found, severity="warning") if found.severity == "note" else found
 
 
 def find_slow(topics: Sequence[RoleTopic], promise: Promise | None, span_s: float) -> Iterator[Finding]:
@@ -288,14 +288,17 @@ def find_slow(topics: Sequence[RoleTopic], promise: Promise | None, span_s: floa
         subject, names = Subject("role", of.role), {"topic": of.topic}
         least_hz = threshold("rate-too-low", "min_rate_fraction") * (of.wanted_hz or 0.0)
         if of.rate_hz is not None and of.wanted_hz is not None and of.rate_hz < least_hz:
-            rates = {"rate_hz": of.rate_hz, "wanted_hz": of.wanted_hz}
-            yield make_finding("rate-too-low", subject, names=names, **rates)
+            yield make_finding("rate-too-low", subject, names=names, rate_hz=of.rate_hz, wanted_hz=of.wanted_hz)
         if of.role != "command" and of.there < threshold("topic-incomplete", "min_present_fraction"):
             yield make_finding("topic-incomplete", subject, names=names, present_fraction=of.there)
     budget = promise.energy_budget if promise else None
     if budget is not None and _is_ruled_by_rate(budget):
-        shares = {"total_fraction": budget.total, "at_20_hz_fraction": budget.at_20_hz}
-        yield make_finding("power-rate-dominates", Subject("role", "power"), **shares)
+        yield make_finding(
+            "power-rate-dominates",
+            Subject("role", "power"),
+            total_fraction=budget.total,
+            at_20_hz_fraction=budget.at_20_hz,
+        )
     if promise is not None and span_s < threshold("log-too-short", "min_span_s"):
         yield make_finding("log-too-short", Subject("log", "log"), length_s=span_s)
 

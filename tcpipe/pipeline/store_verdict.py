@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tcpipe.cost.held_out import PHYSICS_UNITS
 from tcpipe.formats.index_files import RunFacts
-from tcpipe.tables.catalogue import threshold
+from tcpipe.tables.catalogue import Severity, threshold
 from tcpipe.tables.findings import Finding, Subject, make_finding
 from tcpipe.tables.verdicts import Verdict, judge
 
@@ -39,9 +39,18 @@ def find_changes(runs: Iterable[RunFacts]) -> tuple[Finding, ...]:
 def _find_changes(series: Iterable[tuple[tuple[str, str, str], Sequence[float]]]) -> Iterator[Finding]:
     for (robot, measure, unit), values in series:
         if (shift := shift_of(values)) is not None:
-            severity = "note" if measure == _USED else None
+            severity: Severity | None = "note" if measure == _USED else None
             names = {"robot": robot, "unit": unit}
-            yield make_finding(_CHANGE, Subject("column", measure), severity=severity, names=names, **shift)
+            yield make_finding(
+                _CHANGE,
+                Subject("column", measure),
+                severity=severity,
+                names=names,
+                before=shift.before,
+                after=shift.after,
+                earlier_count=shift.earlier_count,
+                latest_count=shift.latest_count,
+            )
 
 
 _USED = "used share of the distance"
@@ -60,8 +69,18 @@ def _measures(run: RunFacts) -> Iterator[tuple[str, str, float]]:
             yield f"physics term {term}", PHYSICS_UNITS.get(term.partition(" ")[0], ""), value
 
 
-def shift_of(values: Sequence[float]) -> dict[str, float] | None:
-    """Return the medians of a series' latest values and of those before, and how many there are of each; None where they do not differ.
+@dataclass(frozen=True, slots=True)
+class Shift:
+    """The medians of a series' latest values and of those before, and how many there are of each."""
+
+    before: float
+    after: float
+    earlier_count: int
+    latest_count: int
+
+
+def shift_of(values: Sequence[float]) -> Shift | None:
+    """Return how the latest values of a series differ from those before; None where they do not.
 
     The latest quarter of the values, at most 20, is compared with those before: the medians must differ by more than three robust standard
     deviations (1.4826 times the median absolute deviation) of the earlier values and by 5 % of their median (thresholds of the catalogue).
@@ -77,4 +96,4 @@ def shift_of(values: Sequence[float]) -> dict[str, float] | None:
     )
     if abs(after - before) <= enough:
         return None
-    return {"before": before, "after": after, "earlier_count": len(earlier), "latest_count": count}
+    return Shift(before, after, len(earlier), count)

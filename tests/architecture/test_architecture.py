@@ -254,7 +254,7 @@ print(*sorted({name.split(".")[0] for name in sys.modules}))
 SUGGESTIONS = "recipe/suggestions.py"
 WRITES_RECIPES = {SUGGESTIONS, "formats/recipe_toml.py", "pipeline/table_proposal.py"}
 """Modules that write lines of recipes: what messages suggest, `tcpipe init`, and the tables of a folder."""
-RECIPE_CALLS = {"suggested", "recipe_key", "RecipeFragment"}
+RECIPE_CALLS = {"suggest", "recipe_key", "RecipeFragment"}
 
 
 def _mentions_of_recipe(tree):

@@ -113,6 +113,16 @@ def test_what_a_run_lost_is_a_problem_to_every_command_until_it_is_back(place, t
     assert verify(root).problems == ()
 
 
+@pytest.mark.parametrize("lost", LOST)
+def test_a_copy_whose_files_have_other_times_misses_the_same(made, tmp_path, lost):
+    store = Store(shutil.copytree(made / "store", tmp_path / "store", copy_function=shutil.copyfile))
+    lose(tmp_path / "store", LOST[lost])
+    for _ in range(2):
+        found = list_runs(store)
+        assert {run_id for run_id, _ in found.damaged} == {LOST[lost].split("/")[1]}
+        store.keep_index(found)
+
+
 def test_a_run_that_a_call_is_making_is_on_its_way_and_no_problem(place, tmp_path):
     files, root = place
     lose(files, "runs/b/*/manifest-1.json")

@@ -174,9 +174,9 @@ def test_a_change_is_told_from_scatter():
     assert shift_of(scatter) is None
     assert shift_of(scatter[:11]) is None
     found = shift_of([*scatter[:15], *(scatter[15:] + 12.0)])
-    assert (found["earlier_count"], found["latest_count"]) == (15, 5)
-    assert shift_of([*np.tile(scatter, 50), *(scatter + 12.0)])["latest_count"] == 20
-    assert found["after"] - found["before"] == pytest.approx(12.0, abs=1.0)
+    assert (found.earlier_count, found.latest_count) == (15, 5)
+    assert shift_of([*np.tile(scatter, 50), *(scatter + 12.0)]).latest_count == 20
+    assert found.after - found.before == pytest.approx(12.0, abs=1.0)
     assert shift_of([5.0] * 20) is None
     assert shift_of([5.0] * 15 + [5.2] * 5) is None  # 4 % of what it was
     assert shift_of([5.0] * 15 + [6.0] * 5) is not None
