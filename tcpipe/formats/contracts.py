@@ -8,8 +8,9 @@ import pyarrow as pa
 
 from tcpipe.formats.dataset_card import DatasetCard
 from tcpipe.formats.json_files import DIALECT, schema_of, to_json
-from tcpipe.formats.recipe_toml import recipe_schema
 from tcpipe.formats.run_documents import Manifest, RunJson
+from tcpipe.recipe import Recipe
+from tcpipe.recipe.checking import describe
 from tcpipe.tables.bits import name_of
 from tcpipe.tables.columns import Column, TableSchema
 from tcpipe.tables.levels import DATA_MODEL_VERSION, GATED_TRACK, LABELLED_SEGMENTS, REJECTIONS, SAMPLES, STREAMS
@@ -22,7 +23,7 @@ def contracts() -> dict[str, str]:
     """Return file name → JSON Schema text, for every table (one row as an object), the recipe and every document."""
     tables = (*STREAMS.values(), GATED_TRACK, REJECTIONS, LABELLED_SEGMENTS, SAMPLES)
     found = {f"{table.name}.schema.json": to_json(_table_schema(table)) for table in tables}
-    found["recipe.schema.json"] = to_json({"$schema": DIALECT, **recipe_schema()})
+    found["recipe.schema.json"] = to_json({"$schema": DIALECT, **describe(Recipe, closed=True)})
     return found | {f"{name}.schema.json": schema_of(cls) for name, cls in DOCUMENTS.items()}
 
 

@@ -9,7 +9,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from enum import Enum
-from inspect import cleandoc
 from pathlib import Path
 from threading import Lock
 from typing import Any, TypeVar
@@ -18,6 +17,7 @@ import msgspec
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_text
+from tcpipe.recipe.checking import describe
 
 T = TypeVar("T")
 Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
@@ -176,11 +176,7 @@ def _from_text(kind: type, text: str) -> Path:
 
 def schema_of(cls: type) -> str:
     """Return the JSON Schema of a dataclass as text: of what `to_json` writes of it, and `read_as` reads."""
-    schema = msgspec.json.schema(cls, schema_hook=lambda _: {"type": "string"})
-    for of in (schema, *schema.get("$defs", {}).values()):
-        if "description" in of:  # a docstring, whose indentation Python 3.13 takes away when it compiles it
-            of["description"] = cleandoc(of["description"])
-    return to_json({"$schema": DIALECT, **schema})
+    return to_json({"$schema": DIALECT, **describe(cls)})
 
 
 def digest(value: Any) -> str:
