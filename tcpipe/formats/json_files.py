@@ -17,14 +17,10 @@ import msgspec
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.atomic import write_text
-from tcpipe.recipe.checking import describe
 
 T = TypeVar("T")
 Json = str | float | bool | None | Sequence["Json"] | Mapping[str, "Json"]
 """A value of a document whose form is others' (JSON-LD, CF attributes); our own documents are dataclasses."""
-
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
-"""Of every schema in ``schemas/``."""
 
 _CONVERTING = Lock()
 """msgspec (0.22) ends the process where two threads meet a dataclass for the first time at once."""
@@ -172,11 +168,6 @@ def _from_text(kind: type, text: str) -> Path:
     if kind is not Path:
         raise NotImplementedError(kind)
     return Path(text)
-
-
-def schema_of(cls: type) -> str:
-    """Return the JSON Schema of a dataclass as text: of what `to_json` writes of it, and `read_as` reads."""
-    return to_json({"$schema": DIALECT, **describe(cls)})
 
 
 def digest(value: Any) -> str:

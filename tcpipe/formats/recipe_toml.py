@@ -107,7 +107,7 @@ def recipe_id(recipe: Recipe | Mapping[str, Json], robot: str) -> str:
 
 def commented_toml(recipe: Recipe | None = None) -> str:
     """Return every key with its default and meaning as TOML; keys at their default are commented out."""
-    return "\n".join(_toml_lines(recipe or Recipe(), describe(Recipe)["$defs"])) + "\n"
+    return "\n".join(_toml_lines(recipe or Recipe(), describe(Recipe)[1])) + "\n"
 
 
 def _toml_lines(recipe: Recipe, definitions: Mapping[str, Any]) -> Iterator[str]:

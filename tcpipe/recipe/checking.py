@@ -72,38 +72,36 @@ def kinds_of(cls: type) -> dict[str, Any]:
     return {of.name: hints[of.name] for of in fields(cls)}
 
 
-def describe(kind: Any, *, closed: bool = False) -> dict[str, Any]:
-    """Return the JSON Schema of an annotation; docstrings describe the dataclasses in it and their keys.
+def describe(*kinds: Any, file: str = "") -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
+    """Return the JSON Schema of each annotation, and the definitions they refer to; docstrings describe dataclasses and their keys.
 
     Parameters
     ----------
-    kind : the annotation.
-    closed : no object has a key that its dataclass lacks.
+    kinds : the annotations.
+    file : that holds the definitions; "" is the file of the schema itself.
     """
-    schema = msgspec.json.schema(kind, schema_hook=lambda _: {"type": "string"})
-    definitions = schema.get("$defs", {})
-    for of in (schema, *definitions.values()):
-        if "description" in of:  # a docstring, whose indentation Python 3.13 takes away when it compiles it
-            of["description"] = inspect.cleandoc(of["description"])
-        if closed and "properties" in of:
-            of["additionalProperties"] = False
-    for cls in _dataclasses_in(kind, set()):
+    template, text = f"{file}#/$defs/{{name}}", {"type": "string"}
+    schemas, definitions = msgspec.json.schema_components(kinds, schema_hook=lambda _: text, ref_template=template)
+    for definition in definitions.values():
+        if "description" in definition:  # a docstring, whose indentation Python 3.13 takes away when it compiles it
+            definition["description"] = inspect.cleandoc(definition["description"])
+    for cls in _dataclasses_in(kinds, set()):
         properties = definitions.get(cls.__name__, {}).get("properties", {})
-        for name, text in _key_docstrings(cls):
-            properties.get(name, {})["description"] = text
-    return schema
+        for name, docstring in _key_docstrings(cls):
+            properties.get(name, {})["description"] = docstring
+    return [*schemas], definitions
 
 
 def values_in_words(kind: Any) -> str:
     """Return the choices or the bounds of an annotation, "" where it has none."""
-    schema = describe(kind)
+    ((schema,), _) = describe(kind)
     schema = schema.get("anyOf", [schema])[0]
     return _in_words(schema) if "enum" in schema else _range_in_words(schema)
 
 
 def _dataclasses_in(kind: Any, found: set[type]) -> set[type]:
-    """Return those that were found, and the dataclasses that an annotation is made of, itself included."""
-    parts = get_args(kind)
+    """Return those that were found, and the dataclasses that an annotation, or each of several, is made of."""
+    parts = kind if isinstance(kind, tuple) else get_args(kind)
     if isinstance(kind, type) and is_dataclass(kind) and kind not in found:
         found.add(kind)
         parts = tuple(kinds_of(kind).values())
@@ -175,7 +173,7 @@ def _checked(kind: Any, value: Any, key: str, problems: list[str]) -> Any:
     try:
         return msgspec.convert(_plain(value), kind)
     except (msgspec.ValidationError, ValueError):  # a number of thousands of digits is the latter
-        return _reject(key, value, _in_words(describe(kind)), problems)
+        return _reject(key, value, _in_words(describe(kind)[0][0]), problems)
 
 
 def _plain(value: Any) -> Any:
