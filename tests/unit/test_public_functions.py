@@ -49,7 +49,7 @@ def test_looking_at_the_package_loads_none_of_it():
 def _options(name):
     """Parameters of a command but those of its terminal, by the keyword of the function."""
     skipped = {"as_json", "quiet", "debug"}
-    return {of.name.replace("path_file", "path"): of for of in cli.commands[name].params if of.name not in skipped}
+    return {of.name: of for of in cli.commands[name].params if of.name not in skipped}
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
