@@ -8,8 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Protocol, cast, overload
 
+from tcpipe.learning.evaluate_options import EvaluateOptions
 from tcpipe.learning.train_options import TrainOptions
 from tcpipe.planning.path_options import PlanPathOptions, PredictPathOptions
 from tcpipe.tables.options import as_function
@@ -42,61 +43,43 @@ def run_train(options: TrainOptions) -> TrainResult:
 train = as_function(TrainOptions, run_train)
 
 
-@overload
-def evaluate(
-    model: str | Path,
-    dataset: str | Path,
-    out: str | Path = "evaluation",
-    *,
-    draws: int = 5,
-    baselines: bool = True,
-    retrain: bool = False,
-    seed: int = 0,
-) -> EvaluationResult: ...
-@overload
-def evaluate(
-    model: str | Path,
-    dataset: str | Path,
-    out: str | Path = "evaluation",
-    *,
-    drives: Sequence[str | Path],
-    map_name: str | None = None,
-    store: str | Path = "tcpipe-store",
-) -> DrivesResult: ...
-def evaluate(
-    model: str | Path,
-    dataset: str | Path,
-    out: str | Path = "evaluation",
-    *,
-    draws: int = 5,
-    baselines: bool = True,
-    retrain: bool = False,
-    seed: int = 0,
-    drives: Sequence[str | Path] = (),
-    map_name: str | None = None,
-    store: str | Path = "tcpipe-store",
-) -> EvaluationResult | DrivesResult:
+class Evaluate(Protocol):
+    """The function `evaluate`: what it returns depends on ``drives``."""
+
+    @overload
+    def __call__(
+        self,
+        model: str | Path,
+        dataset: str | Path,
+        out: str | Path = "evaluation",
+        *,
+        draws: int = 5,
+        baselines: bool = True,
+        retrain: bool = False,
+        seed: int = 0,
+    ) -> EvaluationResult: ...
+    @overload
+    def __call__(
+        self,
+        model: str | Path,
+        dataset: str | Path,
+        out: str | Path = "evaluation",
+        *,
+        drives: Sequence[str | Path],
+        map_name: str | None = None,
+        store: str | Path = "tcpipe-store",
+    ) -> DrivesResult: ...
+
+
+def run_evaluate(options: EvaluateOptions) -> EvaluationResult | DrivesResult:
     """Measure a model on a dataset's test samples and unseen area, or on whole drives, and write the evaluation to ``out``.
 
-    Parameters
-    ----------
-    model, dataset : a model, and a dataset; of drives the one that the model was trained on. Here or in a bucket.
-    out : a directory, or a URL in a bucket.
-    draws, baselines, retrain, seed : as in `tcpipe.learning.evaluation_facts.EvaluateConfig`.
-    drives : ingested logs, by path or run name, to measure the model on instead.
-    map_name : the map of the drives. None: the only one in the store.
-    store : where the drives and the map are.
-
-    Returns
-    -------
-    EvaluationResult or, of drives, DrivesResult : ``values`` are those of the written JSON; ``str`` of it is what the command prints.
-
-    Raises
-    ------
-    UsageError : an option is out of its range, ``out`` holds something else, or a drive is not in the store.
-    ModelError, DatasetError, MapError, StoreError : a model, a dataset, a map or the store cannot be used.
+    ``values`` of the result are those of the written JSON; ``str`` of it is what the command prints. Raises `UsageError` where an option
+    is out of its range, ``out`` holds something else, or a drive is not in the store; `ModelError`, `DatasetError`, `MapError` or
+    `StoreError` where an input cannot be used.
     """
-    if drives:
+    model, dataset, out = options.model, options.dataset, options.out
+    if options.drives:
         from tcpipe.dataset import open_dataset
         from tcpipe.learning.models import load_model
         from tcpipe.learning.predictions import check_origin
@@ -105,13 +88,17 @@ def evaluate(
 
         loaded, data = load_model(model), open_dataset(dataset)
         check_origin(loaded.card, data, str(model))
-        return evaluate_drives(loaded, data, chosen_map(store, map_name), [*map(str, drives)], store=store, out=out)
+        source = chosen_map(options.store, options.map_name)
+        return evaluate_drives(loaded, data, source, [*map(str, options.drives)], store=options.store, out=out)
     from tcpipe.learning.evaluation_facts import EvaluateConfig
     from tcpipe.learning.evaluation_files import run_evaluation
     from tcpipe.recipe.checking import from_values
 
-    options = {"draws": draws, "baselines": baselines, "retrain": retrain, "seed": seed}
-    return run_evaluation(model, dataset, out, config=from_values(EvaluateConfig, options, where="evaluate"))
+    asked = {name: getattr(options, name) for name in ("draws", "baselines", "retrain", "seed")}
+    return run_evaluation(model, dataset, out, config=from_values(EvaluateConfig, asked, where="evaluate"))
+
+
+evaluate = cast("Evaluate", as_function(EvaluateOptions, run_evaluate))
 
 
 def run_predict_path(options: PredictPathOptions) -> PathResult:
