@@ -19,7 +19,6 @@ from click.shell_completion import CompletionItem
 from tcpipe.errors import TcpipeError
 from tcpipe.formats import places
 from tcpipe.tables import options
-from tcpipe.tables.bounds import Bounds
 
 if TYPE_CHECKING:
     from tcpipe.store import Store
@@ -203,10 +202,10 @@ def parameter(name: str, default: Any, shown: options.Option) -> Option:
     """Return the decorator of click for a declared option or argument."""
     settings: dict[str, Any] = {"metavar": shown.metavar}
     match shown.kind:
-        case Bounds(ge=int() as least, le=int() as most):
+        case options.Range(int() as least, int() as most):
             settings["type"] = click.IntRange(least, most)
-        case Bounds(ge=least, gt=above, le=most):
-            settings["type"] = FloatRange(above if least is None else least, most, min_open=least is None)
+        case options.Range(least, most, is_open):
+            settings["type"] = FloatRange(least, most, min_open=is_open)
         case tuple(choices):
             settings["type"] = click.Choice(choices)
         case kind if kind:

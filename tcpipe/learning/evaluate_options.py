@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 
-from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.options import MAP, MODEL, SEED, STORE, Option, option, required
+from tcpipe.tables.options import MAP, MODEL, SEED, STORE, Option, Range, option, required
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,7 +18,7 @@ class EvaluateOptions:
     """Of drives the one that the model was trained on."""
     out: str | Path = option("evaluation", Option(kind="published", metavar="[OUT]", is_argument=True))
     _: KW_ONLY
-    draws: int = option(5, Option("Draws of noise for each ablated input set.", kind=Bounds(ge=1, le=1000)))
+    draws: int = option(5, Option("Draws of noise for each ablated input set.", kind=Range(1, 1000)))
     baselines: bool = option(
         True,
         Option(

@@ -6,8 +6,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.options import SEED, Option, option, required
+from tcpipe.tables.options import SEED, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.dataset.energies import EnergyName
@@ -39,20 +38,20 @@ class TrainOptions:
             kind=("nrmse", "paper_eq4"),
         ),
     )
-    epochs: int | None = option(None, Option("At most.", kind=Bounds(ge=1, le=100_000), shown=100))
+    epochs: int | None = option(None, Option("At most.", kind=Range(1, 100_000), shown=100))
     patience: int | None = option(
-        None, Option("Epochs without a better held-out loss.", kind=Bounds(ge=1, le=100_000), shown=12)
+        None, Option("Epochs without a better held-out loss.", kind=Range(1, 100_000), shown=12)
     )
-    batch: int | None = option(None, Option("Samples in a batch.", kind=Bounds(ge=1, le=65_536), shown=64))
-    learning_rate: float | None = option(None, Option(kind=Bounds(gt=0.0, le=1.0), shown=1e-4))
-    fold: int | None = option(None, Option("Fold of train to stop early by.", kind=Bounds(ge=0, le=99), shown=0))
+    batch: int | None = option(None, Option("Samples in a batch.", kind=Range(1, 65_536), shown=64))
+    learning_rate: float | None = option(None, Option(kind=Range(0.0, 1.0, is_open=True), shown=1e-4))
+    fold: int | None = option(None, Option("Fold of train to stop early by.", kind=Range(0, 99), shown=0))
     mirror: bool | None = option(
         None, Option("Mirror every other patch across its travel.", ("--mirror/--no-mirror",), shown=True)
     )
     weights: bool = option(False, Option("Weigh each label by its inverse variance."))
     width: int | None = option(
         None,
-        Option("Filters of the first stage, a multiple of 16; 64 is ResNet-18.", kind=Bounds(ge=16, le=512), shown=64),
+        Option("Filters of the first stage, a multiple of 16; 64 is ResNet-18.", kind=Range(16, 512), shown=64),
     )
     label: EnergyName = option(
         "total",

@@ -7,8 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.options import MAP, MODEL, PHYSICS, SPEED, STORE, Option, option, required
+from tcpipe.tables.options import MAP, MODEL, PHYSICS, SPEED, STORE, Option, Range, option, required
 
 if TYPE_CHECKING:
     from tcpipe.planning.plan import Objective
@@ -51,7 +50,7 @@ class PlanPathOptions:
         Option("A cost map of this model and map; without one only what is needed is predicted.", (), "sealed", "DIR"),
     )
     step_m: float = option(
-        1.0, Option("Side of a cell; that of --cost-map rules.", ("--step",), Bounds(ge=0.05, le=1000.0), "METRES")
+        1.0, Option("Side of a cell; that of --cost-map rules.", ("--step",), Range(0.05, 1000.0), "METRES")
     )
     allow_unseen: bool = option(False, Option("Also cross ground unlike any that the model was trained on."))
     physics: str | Path | None = option(None, PHYSICS)

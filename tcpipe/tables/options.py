@@ -8,13 +8,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from inspect import cleandoc, signature
-from typing import Any, ParamSpec, TypeVar
-
-from tcpipe.tables.bounds import Bounds
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 P = ParamSpec("P")
 O = TypeVar("O")
 R = TypeVar("R")
+
+
+class Range(NamedTuple):
+    """The bounds of a number; msgspec, which knows bounds too, would make ``--help`` slower."""
+
+    least: float
+    most: float
+    is_open: bool = False
+    """Whether the least is excluded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +31,7 @@ class Option:
     about: str = ""
     flags: tuple[str, ...] = ()
     """In place of ``--`` and the field's name."""
-    kind: Bounds | tuple[str, ...] | str = ""
+    kind: Range | tuple[str, ...] | str = ""
     """Bounds of a number, the choices, or the name of one of `tcpipe.cli.options.KINDS`."""
     metavar: str | None = None
     shown: str | float | None = None
@@ -54,11 +61,11 @@ PHYSICS = Option(
 SPEED = Option(
     "Commanded speed, for a model trained with --beside (default: the mean of its training).",
     ("--speed",),
-    Bounds(gt=0.0, le=100.0),
+    Range(0.0, 100.0, is_open=True),
     "MPS",
 )
 DRY_RUN = Option("Say what would be done, and what it would take; do nothing.")
-SEED = Bounds(ge=0, le=2**32 - 1)
+SEED = Range(0, 2**32 - 1)
 """What every generator of random numbers takes."""
 
 
@@ -74,7 +81,7 @@ def option(default: object, shown: Option) -> Any:
 
 def jobs(what: str) -> Any:
     """Return the field of ``--jobs``."""
-    return option(1, Option(f"{what} side by side.", ("--jobs", "-j"), Bounds(ge=1, le=1024)))
+    return option(1, Option(f"{what} side by side.", ("--jobs", "-j"), Range(1, 1024)))
 
 
 def tags(about: str) -> Any:

@@ -7,8 +7,7 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcpipe.tables.bounds import Bounds
-from tcpipe.tables.options import CLUSTER, DRY_RUN, RECIPE, SEED, STORE, Option, jobs, option, tags
+from tcpipe.tables.options import CLUSTER, DRY_RUN, RECIPE, SEED, STORE, Option, Range, jobs, option, tags
 
 if TYPE_CHECKING:
     from tcpipe.formats.dataset_files import FileFormat
@@ -63,7 +62,7 @@ class BuildDatasetOptions:
         None,
         Option(
             "Build nothing from fewer runs; so many are enough: that others are left out or gone is a warning then.",
-            (), Bounds(ge=1, le=1_000_000), "N",
+            (), Range(1, 1_000_000), "N",
         ),
     )  # fmt: skip
     redact: bool = option(
