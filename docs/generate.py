@@ -70,7 +70,9 @@ def _documents() -> str:
 
 _FILES = """# JSON documents and answers
 
-`schemas/` has every key of each with its type, as JSON Schema: what a scheduler parses. Files have their seal beside (`document_sha256`).
+`schemas/` has every key of each with its type and meaning, as JSON Schema: what a scheduler parses. Definitions that several share are in
+`schemas/defs.schema.json`, to which the others refer by its relative name: load the folder as a whole. Files have their seal beside
+(`document_sha256`).
 
 ## Files
 """
@@ -78,6 +80,7 @@ _FILES = """# JSON documents and answers
 _ANSWERS = """## What commands print with `--json`
 
 `ingest` prints a line for each log as it ends (`ingest-log`) and one of all (`ingest-summary`); what `inspect` prints is by the key `kind`.
+`evaluate` prints the file `evaluation`, and with `--drive` the answer `evaluate-drives`.
 A command that fails prints `exit_code` and `problems`.
 """
 

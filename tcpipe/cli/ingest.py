@@ -4,25 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import click
 
-from tcpipe.cli.options import (
-    ONE_OF_SEVERAL,
-    cluster_option,
-    dry_run_option,
-    jobs_option,
-    min_age_option,
-    msgdef_option,
-    quiet_option,
-    recipe_option,
-    robot_option,
-    shard_value,
-    store_option,
-    tag_option,
-)
+from tcpipe.cli.options import dry_run_option, options_of, quiet_option
 from tcpipe.cli.output import say
+from tcpipe.pipeline.ingest_options import IngestOptions
 
 if TYPE_CHECKING:
     from tcpipe.pipeline.ingest import IngestSummary
@@ -30,48 +18,11 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="Logs to labelled 1 m segments")
-@click.argument("logs", nargs=-1, required=True, type=ONE_OF_SEVERAL, metavar="LOG...")
-@store_option
-@recipe_option
-@robot_option(
-    "Robot profile: one that `tcpipe init` lists, or of the recipe (found by message types and topic names otherwise)."
-)
-@tag_option("Free tag on the runs; repeatable.")
-@jobs_option("Logs")
-@cluster_option
-@click.option("--as-one", is_flag=True, help="All logs are parts of one drive (splits; power logged apart).")
-@msgdef_option
-@click.option(
-    "--shard",
-    metavar="I/N",
-    callback=shard_value,
-    help="Only the I-th of N shares of the logs: one for each task of an array.",
-)
-@min_age_option("0", "A log that was written to since (90, 90s, 10m, 2h, 1d) waits for another call.")
-@click.option("--retry-failed", is_flag=True, help="Try again what is known to fail.")
-@click.option("--force", is_flag=True, help="Do again what is there already, and what is known to fail.")
+@options_of(IngestOptions)
 @dry_run_option
 @click.option("--json", "as_json", is_flag=True, help="Print a JSON object for each log as it ends, and one of all.")
 @quiet_option
-def ingest(
-    logs: tuple[str, ...],
-    *,
-    store: str,
-    recipe: str | None,
-    robot: str | None,
-    tags: dict[str, str],
-    jobs: int,
-    cluster: str | None,
-    as_one: bool,
-    msgdef: str | None,
-    shard: tuple[int, int] | None,
-    min_age_s: float,
-    retry_failed: bool,
-    force: bool,
-    dry_run: bool,
-    as_json: bool,
-    quiet: bool,
-) -> int:
+def ingest(options: IngestOptions, *, dry_run: bool, as_json: bool, quiet: bool) -> int:
     """Read logs, fuse the sensors, gate, cut into 1 m segments, and label each with power, velocity, time and energy.
 
     A LOG is a .mcap, a .bag, a .db3, a ROS 2 bag directory, or a folder of such, searched downward, or the s3:// URL of
@@ -85,28 +36,28 @@ def ingest(
 
     from tcpipe.cli.output import print_json_line, progress, ruling_recipe, say_result
     from tcpipe.formats.json_files import recast
-    from tcpipe.pipeline.ingest import SummaryLine
-    from tcpipe.pipeline.ingest import ingest as run
+    from tcpipe.pipeline.ingest import SummaryLine, run_ingest
     from tcpipe.pipeline.ingest_task import LogLine
 
-    ruling, source = ruling_recipe(recipe)
+    ruling, source = ruling_recipe(cast("str | None", options.recipe))
+    options = replace(options, recipe=ruling)
     if not as_json:
         say(f"recipe: {source}")
     if dry_run:
         from tcpipe.pipeline.status import status
 
         planned = status(
-            logs,
-            store=store,
+            options.logs,
+            store=options.store,
             recipe=ruling,
-            robot=robot,
-            as_one=as_one,
-            shard=shard,
-            min_age_s=min_age_s,
-            message_definitions=Path(msgdef) if msgdef else None,
-            force=force,
-            retry_failed=retry_failed,
-            jobs=jobs,
+            robot=options.robot,
+            as_one=options.as_one,
+            shard=options.shard,
+            min_age_s=options.min_age_s,
+            message_definitions=Path(options.message_definitions) if options.message_definitions else None,
+            force=options.force,
+            retry_failed=options.retry_failed,
+            jobs=options.jobs,
             create=True,
         )
         say_result(replace(planned, history=()), as_json=as_json)
@@ -127,28 +78,12 @@ def ingest(
             if as_json:
                 print_json_line(recast(result, LogLine))
             else:
-                for line in _of_one(result, store, several=several):
+                for line in _of_one(result, options.store, several=several):
                     shown.result(line)
             for problem in result.problems if result.is_news else ():
                 shown.problem(problem)
 
-        summary = run(
-            logs,
-            store=store,
-            recipe=ruling,
-            robot=robot,
-            tags=tags,
-            jobs=jobs,
-            cluster=cluster,
-            force=force,
-            retry_failed=retry_failed,
-            as_one=as_one,
-            shard=shard,
-            min_age_s=min_age_s,
-            message_definitions=Path(msgdef) if msgdef else None,
-            on_found=on_found,
-            on_result=on_result,
-        )
+        summary = run_ingest(replace(options, on_found=on_found, on_result=on_result))
     if as_json:
         made = str(summary.store) if isinstance(summary.store, str) or summary.store.is_dir() else None
         print_json_line(SummaryLine(source, made, summary.exit_code, summary.results))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -24,6 +24,7 @@ from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.store_mark import gone_if_empty
 from tcpipe.pipeline.begun_calls import begun_call
 from tcpipe.pipeline.calls import INGEST, remember_call, room_of, started
+from tcpipe.pipeline.ingest_options import IngestOptions
 from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
 from tcpipe.pipeline.known_runs import KnownRuns, known_runs
@@ -39,8 +40,8 @@ from tcpipe.pipeline.log_sources import (
     with_hashes,
 )
 from tcpipe.pipeline.supersession import remember_earlier, superseded_by
-from tcpipe.recipe import Recipe
 from tcpipe.store import Store, add_by_hash, open_store
+from tcpipe.tables.options import as_function
 
 R = TypeVar("R")
 
@@ -77,100 +78,59 @@ class SummaryLine:
     kind: Literal["summary"] = "summary"
 
 
-def ingest(
-    logs: Iterable[str | Path],
-    *,
-    store: str | Path = "tcpipe-store",
-    recipe: Recipe | str | Path | None = None,
-    robot: str | None = None,
-    tags: Mapping[str, str] | None = None,
-    jobs: int = 1,
-    cluster: str | None = None,
-    force: bool = False,
-    retry_failed: bool = False,
-    as_one: bool = False,
-    shard: tuple[int, int] | None = None,
-    min_age_s: float = 0.0,
-    message_definitions: Path | None = None,
-    on_found: Callable[[Mapping[str, int]], None] | None = None,
-    on_result: Callable[[IngestResult], None] | None = None,
-) -> IngestSummary:
+def run_ingest(options: IngestOptions) -> IngestSummary:
     """Ingest logs (files, ROS 2 bag directories, folders of them) into the store; what is there already is left alone.
 
-    Parameters
-    ----------
-    logs
-        ``.mcap``, ``.bag``, ``.db3``, ROS 2 bag directories, or folders searched downward; or URLs of such (``s3://…``), which are
-        read by range, or copied where they have no index.
-    recipe
-        A `Recipe`, a path to one, or None for the one that rules here (``TCPIPE_RECIPE``, nearest tcpipe.toml, defaults).
-    robot
-        Profile; None takes the recipe's, or finds it by message types.
-    jobs
-        Logs side by side, each in a process of its own.
-    cluster
-        Address of a Dask scheduler whose workers take the logs instead; they see logs and store under the same absolute paths.
-    force
-        Do again what is there already, and what is known to fail.
-    retry_failed
-        Try again what is known to fail.
-    as_one
-        All logs are parts of one drive.
-    shard
-        ``(i, n)``: only the i-th of n shares of the logs, i from 1.
-    min_age_s
-        A log that was written since so many seconds waits for another call.
-    message_definitions
-        A directory of .msg or .idl files for types that the logs do not define.
-    on_found
-        Called once with the size [byte] of every log by its name.
-    on_result
-        Called as each log ends, in the order of ending.
-
-    Raises
-    ------
-    LogError, StoreError, RecipeError, UsageError
-        When nothing can be begun; what goes wrong with one log or path stands in its result.
+    Raises `LogError`, `StoreError`, `RecipeError` or `UsageError` when nothing can be begun; what goes wrong with one log or path stands
+    in its result.
     """
     watch = started()
-    ruling = recipe_of(recipe)
-    robot = robot or ruling.robot
+    ruling, shard = recipe_of(options.recipe), options.shard
+    robot = options.robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store), ExitStack() as until_it_ends:
-        found = find_sources(logs, as_one=as_one, staging=staging, tables=ruling.tables)
+    with (
+        _place_for_stand_ins(logs := list(options.logs)) as staging,
+        gone_if_empty(options.store),
+        ExitStack() as until_it_ends,
+    ):
+        found = find_sources(logs, as_one=options.as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
-        opened = open_store(store, create=True)
+        opened = open_store(options.store, create=True)
         given = tuple(str(log) if is_url(log) else str(Path(log).absolute()) for log in logs if not is_presigned(log))
-        options = (ingest_key(ruling), robot, shard)
-        until_it_ends.enter_context(begun_call(opened, INGEST, given, options=options))
+        until_it_ends.enter_context(begun_call(opened, INGEST, given, options=(ingest_key(ruling), robot, shard)))
         remember_earlier(opened)
-        known = known_runs(opened, force=force)
+        known = known_runs(opened, force=options.force)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
         root = opened.root
-        if cluster is not None:  # its workers are elsewhere
+        message_definitions = None if options.message_definitions is None else Path(options.message_definitions)
+        if options.cluster is not None:  # its workers are elsewhere
             root = root.absolute() if isinstance(root, Path) else root
             message_definitions = None if message_definitions is None else message_definitions.absolute()
-        common = (root, ruling, robot, dict(tags or {}), force, message_definitions)
-        how = (definitions_key(message_definitions), retry_failed, min_age_s)
+        common = (root, ruling, robot, dict(options.tags or {}), options.force, message_definitions)
+        how = (definitions_key(message_definitions), options.retry_failed, options.min_age_s)
         sources = with_hashes(mine, lambda lineage: known.seen.get(lineage, ()))
         tasks = [IngestTask(source, *common, *how) for source in sources]
-        if on_found:
+        if options.on_found:
             sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
-            on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
+            options.on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
         results = {}
-        for index, source, result in _results(opened, tasks, found, known, jobs=jobs, cluster=cluster):
+        for index, source, result in _results(opened, tasks, found, known, jobs=options.jobs, cluster=options.cluster):
             results[index] = result
-            if on_result:
-                on_result(result)
+            if options.on_result:
+                options.on_result(result)
             if source is not None:
                 _remember(opened, tasks[index], source, result, known)
         _keep_index(opened, known, results.values())
         summary = IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
         if any(result.run_id for result in summary.results):  # else no store may remain
-            remember_call(opened, watch, _call_of(opened, summary, given, tasks, jobs))
+            remember_call(opened, watch, _call_of(opened, summary, given, tasks, options.jobs))
         return summary
+
+
+ingest = as_function(IngestOptions, run_ingest)
+"""`tcpipe.ingest`: its keywords are the fields of `IngestOptions`."""
 
 
 def _call_of(

@@ -138,7 +138,7 @@ def test_page_names_every_room():
 
 def test_each_file_format_has_the_home_that_the_page_gives():
     homes = {name: {f"{home}" for home in re.findall(r"`([\w/]+\.py)`", cell)} for name, cell in _table("Homes")}
-    assert {"rosbags", "mcap", "rasterio", "zarr", "pydantic", "pyarrow.parquet", "numba", "torch"} <= set(homes)
+    assert {"rosbags", "mcap", "rasterio", "zarr", "msgspec", "pyarrow.parquet", "numba", "torch"} <= set(homes)
     importers = {
         name: {
             path for path, tree in TREES.items() if any(f"{used}.".startswith(f"{name}.") for used in _imported(tree))

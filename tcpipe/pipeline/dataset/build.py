@@ -53,6 +53,7 @@ from tcpipe.pipeline.begun_calls import begun_call
 from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
+from tcpipe.pipeline.dataset.build_dataset_options import BuildDatasetOptions
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
 from tcpipe.pipeline.dataset.content import gather_content
 from tcpipe.pipeline.dataset.findings import is_problem
@@ -80,6 +81,7 @@ from tcpipe.store import Store, open_store
 from tcpipe.tables.facts import EnergyBudget
 from tcpipe.tables.findings import LEFT_OUT, Finding
 from tcpipe.tables.levels import DATA_MODEL_VERSION, READ_VERSIONS
+from tcpipe.tables.options import as_function
 from tcpipe.tables.verdicts import Verdict
 
 logger = logging.getLogger("tcpipe")
@@ -152,84 +154,25 @@ class BuildResult:
         return [*Redacted().lines(), publish] if self.redacted else []
 
 
-def build_dataset(
-    out: str | Path = "dataset",
-    *,
-    store: str | Path = "tcpipe-store",
-    split: str | Path | None = None,
-    map_name: str | Sequence[str] | None = None,
-    robot: str | None = None,
-    tags: Mapping[str, str] | None = None,
-    recipe: Recipe | str | Path | None = None,
-    jobs: int = 1,
-    cluster: str | None = None,
-    file_format: FileFormat = "zarr",
-    holdout: str | None = None,
-    seed: int | None = None,
-    keep_split: str | Path | None = None,
-    covariates: str | Path | Sequence[str | Path] = (),
-    min_runs: int | None = None,
-    redact: bool = False,
-    force: bool = False,
-    dry_run: bool = False,
-) -> BuildResult:
+def run_build_dataset(options: BuildDatasetOptions) -> BuildResult:
     """Sample a rotated patch for every segment, split by region, and write the dataset to ``out``.
 
     Runs that are not as they were written are left out; those, runs that have to be ingested again, runs of the dataset that is replaced
-    that are gone, and empty splits are findings that make the exit code 3.
+    that are gone, and empty splits are findings that make the exit code 3. The bytes do not depend on ``jobs`` and ``cluster``.
 
-    Parameters
-    ----------
-    out
-        Directory of the dataset: new, empty, or a dataset of the same options, which is replaced unless it is made from the same inputs;
-        or the URL of one in a bucket (``s3://…``), where nothing is replaced.
-    store
-        Where runs and maps are kept.
-    split
-        GeoJSON region (WGS84): inside is train and test, outside is unseen. None: everything is train and test.
-    map_name
-        Map to sample, or several, the first ruling where they overlap; None takes the only one in the store.
-    robot
-        Only runs of this robot; needed where the store holds several.
-    tags
-        Only runs that carry all of these tags.
-    recipe
-        A `Recipe`, a path to one, or None for the one that rules here.
-    jobs
-        Processes that sample side by side; the bytes do not depend on it.
-    cluster
-        Address of a Dask scheduler whose workers sample instead; they see the store under the same absolute path or URL.
-    file_format
-        ``zarr`` or ``parquet``.
-    holdout, seed
-        Instead of the recipe's; ``block``, ``sample``, ``run``, or ``tag:NAME``, which keeps runs of one value of the tag together.
-    keep_split
-        An earlier dataset, which may be ``out`` itself: its samples keep their split and fold, only new ones are drawn.
-    covariates
-        Tables (CSV or Parquet) whose columns are joined to the samples by time, as the recipe's section ``covariates`` says.
-    min_runs
-        Of fewer runs no dataset is built; that so many are enough also makes runs that are left out or gone mere notes, damage aside.
-    redact
-        For the public: everything is moved by one offset that is kept nowhere, and no log, topic, path, host or user is named.
-    force
-        Replace a dataset that was made with other options: another recipe, region, map, robot, format or other tags.
-    dry_run
-        Choose the runs, look whether there is something to do, and estimate what it takes; write nothing.
-
-    Raises
-    ------
-    DatasetError, RegionError, MapError, StoreError, RecipeError, UsageError
-        Nothing is written then.
+    Raises `DatasetError`, `RegionError`, `MapError`, `StoreError`, `RecipeError` or `UsageError`; nothing is written then.
     """
-    watch, ruling = started(), _ruling(recipe, holdout=holdout, seed=seed)
+    watch, ruling = started(), _ruling(options.recipe, holdout=options.holdout, seed=options.seed)
+    out, store, tags, dry_run = options.out, options.store, options.tags or {}, options.dry_run
     place = str(out).rstrip("/") if is_url(out) else local_output(out)
-    opened = open_store(store if cluster is None or is_url(store) else Path(store).absolute())
+    opened = open_store(store if options.cluster is None or is_url(store) else Path(store).absolute())
     if isinstance(place, Path) and not dry_run:
         clear_beside(place)
     known, proved = _card_in_bucket(place) if isinstance(place, str) else _card_in_place(place)
-    regions = None if split is None else read_regions(Path(split))
-    region = None if split is None else Path(split).read_bytes()
-    robot = robot or ruling.robot
+    regions = None if options.split is None else read_regions(Path(options.split))
+    region = None if options.split is None else Path(options.split).read_bytes()
+    robot = options.robot or ruling.robot
+    covariates, map_name, keep_split = options.covariates, options.map_name, options.keep_split
     tables = (covariates,) if isinstance(covariates, str | Path) else tuple(covariates)
     earlier = None if keep_split is None else earlier_splits(keep_split)
     inputs = choose_inputs(
@@ -239,36 +182,36 @@ def build_dataset(
         robot=robot,
         tags=tags,
         region=region,
-        file_format=file_format,
+        file_format=options.file_format,
         earlier=earlier,
         covariates=read_all_covariates([Path(path) for path in tables], ruling.covariates),
     )
-    inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if redact else inputs
+    inputs = replace(inputs, digest=digest(("redacted", inputs.digest))) if options.redact else inputs
     keeps_own = keep_split is not None and _absolute(keep_split) == _absolute(place)
-    options = BuildOptions(ruling, regions, tags or {}, file_format, redact, keep_split is not None, keeps_own)
+    marks = BuildOptions(ruling, regions, tags, options.file_format, options.redact, keep_split is not None, keeps_own)
     left_out = _find_left_out(
         inputs,
         None if known is not None and known.redaction else known,
         robot=robot,
-        tags=tags or {},
-        min_runs=min_runs,
+        tags=tags,
+        min_runs=options.min_runs,
     )
     inputs = replace(inputs, findings=(*left_out, *inputs.findings))
     if proved and known is not None and known.inputs == inputs.digest and _is_all_there(place, known):
         card, result = known, _result(place, "unchanged", known, left_out)
     elif dry_run:
-        _refuse_other_options(place, known, options, inputs, force=force)
+        _refuse_other_options(place, known, marks, inputs, force=options.force)
         if isinstance(place, str):
             refuse_others(open_place(place), CARD)
-        return _planned(place, opened, inputs, jobs=jobs)
+        return _planned(place, opened, inputs, jobs=options.jobs)
     else:
-        _refuse_other_options(place, known, options, inputs, force=force)
+        _refuse_other_options(place, known, marks, inputs, force=options.force)
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
         begun = begun_call(opened, BUILD, [_absolute(place)])
         with (
             begun,
             whole as directory,
-            _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers,
+            _workers(directory, opened, inputs.digest, jobs=options.jobs, cluster=options.cluster) as workers,
         ):
             card = _build(
                 directory,
@@ -276,20 +219,26 @@ def build_dataset(
                 ruling,
                 regions,
                 earlier,
-                file_format=file_format,
+                file_format=options.file_format,
                 workers=workers,
-                redact=redact,
-                tags=options.tags,
+                redact=options.redact,
+                tags=marks.tags,
             )
             _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
         for entry in workers.waiting.entries():
             workers.waiting.delete(entry.name)
         result = _result(place, "done", card, left_out)
     if not dry_run:
-        _remember(opened, watch, result, inputs, jobs, size=sum(of.size_bytes for of in card.checksums.values()))
+        _remember(
+            opened, watch, result, inputs, options.jobs, size=sum(of.size_bytes for of in card.checksums.values())
+        )
         if known is not None and known.inputs != inputs.digest:
             _note(opened, "replaced", DatasetReplaced(_lasting(result), known.inputs))
     return result
+
+
+build_dataset = as_function(BuildDatasetOptions, run_build_dataset)
+"""`tcpipe.build_dataset`: its keywords are the fields of `BuildDatasetOptions`."""
 
 
 def _refuse_other_options(
