@@ -111,7 +111,7 @@ def _of_one(result: IngestResult, store: Path | str, *, several: bool) -> Iterat
         wrong = "damaged" if result.damage else "empty" if problems else ""
         known = f" ({wrong}, known)" if wrong and not result.is_news else ""
         more = f", noise floor of E {100 * budget.total:.1f} %" if several and budget else ""
-        more += f", {result.verdict.worst}" if several and is_new and result.verdict else ""
+        more += f"; {format_verdict(result.verdict)}" if several and is_new and result.verdict else ""
         yield (
             f"{result.status:<10} {result.run_id}/{result.recipe_id}: {result.segments} segments "
             f"from {result.kept_m:.1f} of {result.distance_m:.1f} m, robot {result.robot}{more}{aside or known}"

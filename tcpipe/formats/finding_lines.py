@@ -11,9 +11,9 @@ import numpy as np
 
 from tcpipe.motion.remedies import StoreLoss, loss_code
 from tcpipe.recipe.suggestions import RecipeFragment
-from tcpipe.tables.catalogue import Entry, Severity, rank_severity, read_catalogue
+from tcpipe.tables.catalogue import AFFECTED, Entry, Severity, rank_severity, read_catalogue
 from tcpipe.tables.findings import Finding, Remedy, sort_findings
-from tcpipe.tables.verdicts import Verdict
+from tcpipe.tables.verdicts import GRADES, Verdict
 
 K = TypeVar("K", bound=Hashable)
 
@@ -68,8 +68,8 @@ def format_finding(finding: Finding) -> str:
     """Return a finding as one line: what was observed, its remedies or the catalogue's advice, and its code."""
     entry = read_catalogue().get(finding.code)
     advice = entry.advice if entry else ""
-    remedy = "; ".join(describe_remedy(finding, of) for of in finding.remedies) or advice
-    return f"{describe_finding(finding)}{f'; {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
+    remedy = ". ".join(describe_remedy(finding, of) for of in finding.remedies) or advice
+    return f"{describe_finding(finding)}{f'. {remedy}' if remedy else ''}".rstrip(".") + f" [{finding.code}]"
 
 
 def recipe_lines(finding: Finding) -> list[str]:
@@ -120,10 +120,13 @@ def _count_rest(findings: int, notes: int, more: str) -> list[str]:
 
 
 def format_verdict(verdict: Verdict) -> str:
-    """Return the grades as one line."""
-    if verdict.worst == "usable":
-        return "position, time and energy are usable"
-    return f"position {verdict.position}, time {verdict.time}, energy {verdict.energy}"
+    """Return the grades as one line, the worst first: ``energy not usable; position and time usable with care``."""
+    labels = {grade: [name for name in AFFECTED if getattr(verdict, name) == grade] for grade in reversed(GRADES)}
+    return "; ".join(f"{_join(names)} {grade}" for grade, names in labels.items() if names)
+
+
+def _join(names: Sequence[str]) -> str:
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
 
 
 def format_loss(loss: StoreLoss) -> str:
@@ -182,7 +185,7 @@ def format_group(group: FindingGroup[K], total: int | None, what: str = "runs") 
     subjects = ", ".join(sorted({of.subject.name for of in findings})[:_MOST_SUBJECTS])
     details = "; ".join(filter(None, (subjects, _format_range(read_catalogue().get(group.code), findings))))
     shared = findings[0].remedies if all(of.remedies == findings[0].remedies for of in findings) else ()
-    remedy = "; ".join(describe_remedy(findings[0], of) for of in shared)
+    remedy = ". ".join(describe_remedy(findings[0], of) for of in shared)
     return format_count(group.code, len(group.of), total, what, details, remedy=remedy)
 
 
@@ -193,7 +196,7 @@ def format_count(
     entry = read_catalogue().get(code)
     title = entry.title if entry else code.replace("-", " ")
     head = "" if total is None else f"{count} of {total} {what}: "
-    return f"{head}{title}{f' ({details})' if details else ''}{f'; {remedy}' if remedy else ''} [{code}]"
+    return f"{head}{title}{f' ({details})' if details else ''}{f'. {remedy}' if remedy else ''} [{code}]"
 
 
 def _format_range(entry: Entry | None, findings: Sequence[Finding]) -> str:

@@ -77,7 +77,7 @@ def read_run(log: LogReader, config: ReadConfig, *, robot: str | None, known: Pr
         *power_candidates(log, assignment, config),
         *unread,
         *unplaced,
-        *find_repeats(repeats, averaged=power.averaged),
+        *find_repeats(repeats),
         *assumed,
         *of_pose,
     )

@@ -10,7 +10,6 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
-from tcpipe.cost.quality import is_too_slow, wanted_rate_hz
 from tcpipe.power.repeats import find_readings
 from tcpipe.tables.arrays import texts
 from tcpipe.tables.columns import floats, integers
@@ -79,23 +78,14 @@ def _rate_hz(at_ns: NDArray[np.int64]) -> float:
     return 1e9 / float(np.mean(step_ns[step_ns < 1.5 * np.median(step_ns)]))
 
 
-def find_repeats(repeats: Sequence[Repeats], *, averaged: bool) -> Iterator[Finding]:
-    """Yield the finding that messages repeat readings, by the slowest of them, and one where a current is read too slowly.
-
-    Parameters
-    ----------
-    averaged : whether a reading is the mean since the one before it.
-    """
+def find_repeats(repeats: Sequence[Repeats]) -> Iterator[Finding]:
+    """Yield the finding that messages repeat readings, by the slowest of them; labels tell whether that is too slow."""
     if not repeats:
         return
     slowest = min(repeats, key=lambda of: of.reading_hz)
     names = {of: ", ".join(dict.fromkeys(getattr(each, of) for each in repeats)) for of in ("quantity", "rail")}
     message_hz, reading_hz = slowest.message_hz, slowest.reading_hz
     yield make_finding("power-readings-repeated", _POWER, names=names, message_hz=message_hz, reading_hz=reading_hz)
-    current_hz = min((of.reading_hz for of in repeats if of.quantity == "current"), default=np.inf)
-    if is_too_slow(current_hz, averaged=averaged):
-        wanted_hz, names = wanted_rate_hz(averaged=averaged), {"quantity": "current"}
-        yield make_finding("power-too-slow", _POWER, names=names, rate_hz=current_hz, wanted_hz=wanted_hz)
 
 
 _POWER = Subject("role", "power")

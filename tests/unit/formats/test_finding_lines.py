@@ -45,7 +45,7 @@ def test_numbers_have_the_unit_of_their_suffix_and_three_digits(name, value, tex
 def test_a_line_says_what_was_observed_what_to_do_and_its_code():
     (line,) = format_findings([slow(0.7)])
     observed = "warning: 70 % of the moving track was commanded below 0.95 m/s; the top command was 0.6 m/s"
-    assert line == f"{observed}; To accept any speed: [gate] require_full_speed = false [driven-below-limit]"
+    assert line == f"{observed}. To accept any speed: [gate] require_full_speed = false [driven-below-limit]"
 
 
 def test_the_worst_comes_first_at_most_eight_and_notes_are_counted_apart():
@@ -75,7 +75,10 @@ def test_findings_of_several_runs_are_one_line_a_code():
     ]  # fmt: skip
     assert format_group(groups[0], 3).startswith("c: no segments from 12 m driven")
     title = "Most of the drive was commanded below the robot's maximum speed"
-    assert format_group(groups[1], 3) == f"2 of 3 runs: {title} (command; 60 % to 70 %) [driven-below-limit]"
+    assert (
+        format_group(groups[1], 3)
+        == f"2 of 3 runs: {title} (command; 60 % to 70 %). To accept any speed: [gate] require_full_speed = false [driven-below-limit]"
+    )
     assert format_groups(groups, 3, more="tcpipe report STORE")[-1] == "and 1 note: tcpipe report STORE"
 
 
@@ -87,8 +90,8 @@ def test_a_finding_of_another_version_or_redacted_is_a_line_all_the_same():
 
 
 def test_a_verdict_is_one_line_and_judged_again_by_another_catalogue():
-    assert format_verdict(Verdict()) == "position, time and energy are usable"
-    assert format_verdict(judge([slow(0.7)])) == "position usable, time usable with care, energy usable"
+    assert format_verdict(Verdict()) == "position, time and energy usable"
+    assert format_verdict(judge([slow(0.7)])) == "time usable with care; position and energy usable"
     old = Verdict(catalogue="another")
     assert judge_again(old, [EMPTY]) == judge([EMPTY])
     assert judge_again(Verdict(), [EMPTY]) == Verdict()
