@@ -3,47 +3,49 @@
 from __future__ import annotations
 
 import logging
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, closing, nullcontext
-from dataclasses import dataclass, field, replace
-from functools import partial
+from contextlib import AbstractContextManager, closing, nullcontext
+from dataclasses import dataclass, field, fields, replace
 from itertools import chain
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.index_files import forget_runs
+from tcpipe.formats.commit_log import keep_state_here
+from tcpipe.formats.commits import Call, Entries, Failure, State, Superseded
 from tcpipe.formats.object_storage import is_presigned, is_url
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
-from tcpipe.formats.record_files import Call
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.store_mark import gone_if_empty
-from tcpipe.pipeline.begun_calls import begun_call
-from tcpipe.pipeline.calls import INGEST, remember_call, room_of, started
-from tcpipe.pipeline.ingest_run import as_indexed, ingest_one, made_before
-from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, told, too_young
-from tcpipe.pipeline.known_runs import KnownRuns, known_runs
-from tcpipe.pipeline.known_trouble import Trouble, trouble_of_run
+from tcpipe.pipeline.begun_calls import begun_call, new_call, settled_calls
+from tcpipe.pipeline.calls import INGEST, measure_call, room_of, started
+from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
+from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, result_of, too_young
 from tcpipe.pipeline.log_sources import (
-    FoundLogs,
     LogSource,
     definitions_key,
     find_sources,
     in_shard,
     in_turns,
+    remembered,
     with_hashes,
 )
-from tcpipe.pipeline.supersession import remember_earlier, superseded_by
+from tcpipe.pipeline.log_writer import LogWriter, open_log
+from tcpipe.pipeline.plan import Step, plan
+from tcpipe.pipeline.problems import failure_of, is_acknowledged, problems_of
+from tcpipe.pipeline.supersession import superseded_by
 from tcpipe.recipe import Recipe
-from tcpipe.store import Store, add_by_hash, open_store
-
-R = TypeVar("R")
+from tcpipe.store import Store, open_store
 
 logger = logging.getLogger("tcpipe")
+
+_TOGETHER_S = 1.0
+"""What ends within so long is one commit."""
 
 _NO_LOGS = "no logs given; wanted .mcap, .bag or .db3 files, ROS 2 bag directories, or folders of them or of tables"
 
@@ -136,16 +138,15 @@ def ingest(
     robot = robot or ruling.robot
     if robot is not None and robot not in (robots := profiles_of(ruling).robots):
         raise UsageError(f"robot {robot!r} is not known; known: {', '.join(sorted(robots))}")
-    with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store), ExitStack() as until_it_ends:
+    with _place_for_stand_ins(logs := list(logs)) as staging, gone_if_empty(store):
         found = find_sources(logs, as_one=as_one, staging=staging, tables=ruling.tables)
         if not found.sources:
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(store, create=True)
-        given = tuple(str(log) if is_url(log) else str(Path(log).absolute()) for log in logs if not is_presigned(log))
-        options = (ingest_key(ruling), robot, shard)
-        until_it_ends.enter_context(begun_call(opened, INGEST, given, options=options))
-        remember_earlier(opened)
-        known = known_runs(opened, force=force)
+        log = open_log(opened)
+        before = log.state.number
+        given = tuple(str(of) if is_url(of) else str(Path(of).absolute()) for of in logs if not is_presigned(of))
+        begin = (INGEST, given, (ingest_key(ruling), robot, shard))
         mine = found.sources if shard is None else in_shard(found.sources, shard)
         root = opened.root
         if cluster is not None:  # its workers are elsewhere
@@ -153,23 +154,42 @@ def ingest(
             message_definitions = None if message_definitions is None else message_definitions.absolute()
         common = (root, ruling, robot, dict(tags or {}), force, message_definitions)
         how = (definitions_key(message_definitions), retry_failed, min_age_s)
-        sources = with_hashes(mine, lambda lineage: known.seen.get(lineage, ()))
-        tasks = [IngestTask(source, *common, *how) for source in sources]
+        seen = {} if force else log.state.seen
+        tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *common, *how) for source in mine]
         if on_found:
             sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
             on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
-        results = {}
-        for index, source, result in _results(opened, tasks, found, known, jobs=jobs, cluster=cluster):
+        steps, results = plan(tasks, log.state, broken=find_broken(opened, log.state)), {}
+
+        def tell(index: int, result: IngestResult) -> None:
             results[index] = result
             if on_result:
                 on_result(result)
-            if source is not None:
-                _remember(opened, tasks[index], source, result, known)
-        _keep_index(opened, known, results.values())
-        summary = IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
-        if any(result.run_id for result in summary.results):  # else no store may remain
-            remember_call(opened, watch, _call_of(opened, summary, given, tasks, jobs))
+
+        for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
+            tell(index, IngestResult(plain_line(path), "failed", problems=lines, transient=True))
+        for index, step in enumerate(steps):
+            if not step.is_todo:
+                tell(index, _result_without_work(log, step))
+        todo = [index for index, step in enumerate(steps) if step.is_todo]
+        summary = IngestSummary(opened.root)
+        if todo:
+            with begun_call(log, *begin[:2], options=begin[2]) as call:
+                for index, result in _results(log, [tasks[index] for index in todo], jobs=jobs, cluster=cluster):
+                    tell(todo[index], result)
+                summary = replace(summary, results=tuple(results[index] for index in sorted(results)))
+                call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, jobs)),))
+        else:
+            summary = replace(summary, results=tuple(results[index] for index in sorted(results)))
+            log.commit("ended", Entries(ended=tuple(settled_calls(log.state, new_call(*begin)))))
+        if log.state.number != before and log.state.runs:
+            opened.write_index(log.state)
         return summary
+
+
+def find_broken(store: Store, state: State) -> set[tuple[str, str]]:
+    """Return the runs and recipes of which a file is gone; in a bucket nobody looks, as that takes a request for every thousand files."""
+    return set() if isinstance(store.root, str) else set(store.ingestions(state=state).lost)
 
 
 def _call_of(
@@ -191,103 +211,107 @@ def _call_of(
     )
 
 
-def _keep_index(store: Store, known: KnownRuns, results: Iterable[IngestResult]) -> None:
-    """Write the index, with what this call made."""
-    results = list(results)
-    mended = {result.run_id for result in results if result.run_id} & {run_id for run_id, _ in known.runs.lost}
-    if mended:
-        forget_runs(store.index_place, mended)
-    if not mended and all(result.status in ("unchanged", "waiting") for result in results):
-        store.keep_index(known.runs)
-    elif known.runs.rows or any(result.run_id for result in results):
-        store.keep_index(store.ingestions())
-        store.seen_logs()
+def _result_without_work(log: LogWriter, step: Step) -> IngestResult:
+    """Return the result of a log that is in the store, is known to fail, or has to wait."""
+    source, made = step.task.source, step.made
+    if step.failure is not None:
+        known = {"known": True, "accepted": step.standing == "quarantined"}
+        return IngestResult(source.name, "failed", problems=step.failure.problems, sha256=source.sha256, **known)
+    if made is None:
+        return too_young(step.task) or IngestResult(source.name, "waiting")
+    result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
+    if made.run_id in log.state.parties:
+        superseded, notes = superseded_by(log.store, log.state, source, made.run_id, str(source.sha256))
+        log.commit("superseded", Entries(superseded=tuple(superseded)))
+        result = replace(result, notes=(*result.notes, *notes))
+    return _judged(log.state, result, source, before=log.state)
 
 
 def _results(
-    store: Store, tasks: Sequence[IngestTask], found: FoundLogs, known: KnownRuns, *, jobs: int, cluster: str | None
-) -> Iterator[tuple[int, LogSource | None, IngestResult]]:
-    """Yield what became of each path that holds no log, and of each log as it ends, by its place; what needs no work is told first."""
-    for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
-        yield index, None, IngestResult(plain_line(path), "failed", problems=lines, transient=True)
-    runs = store.run_ids_by_hash()
-    for turn in in_turns([task.source for task in tasks]):
-        todo = []
-        for index in turn:
-            result = told(tasks[index], partial(_without_work, store=store, known=known, runs=runs))
-            if result is None:
-                todo.append(index)
-            else:
-                yield index, tasks[index].source, _judged(store, tasks[index].source, result, runs, known)
-        with closing(run_all(ingest_one, [tasks[index] for index in todo], jobs=jobs, cluster=cluster)) as outcomes:
+    log: LogWriter, tasks: Sequence[IngestTask], *, jobs: int, cluster: str | None
+) -> Iterator[tuple[int, IngestResult]]:
+    """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
+    hashed = with_hashes([task.source for task in tasks])
+    tasks = [replace(task, source=source) for task, source in zip(tasks, hashed, strict=True)]
+    keep_state_here(log.store.place, log.state)
+    for turn in in_turns(hashed):
+        waiting, last_s = list[tuple[int, Ingested]](), 0.0
+        with closing(run_all(ingest_one, [tasks[index] for index in turn], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                task = tasks[todo[outcome.index]]
-                source, result = outcome.result or (task.source, died(task.source))
-                yield todo[outcome.index], source, _judged(store, source, result, runs, known)
+                index = turn[outcome.index]
+                waiting.append((index, outcome.result or Ingested(tasks[index].source, died(tasks[index].source))))
+                if time.monotonic() - last_s >= _TOGETHER_S:
+                    yield from _commit(log, tasks, waiting)
+                    waiting, last_s = [], time.monotonic()
+        yield from _commit(log, tasks, waiting)
 
 
-def _without_work(
-    task: IngestTask, *, store: Store, known: KnownRuns, runs: Mapping[str, Sequence[str]]
-) -> IngestResult | None:
-    """Return the result of a log that is in the store, is known to fail, or has to wait; None where there is something to do."""
-    source, sha256 = task.source, None if task.force else task.source.sha256
-    if sha256 and (made := as_indexed(task, known.made.get(sha256, ()), sha256)):
-        return made
-    run_id = store.run_of(sha256, runs) if sha256 else None
-    if run_id and (made := made_before(store, run_id, task, str(source.sha256))):
-        return made
-    again = task.force or task.retry_failed or task.failure not in known.failed
-    failed = None if again else store.recall(task.failure, Trouble)
-    if failed is not None:
-        return IngestResult(source.name, "failed", problems=failed.lines, sha256=source.sha256, known=True)
-    return too_young(task)
+def _commit(
+    log: LogWriter, tasks: Sequence[IngestTask], ended: Sequence[tuple[int, Ingested]]
+) -> Iterator[tuple[int, IngestResult]]:
+    """Commit what became of logs, and yield it with what the log says of it."""
+    before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
+    for index, of in ended:
+        more, notes[index] = _entries_of(log, tasks[index], of)
+        entries = Entries(*((*getattr(entries, name.name), *getattr(more, name.name)) for name in fields(Entries)))
+    others = dict[str, str]()
 
+    def make(state: State) -> Entries:
+        """Return what is to be added; of two calls that gave one recording two names the first wins."""
+        others.clear()
+        for row in entries.runs:
+            named = state.run_of(row.log.source.sha256) if row.log else None
+            others.update({} if named in (None, row.run_id) else {row.run_id: named})
+        return replace(entries, runs=tuple(row for row in entries.runs if row.run_id not in others))
 
-def _judged(
-    store: Store, source: LogSource, result: IngestResult, runs: dict[str, list[str]], known: KnownRuns
-) -> IngestResult:
-    """Return a result with what the store says of it: whether its trouble is news, and which runs it supersedes."""
-    notes = result.notes
-    if result.run_id and result.sha256 and not _is_settled(source, result, known):
-        if store.run_of(result.sha256, runs) is None:
-            add_by_hash(runs, result.run_id)
-        try:
-            notes += tuple(superseded_by(store, source, result.run_id, result.sha256, runs))
-        except StoreError as error:
-            notes += error.problems
-    trouble = _trouble(source, result)
-    if trouble is None:
-        return result if notes == result.notes else replace(result, notes=notes)
-    told_before = result.known or (trouble.kind != "failed" and trouble.is_told(store))
-    return replace(result, notes=notes, known=told_before, accepted=trouble.is_accepted(store))
-
-
-def _is_settled(source: LogSource, result: IngestResult, known: KnownRuns) -> bool:
-    """Tell whether a log is as it was, and its run has no part in what supersedes what."""
-    unchanged = result.status == "unchanged" and result.run_id not in known.parties
-    return unchanged and result.sha256 is not None and known.has_seen(source, result.sha256)
-
-
-def _trouble(source: LogSource, result: IngestResult) -> Trouble | None:
-    content = result.sha256 or source.files_digest
-    if result.status == "failed":
-        return Trouble(content, result.problems, source.origins, kind="failed")
-    return trouble_of_run(result.run_id, result.why_empty, result.damage, content=content, log=source.origins)
-
-
-def _remember(store: Store, task: IngestTask, source: LogSource, result: IngestResult, known: KnownRuns) -> None:
-    """Remember what a log holds, and what is wrong with that; where it cannot be written it is told again the next time."""
-    trouble = _trouble(source, result)
     try:
-        if result.sha256 and source.files and not known.has_seen(source, result.sha256):
-            store.note(source.lineage, source.sighting(result.sha256))
-        if trouble is not None and trouble.kind != "failed":
-            trouble.told(store)
-        elif trouble is not None and not result.transient and not result.known:
-            task = replace(task, source=replace(source, sha256=result.sha256))
-            store.remember(task.failure, replace(trouble, version=__version__))
+        kind = "ingested" if entries.runs else "failed" if entries.failed else "seen"
+        log.commit(kind, make)
     except StoreError as error:
+        if entries.runs:
+            raise
         logger.error("%s", error)  # noqa: TRY400  one line
+    keep_state_here(log.store.place, log.state)
+    for index, of in ended:
+        result = replace(of.result, notes=(*of.result.notes, *notes[index]))
+        if by := others.get(str(result.run_id)):
+            problem = (
+                f"{result.log}: another call ingested the same recording as run {by} at the same time; run it again"
+            )
+            result = IngestResult(result.log, "failed", problems=(problem,), sha256=result.sha256, transient=True)
+        yield index, _judged(log.state, result, of.source, before=before)
+
+
+def _entries_of(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries, tuple[str, ...]]:
+    """Return what a commit has of the result of a log, and what is to be said of runs that it supersedes."""
+    source, result, superseded, notes = of.source, of.result, tuple[Superseded, ...](), tuple[str, ...]()
+    sha256 = result.sha256
+    new = sha256 is not None and bool(source.files) and not log.state.has_seen(source.sighting(sha256))
+    if result.run_id and sha256 and (new or result.status != "unchanged" or result.run_id in log.state.parties):
+        try:
+            superseded, notes = superseded_by(log.store, log.state, source, result.run_id, sha256)
+        except StoreError as error:
+            notes = error.problems
+    failed = tuple[Failure, ...]()
+    if result.status == "failed" and not result.transient:
+        task = replace(task, source=replace(source, sha256=sha256))
+        content = sha256 or source.files_digest
+        failed = (Failure(task.failure_key, content, source.origins, result.problems, __version__),)
+    seen = (source.sighting(sha256),) if new and sha256 else ()
+    return Entries(seen=seen, runs=of.rows, failed=failed, superseded=tuple(superseded)), tuple(notes)
+
+
+def _judged(state: State, result: IngestResult, source: LogSource, *, before: State) -> IngestResult:
+    """Return a result with whether its problems were known before, and are acknowledged."""
+    if result.status == "failed":
+        problem = failure_of(result.sha256 or source.files_digest, source.origins)
+        return replace(result, accepted=result.accepted or is_acknowledged([problem], state))
+    if not (result.damage or result.why_empty):
+        return result
+    row = state.runs[str(result.run_id), str(result.recipe_id)]
+    problems = problems_of(row)
+    told = {of.key for old in before.runs.values() if old.run_id == row.run_id for of in problems_of(old)}
+    return replace(result, known=all(of.key in told for of in problems), accepted=is_acknowledged(problems, state))
 
 
 def _place_for_stand_ins(logs: Iterable[str | Path]) -> AbstractContextManager[Path]:

@@ -17,6 +17,7 @@ from tcpipe.cost.budget import in_words
 from tcpipe.errors import DatasetError, RecipeError, StoreError, UsageError, plain_lines
 from tcpipe.formats.atomic import atomic_directory, clear_beside, write_text
 from tcpipe.formats.bucket import open_place
+from tcpipe.formats.commits import Call, Dataset, Entries
 from tcpipe.formats.croissant import croissant
 from tcpipe.formats.dataset_card import DatasetCard, Doubtful, Redacted, RunFinding
 from tcpipe.formats.dataset_files import (
@@ -45,11 +46,10 @@ from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.places import local_output
 from tcpipe.formats.published import has_card, here_by_range, published, refuse_others, settle
 from tcpipe.formats.recipe_toml import recipe_of
-from tcpipe.formats.record_files import Call, DatasetMade, DatasetReplaced
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
-from tcpipe.pipeline.begun_calls import begun_call
-from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, latest_calls, remember_call, started
+from tcpipe.pipeline.begun_calls import OpenCall, begun_call
+from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, measure_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
@@ -70,6 +70,7 @@ from tcpipe.pipeline.dataset.sampling import Workers
 from tcpipe.pipeline.dataset.segments import KEPT
 from tcpipe.pipeline.dataset.splitting import empty_splits
 from tcpipe.pipeline.dataset.writing import write_patches
+from tcpipe.pipeline.log_writer import LogWriter, open_log
 from tcpipe.recipe import Recipe
 from tcpipe.report.dataset_report import dataset_report
 from tcpipe.report.overview import class_overview, maps_overview, relief_overview, write_overview
@@ -247,31 +248,26 @@ def build_dataset(
     else:
         _refuse_other_options(place, known, options, inputs, force=force)
         whole = published(place, CARD) if isinstance(place, str) else atomic_directory(place.absolute())
-        begun = begun_call(opened, BUILD, [_absolute(place)])
-        with (
-            begun,
-            whole as directory,
-            _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers,
-        ):
-            card = _build(
-                directory,
-                inputs,
-                ruling,
-                regions,
-                earlier,
-                file_format=file_format,
-                workers=workers,
-                redact=redact,
-                tags=options.tags,
-            )
-            _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
-        for entry in workers.waiting.entries():
-            workers.waiting.delete(entry.name)
-        result = _result(place, "done", card, problems)
-    if not dry_run:
-        _remember(opened, watch, result, inputs, jobs, size=sum(of.size_bytes for of in card.checksums.values()))
-        if known is not None and known.inputs != inputs.digest:
-            _note(opened, "replaced", DatasetReplaced(_lasting(result), known.inputs))
+        with begun_call(open_log(opened), BUILD, [_absolute(place)]) as call:
+            with whole as directory, _workers(directory, opened, inputs.digest, jobs=jobs, cluster=cluster) as workers:
+                card = _build(
+                    directory,
+                    inputs,
+                    ruling,
+                    regions,
+                    earlier,
+                    file_format=file_format,
+                    workers=workers,
+                    redact=redact,
+                    tags=options.tags,
+                )
+                _refuse_others_since(place, {known.inputs if known else None, inputs.digest})
+            for entry in workers.waiting.entries():
+                workers.waiting.delete(entry.name)
+            result = _result(place, "done", card, problems)
+            _end(call, watch, result, inputs, known, jobs, size=sum(of.size_bytes for of in card.checksums.values()))
+    if result.status == "unchanged":
+        _refer(open_log(opened), _dataset_of(result, inputs))
     return result
 
 
@@ -299,27 +295,46 @@ def _refuse_others_since(place: Path | str, expected: Container[str | None]) -> 
 def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> BuildResult:
     """Return what is to be expected of a build."""
     most = sum(run.facts.segments - int(inputs.again[run.run_id].sum()) for run in inputs.runs)
-    expected = estimate(latest_calls(store), BUILD, most, jobs=jobs)
+    expected = estimate(store.state().calls, BUILD, most, jobs=jobs)
     code, told = 3 if inputs.problems else 0, (inputs.warnings, inputs.problems)
     return BuildResult(str(place), "planned", most, {}, {}, (), *told, exit_code=code, estimate=expected)
 
 
-def _remember(store: Store, watch: Stopwatch, result: BuildResult, inputs: Inputs, jobs: int, *, size: int) -> None:
-    """Leave a record in the store of the dataset, for what it refers to stays, and one of the call."""
-    runs = tuple((run.run_id, run.recipe_id) for run in inputs.runs)
-    _note(store, "datasets", DatasetMade(_lasting(result), inputs.digest, runs))
-    counts, written = {"runs": len(inputs.runs), "samples": 0, "unchanged": 1}, 0
-    if result.status == "done":
-        counts, written = counts | {"samples": result.samples, "unchanged": 0}, size
-    call = Call(BUILD, __version__, result.exit_code, counts, jobs, written_bytes=written)
-    remember_call(store, watch, call)
+def _end(
+    opened: OpenCall,
+    watch: Stopwatch,
+    result: BuildResult,
+    inputs: Inputs,
+    known: DatasetCard | None,
+    jobs: int,
+    *,
+    size: int,
+) -> None:
+    """Let the last commit of the call say which dataset was built, for what it refers to stays, and what the call took."""
+    call = Call(
+        BUILD,
+        __version__,
+        result.exit_code,
+        {"runs": len(inputs.runs), "samples": result.samples},
+        jobs,
+        written_bytes=size,
+    )
+    before = () if known is None or known.inputs == inputs.digest else (Dataset(_lasting(result), known.inputs),)
+    opened.kind = "built"
+    opened.end = Entries(datasets=(_dataset_of(result, inputs),), forgotten=before, calls=(measure_call(watch, call),))
 
 
-def _note(store: Store, kind: str, fact: DatasetMade | DatasetReplaced) -> None:
-    try:
-        store.note(kind, fact)
-    except StoreError as error:
-        logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
+def _dataset_of(result: BuildResult, inputs: Inputs) -> Dataset:
+    return Dataset(_lasting(result), inputs.digest, tuple((run.run_id, run.recipe_id) for run in inputs.runs))
+
+
+def _refer(log: LogWriter, dataset: Dataset) -> None:
+    """Commit what a dataset refers to that was built before, where the log does not say so."""
+    if log.state.datasets.get((dataset.out, dataset.inputs)) != dataset:
+        try:
+            log.commit("built", Entries(datasets=(dataset,)))
+        except StoreError as error:
+            logger.warning("%s; so 'tcpipe prune' does not know what this dataset refers to", error.problems[0])
 
 
 def _lasting(result: BuildResult) -> str:

@@ -8,13 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcpipe.errors import DatasetError, StoreError
+from tcpipe.errors import DatasetError
 from tcpipe.formats.dataset_card import RunSource
 from tcpipe.formats.index_files import RunFacts
 from tcpipe.formats.recipe_toml import ingest_key
-from tcpipe.formats.run_documents import LogOrigin, ManifestHead, RunJson
+from tcpipe.formats.run_documents import LogOrigin
 from tcpipe.formats.stored_runs import Ingestions, RunDirectory
-from tcpipe.pipeline.known_runs import list_runs
 from tcpipe.pipeline.unknown_robots import alike, in_words
 from tcpipe.recipe import Recipe
 from tcpipe.robots.profiles import GENERIC
@@ -40,18 +39,15 @@ class Chosen:
 
 def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mapping[str, str]) -> Chosen:
     """Return the runs to pool, those that carry all of the tags, each proved; two robots are never pooled unasked."""
-    found, key = list_runs(store), ingest_key(recipe)
-    store.keep_index(found)
+    found, key = store.ingestions(), ingest_key(recipe)
     mine = [run for run in found.finished if run.facts.ingest_key == key]
     if not mine:
         raise DatasetError(*_nothing_to_pool(store, found))
     runs, logs, damaged = _proved(store, _of_one_robot(store, _tagged(store, mine, tags), robot))
     known = {run.run_id for run in mine}
-    there, lost = set(store.run_ids()), {run_id: row for (run_id, _), row in found.lost.items()}
-    gone = dict[str, str]()
-    for (run_id, _), line in found.damaged.items():
-        if run_id not in known and _belongs(_known(store, run_id) or lost.get(run_id), robot, tags):
-            (damaged if run_id in there else gone).setdefault(run_id, line)
+    for (run_id, recipe_id), line in found.damaged.items():
+        if run_id not in known and _belongs(found.rows[run_id, recipe_id], robot, tags):
+            damaged.setdefault(run_id, line)
     lines = tuple(
         f"run {run_id}: left out: {line}; ingest its log again with --force" for run_id, line in damaged.items()
     )
@@ -59,21 +55,19 @@ def choose_runs(store: Store, recipe: Recipe, *, robot: str | None, tags: Mappin
         raise DatasetError(*lines)
     if robot is None:
         _refuse_unlike(store, [run for run in runs if run.facts.robot == GENERIC])
-    settled = {*known, *damaged, *gone}
+    settled = {*known, *damaged}
     others = {run.run_id: run.recipe_id for run in found.finished if _belongs(run.facts, robot, tags)}
     older = {name: str(of.data_model_version) for name, of in found.outdated.items() if _belongs(of, robot, tags)}
     others, older = ({name: of for name, of in each.items() if name not in settled} for each in (others, older))
-    left_out = {*damaged, *gone, *others, *older}
+    left_out = {*damaged, *others, *older}
     total = len({run.run_id for run in runs} | left_out)
-    missing = (*dict.fromkeys(gone.values()), *_missing(store, others, older, total))
+    missing = tuple(_missing(found, others, older, total))
     warnings = tuple(_remarks(found))
     return Chosen(tuple(runs), logs, missing, lines, frozenset(left_out | found.superseded.keys()), warnings)
 
 
 def _remarks(found: Ingestions) -> Iterator[str]:
-    """Yield a line about runs that have not finished, and about those that others have taken the place of."""
-    if found.unfinished:
-        yield f"no ingestion of {_named(found.unfinished)} has finished: it is being ingested, or its log failed"
+    """Yield a line about runs that others have taken the place of."""
     if found.superseded:
         yield f"superseded, since their logs were completed or repaired: {_named(found.superseded)}; left out"
 
@@ -140,30 +134,19 @@ def _proved(
     return [run for run in runs if run.run_id in logs], logs, damaged
 
 
-def _missing(store: Store, by_recipe: Mapping[str, str], by_version: Mapping[str, str], total: int) -> list[str]:
+def _missing(found: Ingestions, by_recipe: Mapping[str, str], by_version: Mapping[str, str], total: int) -> list[str]:
     """Return a line for each reason why runs that belong in have no ingestion that could be used."""
     return [
         f"{len(of)} of {total} runs have no ingestion {what} (they have {', '.join(sorted(set(of.values())))}): {_named(of)}; "
-        f"ingest their logs again: tcpipe ingest {_logs_of(store, of)}"
+        f"ingest their logs again: tcpipe ingest {_logs_of(found, of)}"
         for what, of in (("under this recipe", by_recipe), (f"of data model {DATA_MODEL_VERSION}", by_version))
         if of
     ]
 
 
-def _known(store: Store, run_id: str) -> RunJson | None:
-    """Return what run.json says, None where it cannot be believed."""
-    with suppress(StoreError):
-        return store.run_json(run_id)
-    return None
-
-
-def _belongs(
-    known: RunJson | RunFacts | ManifestHead | RunSource | None, robot: str | None, tags: Mapping[str, str]
-) -> bool:
+def _belongs(known: RunFacts | RunSource, robot: str | None, tags: Mapping[str, str]) -> bool:
     """Tell whether a run is of the robot and the tags that were asked for, as far as is known."""
-    if known is None:
-        return True
-    its_robot = robot is None or known.robot is None or known.robot == robot
+    its_robot = robot is None or known.robot == robot
     return its_robot and (known.tags is None or tags.items() <= known.tags.items())
 
 
@@ -173,9 +156,11 @@ def _named(run_ids: Iterable[str], most: int = 3) -> str:
     return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
-def _logs_of(store: Store, run_ids: Iterable[str]) -> str:
+def _logs_of(found: Ingestions, run_ids: Iterable[str]) -> str:
     """Return what to give to `tcpipe ingest` for the logs of runs: their folder, where they have one in common."""
-    paths = [path for run_id in run_ids if (known := _known(store, run_id)) for path in known.source.paths]
+    names = set(run_ids)
+    logs = [row.log.source for row in found.rows.values() if row.log and row.run_id in names]
+    paths = [path for log in logs for path in log.paths]
     with suppress(ValueError):  # no path, or some relative and some not
         folder = Path(os.path.commonpath(paths))
         if folder.is_absolute() and folder != Path(folder.anchor):

@@ -1,0 +1,128 @@
+"""Problems of runs, logs and calls: what causes exit code 3 until a person acknowledges it, identified by code and content, never by text."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcpipe.errors import UsageError
+from tcpipe.formats.atomic import scratch_directory
+from tcpipe.formats.commits import Entries, Problem, State, lineage_of
+from tcpipe.formats.index_files import RunFacts
+from tcpipe.pipeline.begun_calls import begun_calls
+from tcpipe.pipeline.log_sources import LogSource, find_sources
+from tcpipe.pipeline.log_writer import LogWriter
+from tcpipe.store import open_store
+from tcpipe.tables.findings import Finding, Subject, make_finding
+
+_MOST_CANDIDATES = 10
+
+
+@dataclass(frozen=True, slots=True)
+class Acknowledged:
+    """Problems that are acknowledged now, and those that were before."""
+
+    acknowledged: tuple[Problem, ...]
+    before: tuple[Problem, ...]
+
+
+def problems_of(row: RunFacts) -> tuple[Problem, ...]:
+    """Return what is wrong with a run: damage of its log, or that it has no segments."""
+    codes = [code for code, holds in (("log-damaged", row.damage), ("no-segments", row.why_empty)) if holds]
+    log = row.log.source if row.log else None
+    return tuple(
+        Problem(Finding(code, "error", Subject("run", row.run_id), "kept"), log.sha256, log.paths, row.run_id)
+        for code in codes
+        if log
+    )
+
+
+def failure_of(content: str, log: tuple[str, ...]) -> Problem:
+    """Return the problem that a log failed because of its content."""
+    return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
+
+
+def waiting_of(source: LogSource, state: str) -> Problem:
+    """Return the problem that a log lies there and no call takes it in; that of other content, written since, is another."""
+    finding = make_finding("log-waiting", Subject("log", source.name), names={"state": state})
+    return Problem(finding, source.files_digest, source.origins)
+
+
+def is_acknowledged(problems: Sequence[Problem], state: State) -> bool:
+    """Return whether a person has acknowledged all of some problems."""
+    return bool(problems) and all(problem.key in state.acknowledged for problem in problems)
+
+
+def known_problems(state: State) -> Iterator[Problem]:
+    """Yield the problems that the log of a store has: of logs and runs, of killed calls, and of commits."""
+    for failure in state.failed.values():
+        yield failure_of(failure.content, failure.log)
+    for row in state.runs.values():
+        yield from problems_of(row) if row.damage or not row.segments else ()
+    yield from (call.problem for call in begun_calls(state) if call.state == "killed")
+    yield from state.problems
+
+
+def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Acknowledged:
+    """Acknowledge the problems of runs, logs and killed calls: they cause no exit code 3 any more, until the content is another.
+
+    Parameters
+    ----------
+    names : runs by their id, logs by path, URL or, where that is enough, file name; killed calls and commits by the name that `status` says.
+    store : the store that knows the problems.
+
+    Raises
+    ------
+    StoreError : there is no store, or it cannot be written.
+    UsageError : a name is none of a run or log with a problem, or of several logs; nothing was acknowledged then.
+    """
+    opened = open_store(store)
+    log = LogWriter(opened, state := opened.state())
+    known = {problem.key: problem for problem in known_problems(state)}
+    chosen, wrong = dict[str, Problem](), list[str]()
+    for name in dict.fromkeys(names):
+        found = _named(name, known.values(), state) or _waiting(name, state)
+        if len({problem.name for problem in found}) == 1:
+            chosen |= {problem.key: problem for problem in found}
+        else:
+            wrong.append(
+                _not_one(
+                    name, found, [of for of in known.values() if of.key not in state.acknowledged], state, opened.root
+                )
+            )
+    if wrong:
+        raise UsageError(*wrong)
+    now = tuple(problem for key, problem in chosen.items() if key not in state.acknowledged)
+    log.commit("acknowledged", Entries(acknowledged=now))
+    return Acknowledged(now, tuple(problem for problem in chosen.values() if problem not in now))
+
+
+def _named(name: str, known: Iterable[Problem], state: State) -> list[Problem]:
+    paths = {name, str(Path(name).absolute()), str(Path(name).resolve())}
+    contents = {sighting.sha256 for path in paths for sighting in state.seen.get(lineage_of((path,)), ())}
+    known = list(known)
+    exact = [of for of in known if of.content in contents or paths & {of.name, " + ".join(of.log), *of.log}]
+    return exact or [of for of in known if name in {Path(origin).name for origin in of.log}]
+
+
+def _waiting(name: str, state: State) -> list[Problem]:
+    """Return the problem of a log by its path or URL that the store does not hold: nobody wants to be told that it waits."""
+    with scratch_directory() as staging:
+        sources = find_sources([name], as_one=False, staging=staging).sources
+    return [waiting_of(source, "pending") for source in sources if source.lineage not in state.seen]
+
+
+def _not_one(name: str, found: Sequence[Problem], candidates: Sequence[Problem], state: State, root: object) -> str:
+    if found:
+        return f"{name}: {len(found)} logs have this name; give the path of one: {_listed(found)}"
+    if state.rows_of(name):
+        return f"{name}: this run has no known problem; there is nothing to acknowledge"
+    listed = f"known problems: {_listed(candidates)}" if candidates else "there are no known problems"
+    return f"{name}: is no run or log with a known problem in {root}; {listed}"
+
+
+def _listed(problems: Sequence[Problem]) -> str:
+    names = sorted({problem.name for problem in problems})
+    more = f" and {len(names) - _MOST_CANDIDATES} more" if len(names) > _MOST_CANDIDATES else ""
+    return ", ".join(names[:_MOST_CANDIDATES]) + more
