@@ -80,16 +80,17 @@ def refresh(store: Place, state: State) -> State:
     numbers = sorted(number for number in found if number > state.number)
     for number, result in zip(numbers, side_by_side(log.where(), lambda n: _try(log, n), numbers), strict=True):
         missing = [_problem("commit-missing", log, absent) for absent in range(state.number + 1, number)]
+        if missing:
+            state = replace(state, digest="", problems=(*state.problems, *missing))
         if isinstance(result, StoreError):
             state = replace(
                 state,
                 number=number,
                 digest="",
-                problems=(*state.problems, *missing, _problem("commit-damaged", log, number)),
+                problems=(*state.problems, _problem("commit-damaged", log, number)),
             )
             continue
         state = _follow(state, result, log)
-        state = replace(state, problems=(*state.problems, *missing)) if missing else state
     return state
 
 
