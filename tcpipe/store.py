@@ -178,7 +178,7 @@ class Store:
         state = self.state() if state is None else state
         rows = {key: state.runs[key] for key in sorted(state.runs) if run_id in (None, key[0])}
         finished, lost, outdated = list[RunDirectory](), dict[tuple[str, str], Lost](), dict[str, RunFacts]()
-        for row, gone, files_state in look_at_files(self.runs_place, rows.values()):
+        for row, gone, files_state in look_at_files(runs := self.runs_place, rows.values()):
             if run_id is None and row.superseded_by:
                 continue
             if gone is not None:
@@ -186,8 +186,7 @@ class Store:
             elif row.data_model_version not in READ_VERSIONS:
                 outdated[row.run_id] = row
             else:
-                place = self.runs_place.below(f"{row.run_id}/{row.recipe_id}")
-                finished.append(RunDirectory(row.run_id, row.recipe_id, place, row, files_state))
+                finished.append(RunDirectory(row.run_id, row.recipe_id, runs, row, files_state))
         current = {run.run_id for run in finished}
         outdated = {name: row for name, row in outdated.items() if name not in current}
         return Ingestions(state, tuple(finished), lost, outdated, rows)

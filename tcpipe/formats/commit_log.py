@@ -17,6 +17,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import msgspec
 import pyarrow as pa
@@ -34,10 +35,13 @@ logger = logging.getLogger("tcpipe")
 LOG = "log"
 _COMMIT = re.compile(r"(\d{10})\.json")
 _SNAPSHOT = "snapshot-"
-_EVERY = 64
-"""So many commits after a snapshot, the next one is written."""
+_EVERY, _EVERY_BYTES = 64, 4 << 20
+"""After so many commits, or so many bytes of them, the next snapshot is written."""
 _KEPT = 2
 """So many snapshots stay."""
+
+
+ReadCommit: TypeAlias = tuple[Commit, str, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,19 +98,21 @@ def refresh(store: Place, state: State) -> State:
     return state
 
 
-def _try(log: Place, number: int) -> tuple[Commit, str] | StoreError:
+def _try(log: Place, number: int) -> ReadCommit | StoreError:
     try:
         return read_commit(log, number)
     except StoreError as error:
         return error
 
 
-def _follow(state: State, result: tuple[Commit, str], log: Place) -> State:
+def _follow(state: State, result: ReadCommit, log: Place) -> State:
     """Return the state after a commit; one that was written after another commit than the last is a problem."""
-    commit, digest = result
+    commit, digest, size_bytes = result
     follows = commit.parent == state.digest or not state.digest
     problems = state.problems if follows else (*state.problems, _problem("commit-damaged", log, commit.number))
-    return replace(fold([commit], state), digest=digest, problems=problems)
+    return replace(
+        fold([commit], state), digest=digest, tail_bytes=state.tail_bytes + size_bytes, problems=problems
+    )
 
 
 def _problem(code: str, log: Place, number: int) -> Problem:
@@ -124,8 +130,8 @@ def snapshot_name(number: int) -> str:
     return f"{_SNAPSHOT}{number:010}.json.zst"
 
 
-def read_commit(log: Place, number: int) -> tuple[Commit, str]:
-    """Return a commit and its seal; `StoreError` where it is gone or not as it was written."""
+def read_commit(log: Place, number: int) -> ReadCommit:
+    """Return a commit, its seal and its size [byte]; `StoreError` where it is gone or not as it was written."""
     name = commit_name(number)
     data, where = log.read(name), log.where(name)
     if data is None:
@@ -134,7 +140,7 @@ def read_commit(log: Place, number: int) -> tuple[Commit, str]:
     commit = typed(document, Commit, where)
     if commit.number != number:
         raise StoreError(f"{where}: is commit {commit.number}")
-    return commit, str(document[SEAL])
+    return commit, str(document[SEAL]), len(data)
 
 
 def put_commit(store: Place, state: State, stamp: Stamp, kind: Kind, make: Callable[[State], Entries]) -> State:
@@ -158,9 +164,13 @@ def put_commit(store: Place, state: State, stamp: Stamp, kind: Kind, make: Calla
         if (
             log.put_new(commit_name(number), data) or log.read(commit_name(number)) == data
         ):  # the answer to one's own may be lost
-            state = _follow(state, (typed(document, Commit, log.where()), str(document[SEAL])), log)
-            return _keep_snapshot(log, state, stamp) if number - state.snapshot >= _EVERY else state
+            state = _follow(state, (typed(document, Commit, log.where()), str(document[SEAL]), len(data)), log)
+            return _keep_snapshot(log, state, stamp) if _is_due(state) else state
         state = refresh(store, state)
+
+
+def _is_due(state: State) -> bool:
+    return state.number - state.snapshot >= _EVERY or state.tail_bytes >= _EVERY_BYTES
 
 
 def _keep_snapshot(log: Place, state: State, stamp: Stamp) -> State:
@@ -171,7 +181,7 @@ def _keep_snapshot(log: Place, state: State, stamp: Stamp) -> State:
         log.put_new(snapshot_name(state.number), _encode_snapshot(state, stamp))
         for name in _list_snapshots(log)[:-_KEPT]:
             log.delete(name)
-    return replace(state, snapshot=state.number)
+    return replace(state, snapshot=state.number, tail_bytes=0)
 
 
 def _list_snapshots(log: Place) -> list[str]:

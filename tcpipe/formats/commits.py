@@ -196,6 +196,8 @@ class State:
     """Its seal."""
     snapshot: int = 0
     """Number of the last snapshot that was read or written."""
+    tail_bytes: int = 0
+    """Size of the commits after it."""
     runs: Mapping[tuple[str, str], RunFacts] = field(default_factory=dict)
     """By run and recipe."""
     seen: Mapping[str, tuple[Sighting, ...]] = field(default_factory=dict)
@@ -286,7 +288,7 @@ def fold(commits: Iterable[Commit], state: State | None = None) -> State:
             begun.pop(ended, None)
         calls = [*reversed(of.calls), *calls][:LATEST_CALLS]
     return State(
-        number, state.digest, state.snapshot, runs, seen, failed, acknowledged, tuple(supersessions), datasets,
+        number, state.digest, state.snapshot, state.tail_bytes, runs, seen, failed, acknowledged, tuple(supersessions), datasets,
         frozenset(forgotten), begun, tuple(calls), state.problems,
     )  # fmt: skip
 

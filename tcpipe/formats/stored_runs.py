@@ -29,12 +29,17 @@ class RunDirectory:
 
     run_id: str
     recipe_id: str
-    place: Place
-    """``runs/<run_id>/<recipe_id>``."""
+    runs: Place
+    """``runs/`` of the store."""
     facts: RunFacts
     """What the log has of it: enough to choose by."""
     files_state: str = ""
     """Distinguishes its files from what is written under their names later."""
+
+    @property
+    def place(self) -> Place:
+        """``runs/<run_id>/<recipe_id>``."""
+        return self.runs.below(f"{self.run_id}/{self.recipe_id}")
 
     @property
     def manifest(self) -> Manifest:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
@@ -168,9 +168,10 @@ def ingest(
 
         for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
             tell(index, IngestResult(plain_line(path), "failed", problems=lines, transient=True))
+        parties = log.state.parties
         for index, step in enumerate(steps):
             if not step.is_todo:
-                tell(index, _result_without_work(log, step))
+                tell(index, _result_without_work(log, step, parties))
         todo = [index for index, step in enumerate(steps) if step.is_todo]
         summary = IngestSummary(opened.root)
         if todo:
@@ -211,7 +212,7 @@ def _call_of(
     )
 
 
-def _result_without_work(log: LogWriter, step: Step) -> IngestResult:
+def _result_without_work(log: LogWriter, step: Step, parties: Container[str]) -> IngestResult:
     """Return the result of a log that is in the store, is known to fail, or has to wait."""
     source, made = step.task.source, step.made
     if step.failure is not None:
@@ -220,11 +221,12 @@ def _result_without_work(log: LogWriter, step: Step) -> IngestResult:
     if made is None:
         return too_young(step.task) or IngestResult(source.name, "waiting")
     result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
-    if made.run_id in log.state.parties:
+    if made.run_id in parties:
         superseded, notes = superseded_by(log.store, log.state, source, made.run_id, str(source.sha256))
         log.commit("superseded", Entries(superseded=tuple(superseded)))
         result = replace(result, notes=(*result.notes, *notes))
-    return _judged(log.state, result, source, before=log.state)
+    trouble = bool(result.damage or result.why_empty)
+    return replace(result, known=True, accepted=is_acknowledged(problems_of(made), log.state)) if trouble else result
 
 
 def _results(

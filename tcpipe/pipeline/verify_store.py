@@ -77,7 +77,7 @@ def _log(log: Place) -> Iterator[Finding]:
             continue
         yield from (f"{log.where(commit_name(absent))}: is missing" for absent in range(last + 1, number))
         try:
-            commit, digest = read_commit(log, number)
+            commit, digest, _ = read_commit(log, number)
         except StoreError as error:
             yield from error.problems
             last, whole = number, False
@@ -132,7 +132,7 @@ def verify_run(store: Store, run_id: str, recipe: str | None = None) -> Iterator
     yield from _isolated(_streams(place, known))
     recipes = [name for name in folders if name != _STREAMS and numbers(place.files(name)).get("manifest")]
     for name in recipes if recipe is None else [recipe]:
-        yield from _isolated(_ingestion(place.below(name)))
+        yield from _isolated(_ingestion(store.runs_place, run_id, name))
     if not recipes:
         yield f"{place.where()}: holds no finished run; ingest its log again"
     for name in names:
@@ -258,9 +258,10 @@ def _streams(place: Place, known: RunJson | None) -> Iterator[Finding]:
         yield "rows", table.num_rows
 
 
-def _ingestion(place: Place) -> Iterator[Finding]:
+def _ingestion(runs: Place, run_id: str, recipe_name: str) -> Iterator[Finding]:
     """Compare what a run became under one recipe with its manifest."""
     yield "runs", 1
+    place = runs.below(f"{run_id}/{recipe_name}")
     last = name_of("manifest", numbers(place.files())["manifest"])
     document, where = read_sealed_at(place, last), place.where(last)
     if document["data_model_version"] not in READ_VERSIONS:
@@ -270,7 +271,6 @@ def _ingestion(place: Place) -> Iterator[Finding]:
         )
         return
     manifest, recipe = typed(document, Manifest, where), document["recipe"]
-    run_id, recipe_name = place.where().rsplit("/", 2)[1:]
     of = (ingest_key(recipe), recipe_id(recipe, manifest.robot)) if isinstance(recipe, Mapping) else None
     if of != (manifest.ingest_key, recipe_name):
         yield f"{where}: its recipe is not the one that the directory is named after"
@@ -278,7 +278,7 @@ def _ingestion(place: Place) -> Iterator[Finding]:
     yield from wrong
     yield "files", len(manifest.checksums)
     yield from _others(place, manifest)
-    run = RunDirectory(run_id, recipe_name, place, facts_of(manifest, last, {}), str(time.time_ns()))
+    run = RunDirectory(run_id, recipe_name, runs, facts_of(manifest, last, {}), str(time.time_ns()))
     yield from _tables(run, where) if not wrong else ()
 
 
