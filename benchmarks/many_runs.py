@@ -58,7 +58,10 @@ def many_runs(directory: Path, count: int) -> tuple[Path, Store]:
     log, sources = open_log(store), find_sources([logs], as_one=False, staging=Path()).sources
     for start in range(0, count, 100):
         made = [_copy(run, store, source, start + at) for at, source in enumerate(sources[start : start + 100])]
-        log.commit("ingested", Entries(runs=tuple(of for each in made for of in each.runs), seen=tuple(of.seen[0] for of in made)))
+        log.commit(
+            "ingested",
+            Entries(runs=tuple(of for each in made for of in each.runs), seen=tuple(of.seen[0] for of in made)),
+        )
     return logs, store
 
 

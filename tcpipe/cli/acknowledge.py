@@ -16,6 +16,8 @@ def acknowledge(names: tuple[str, ...], *, store: str, as_json: bool) -> int:
 
     Acknowledge a call that was killed by the name that status prints, a log that waits and a damaged commit by its path.
 
+    A run of which files are missing is given up: the store no longer expects it.
+
     This holds for this problem of this content: another problem, or other content, is reported.
     """
     from tcpipe.cli.output import print_json, say

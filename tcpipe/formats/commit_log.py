@@ -110,9 +110,7 @@ def _follow(state: State, result: ReadCommit, log: Place) -> State:
     commit, digest, size_bytes = result
     follows = commit.parent == state.digest or not state.digest
     problems = state.problems if follows else (*state.problems, _problem("commit-damaged", log, commit.number))
-    return replace(
-        fold([commit], state), digest=digest, tail_bytes=state.tail_bytes + size_bytes, problems=problems
-    )
+    return replace(fold([commit], state), digest=digest, tail_bytes=state.tail_bytes + size_bytes, problems=problems)
 
 
 def _problem(code: str, log: Place, number: int) -> Problem:

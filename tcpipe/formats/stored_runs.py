@@ -44,7 +44,11 @@ class RunDirectory:
     @property
     def manifest(self) -> Manifest:
         """The whole manifest, with the run's tags as they are now; `StoreError` if it is not as it was written."""
-        return replace(_manifest(self.place, self.facts.manifest, self.files_state), tags=self.facts.tags)
+        manifest = _manifest(self.place, self.facts.manifest, self.files_state)
+        if (manifest.run_id, manifest.recipe_id) != (self.run_id, self.recipe_id):
+            what = f"is of {manifest.run_id}/{manifest.recipe_id}, but lies in {self.run_id}/{self.recipe_id}"
+            raise StoreError(f"{self.place.where(self.facts.manifest)}: {what}")
+        return replace(manifest, tags=self.facts.tags)
 
     @property
     def streams_key(self) -> str:

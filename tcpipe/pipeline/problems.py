@@ -10,10 +10,11 @@ from tcpipe.errors import UsageError
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.commits import Entries, Problem, State, lineage_of
 from tcpipe.formats.index_files import RunFacts
+from tcpipe.formats.stored_runs import Ingestions
 from tcpipe.pipeline.begun_calls import begun_calls
 from tcpipe.pipeline.log_sources import LogSource, find_sources
 from tcpipe.pipeline.log_writer import LogWriter
-from tcpipe.store import open_store
+from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
 
 _MOST_CANDIDATES = 10
@@ -43,6 +44,13 @@ def failure_of(content: str, log: tuple[str, ...]) -> Problem:
     return Problem(Finding("log-failed", "error", Subject("log", " + ".join(log)), "rejected"), content, log)
 
 
+def incomplete_runs(found: Ingestions) -> Iterator[Problem]:
+    """Yield the runs of which files are missing."""
+    for (run_id, recipe_id), lost in found.lost.items():
+        finding = make_finding("run-incomplete", Subject("run", run_id), names={"file": lost.where})
+        yield Problem(finding, f"{run_id}/{recipe_id} {found.rows[run_id, recipe_id].commit}", run_id=run_id)
+
+
 def waiting_of(source: LogSource, state: str) -> Problem:
     """Return the problem that a log lies there and no call takes it in; that of other content, written since, is another."""
     finding = make_finding("log-waiting", Subject("log", source.name), names={"state": state})
@@ -67,6 +75,8 @@ def known_problems(state: State) -> Iterator[Problem]:
 def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> Acknowledged:
     """Acknowledge the problems of runs, logs and killed calls: they cause no exit code 3 any more, until the content is another.
 
+    A run of which files are missing is given up: the log of the store no longer names it.
+
     Parameters
     ----------
     names : runs by their id, logs by path, URL or, where that is enough, file name; killed calls and commits by the name that `status` says.
@@ -82,7 +92,7 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
     known = {problem.key: problem for problem in known_problems(state)}
     chosen, wrong = dict[str, Problem](), list[str]()
     for name in dict.fromkeys(names):
-        found = _named(name, known.values(), state) or _waiting(name, state)
+        found = _named(name, known.values(), state) or _lost(name, opened, state) or _waiting(name, state)
         if len({problem.name for problem in found}) == 1:
             chosen |= {problem.key: problem for problem in found}
         else:
@@ -95,6 +105,10 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
         raise UsageError(*wrong)
     now = tuple(problem for key, problem in chosen.items() if key not in state.acknowledged)
     log.commit("acknowledged", Entries(acknowledged=now))
+    gone = {problem.run_id for problem in now if problem.finding.code == "run-incomplete"}
+    log.commit(
+        "excluded", Entries(removed=tuple(key for name in gone for key in opened.ingestions(name, state=state).lost))
+    )
     return Acknowledged(now, tuple(problem for problem in chosen.values() if problem not in now))
 
 
@@ -104,6 +118,11 @@ def _named(name: str, known: Iterable[Problem], state: State) -> list[Problem]:
     known = list(known)
     exact = [of for of in known if of.content in contents or paths & {of.name, " + ".join(of.log), *of.log}]
     return exact or [of for of in known if name in {Path(origin).name for origin in of.log}]
+
+
+def _lost(name: str, store: Store, state: State) -> list[Problem]:
+    """Return the problem of a run of which files are missing: to acknowledge it is to give the run up."""
+    return list(incomplete_runs(store.ingestions(name, state=state))) if state.rows_of(name) else []
 
 
 def _waiting(name: str, state: State) -> list[Problem]:

@@ -24,7 +24,7 @@ from tcpipe.pipeline.calls import INGEST, Estimate, estimate, in_time
 from tcpipe.pipeline.ingest_task import IngestTask
 from tcpipe.pipeline.log_sources import definitions_key, find_sources, in_shard, remembered
 from tcpipe.pipeline.plan import STANDINGS, TROUBLE, Standing, Step, plan
-from tcpipe.pipeline.problems import waiting_of
+from tcpipe.pipeline.problems import incomplete_runs, waiting_of
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 from tcpipe.tables.findings import Finding, Subject, make_finding
@@ -188,13 +188,6 @@ def _store_problems(found: Ingestions) -> Iterator[Problem]:
     yield from found.state.problems
     yield from incomplete_runs(found)
     yield from (call.problem for call in begun_calls(found.state) if call.state == "killed")
-
-
-def incomplete_runs(found: Ingestions) -> Iterator[Problem]:
-    """Yield the runs of which files are missing."""
-    for (run_id, recipe_id), lost in found.lost.items():
-        finding = make_finding("run-incomplete", Subject("run", run_id), names={"file": lost.where})
-        yield Problem(finding, f"{run_id}/{recipe_id} {found.rows[run_id, recipe_id].commit}", run_id=run_id)
 
 
 def _waiting_too_long(steps: Iterable[Step]) -> Iterator[Problem]:

@@ -169,9 +169,9 @@ def test_sentences_of_manifests_and_cards_become_findings():
     }  # fmt: skip
     brought = bring_document(manifest, "manifest-1.json")
     assert (brought["data_model_version"], brought["info"]["report"]["facts"]) == (DATA_MODEL_VERSION, {"n": 1})
-    assert [(of["code"], of["subject"]["name"], of["names"]["text"]) for of in brought["info"]["report"]["findings"]] == [
-        ("earlier-warning", "a", line) for line in WARNED
-    ]
+    assert [
+        (of["code"], of["subject"]["name"], of["names"]["text"]) for of in brought["info"]["report"]["findings"]
+    ] == [("earlier-warning", "a", line) for line in WARNED]
     assert brought["verdict"]["position"] == "usable", "a note changes no verdict"
     assert bring_document(brought, "manifest-1.json") is brought
     card = {
@@ -181,7 +181,9 @@ def test_sentences_of_manifests_and_cards_become_findings():
     brought = bring_document(card, "dataset.json")
     assert [of["names"]["text"] for of in brought["findings"]] == list(WARNED)
     assert ([len(of["findings"]) for of in brought["runs"]], brought["maps"]) == ([2], [{"name": "m", "findings": []}])
-    with pytest.raises(StoreError, match=r"of data model 4\.0, this version knows 2\.0, 2\.1, 2\.2, 3\.0; left as it is"):
+    with pytest.raises(
+        StoreError, match=r"of data model 4\.0, this version knows 2\.0, 2\.1, 2\.2, 3\.0; left as it is"
+    ):
         bring_document({"data_model_version": "4.0"}, "dataset.json")
 
 

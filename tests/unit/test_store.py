@@ -47,7 +47,9 @@ def put(store: Store, length_m: float = 10.0, **how: object) -> None:
 
 def contents(store: Store) -> dict[str, bytes | None]:
     """What is there, but for when and by whom it was committed."""
-    return {entry.name: store.place.read(entry.name) for entry in store.place.entries() if not entry.name.startswith("log/")}
+    return {
+        entry.name: store.place.read(entry.name) for entry in store.place.entries() if not entry.name.startswith("log/")
+    }
 
 
 def counted(store: Store) -> list[int]:

@@ -119,7 +119,9 @@ def test_a_commit_that_is_missing_damaged_or_of_another_store_is_a_problem_until
         log.delete("0000000003.json")
         state = put_commit(place, replace(read_state(place), number=2), STAMP, "seen", lambda _: saw(3))
     elif how == "damaged":
-        log.put("0000000002.json", (log.read("0000000002.json") or b"").replace(b'"size', b'"sice').replace(b"1,", b"2,"))
+        log.put(
+            "0000000002.json", (log.read("0000000002.json") or b"").replace(b'"size', b'"sice').replace(b"1,", b"2,")
+        )
         state = write(place, 1)
     else:
         state = put_commit(place, replace(read_state(place), digest="f" * 64), STAMP, "seen", lambda _: saw(3))

@@ -1,7 +1,5 @@
 """A dataset of the runs that carry given tags."""
 
-import json
-import os
 import shutil
 from dataclasses import replace
 
@@ -57,7 +55,9 @@ def test_a_tag_that_no_run_has_is_answered_with_those_there_are(store, tmp_path)
 
 def make_outdated(store, *run_ids):
     """Have runs look as if an earlier version of tcpipe had made them."""
-    rows = [replace(row, data_model_version="0.9", commit=0) for run_id in run_ids for row in store.state().rows_of(run_id)]
+    rows = [
+        replace(row, data_model_version="0.9", commit=0) for run_id in run_ids for row in store.state().rows_of(run_id)
+    ]
     open_log(store).commit("ingested", Entries(runs=tuple(rows)))
 
 
@@ -119,7 +119,9 @@ def test_a_dataset_that_was_moved_before_another_was_built_in_its_place_still_ho
     assert len(prune(store=store.root, recipe=Recipe(), dry_run=True).removed) == 1
 
 
-def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_commit(store, tmp_path, caplog, monkeypatch):
+def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_commit(
+    store, tmp_path, caplog, monkeypatch
+):
     place = type(store.place)
     monkeypatch.setattr(place, "put_new", lambda self, name, _: (_ for _ in ()).throw(StoreError(f"{name}: read-only")))
     for _ in range(2):

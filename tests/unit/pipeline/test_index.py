@@ -18,6 +18,7 @@ from tcpipe.pipeline.log_writer import commit_run, open_log, supersede
 from tcpipe.recipe import Recipe
 from tcpipe.store import Store
 
+
 @pytest.fixture
 def store(tmp_path):
     store = Store(tmp_path / "store")

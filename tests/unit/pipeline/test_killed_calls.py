@@ -19,8 +19,8 @@ from wheel_drives import START_NS, drive_at
 from tcpipe.cli import cli
 from tcpipe.errors import StoreError, UsageError
 from tcpipe.formats.commits import Begun, Entries
-from tcpipe.pipeline import log_writer
 from tcpipe.pipeline import ingest as ingest_module
+from tcpipe.pipeline import log_writer
 from tcpipe.pipeline import status as status_module
 from tcpipe.pipeline.begun_calls import begun_call, begun_calls
 from tcpipe.pipeline.ingest import ingest

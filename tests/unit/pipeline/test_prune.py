@@ -9,8 +9,8 @@ import pytest
 from synthetic_store import add_run, lanes, segments
 
 from tcpipe.errors import UsageError
-from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.commits import Dataset, Entries
+from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.store_mark import SPOOL
 from tcpipe.pipeline.log_writer import open_log, supersede
 from tcpipe.pipeline.prune import prune
