@@ -35,7 +35,7 @@ from tcpipe.recipe import Recipe
 from tcpipe.store import Store, open_store
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-from wheel_drives import wheel_drive  # noqa: E402
+from wheel_drives import wheel_drive
 
 T = TypeVar("T")
 

@@ -195,7 +195,7 @@ def _encode_snapshot(state: State, stamp: Stamp) -> bytes:
     sink = pa.BufferOutputStream()
     with pa.CompressedOutputStream(sink, "zstd") as stream:
         stream.write(hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
-    return sink.getvalue().to_pybytes()
+    return bytes(sink.getvalue())
 
 
 def _read_snapshot(log: Place, name: str) -> State:

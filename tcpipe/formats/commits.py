@@ -247,50 +247,63 @@ def lineage_of(log: tuple[str, ...]) -> str:
 
 
 def fold(commits: Iterable[Commit], state: State | None = None) -> State:
-    """Return the state after commits that follow ``state``; a snapshot replaces all before it."""
+    """Return the state after commits that follow ``state``."""
     state = State() if state is None else state
-    runs, seen, failed = dict(state.runs), dict(state.seen), dict(state.failed)
-    acknowledged, datasets, forgotten = dict(state.acknowledged), dict(state.datasets), set(state.forgotten)
-    begun, calls, supersessions = dict(state.begun), list(state.calls), list(state.supersessions)
+    runs, seen, failed, acknowledged = dict(state.runs), dict(state.seen), dict(state.failed), dict(state.acknowledged)
+    datasets, begun, forgotten = dict(state.datasets), dict(state.begun), set(state.forgotten)
+    calls, supersessions, number = state.calls, state.supersessions, state.number
     gone = state.superseded
-    number = state.number
     for commit in commits:
         of, number = commit.entries, commit.number
         supersessions += of.superseded
-        for each in of.superseded:
-            gone.update({each.run_id: each.by} if each.by else {})
-            if each.by is None:
-                gone.pop(each.run_id, None)
-            for key in [key for key in runs if key[0] == each.run_id]:
-                runs[key] = replace(runs[key], superseded_by=each.by)
-        for row in of.runs:
-            by = gone.get(row.run_id)
-            if row.superseded_by != by or not row.commit:
-                row = replace(row, superseded_by=by, commit=row.commit or number)  # noqa: PLW2901
-            runs[row.run_id, row.recipe_id] = row
-        for key in of.removed:
-            runs.pop(key, None)
+        _supersede(runs, gone, of.superseded)
+        _add_runs(runs, gone, commit)
         for sighting in of.seen:
             lineage = lineage_of(sighting.log)
             seen[lineage] = (*(old for old in seen.get(lineage, ()) if old != sighting), sighting)
         failed.update({failure.key: failure for failure in of.failed})
         acknowledged.update({problem.key: problem for problem in of.acknowledged})
-        for dataset in of.forgotten:
-            forgotten.add((dataset.out, dataset.inputs))
-            datasets.pop((dataset.out, dataset.inputs), None)
-        for dataset in of.datasets:
-            forgotten.discard((dataset.out, dataset.inputs))
-            datasets[dataset.out, dataset.inputs] = dataset
-        for call in of.begun:
-            call = call if call.number else replace(call, number=number, begin=commit.at, process=commit.who)  # noqa: PLW2901
-            begun[call.number] = call
-        for ended in of.ended:
-            begun.pop(ended, None)
-        calls = [*reversed(of.calls), *calls][:LATEST_CALLS]
-    return State(
-        number, state.digest, state.snapshot, state.tail_bytes, runs, seen, failed, acknowledged, tuple(supersessions), datasets,
-        frozenset(forgotten), begun, tuple(calls), state.problems,
+        _add_datasets(datasets, forgotten, of)
+        begun.update(_number(call, commit) for call in of.begun)
+        begun = {key: call for key, call in begun.items() if key not in of.ended}
+        calls = (*reversed(of.calls), *calls)[:LATEST_CALLS]
+    return replace(
+        state, number=number, runs=runs, seen=seen, failed=failed, acknowledged=acknowledged, supersessions=supersessions,
+        datasets=datasets, forgotten=frozenset(forgotten), begun=begun, calls=calls,
     )  # fmt: skip
+
+
+def _supersede(runs: dict[tuple[str, str], RunFacts], gone: dict[str, str], superseded: Iterable[Superseded]) -> None:
+    for each in superseded:
+        gone.pop(each.run_id, None)
+        gone.update({each.run_id: each.by} if each.by else {})
+        for key in [key for key in runs if key[0] == each.run_id]:
+            runs[key] = replace(runs[key], superseded_by=each.by)
+
+
+def _add_runs(runs: dict[tuple[str, str], RunFacts], gone: Mapping[str, str], commit: Commit) -> None:
+    for row in commit.entries.runs:
+        by = gone.get(row.run_id)
+        is_settled = row.commit and row.superseded_by == by
+        new = row if is_settled else replace(row, superseded_by=by, commit=row.commit or commit.number)
+        runs[row.run_id, row.recipe_id] = new
+    for key in commit.entries.removed:
+        runs.pop(key, None)
+
+
+def _add_datasets(datasets: dict[tuple[str, str], Dataset], forgotten: set[tuple[str, str]], of: Entries) -> None:
+    for dataset in of.forgotten:
+        forgotten.add((dataset.out, dataset.inputs))
+        datasets.pop((dataset.out, dataset.inputs), None)
+    for dataset in of.datasets:
+        forgotten.discard((dataset.out, dataset.inputs))
+        datasets[dataset.out, dataset.inputs] = dataset
+
+
+def _number(call: Begun, commit: Commit) -> tuple[int, Begun]:
+    """Return a call with the number, time and process of its commit, unless a snapshot has them."""
+    known = call if call.number else replace(call, number=commit.number, begin=commit.at, process=commit.who)
+    return known.number, known
 
 
 def compact(state: State) -> Entries:

@@ -146,13 +146,17 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
     place : ``runs/``. On disk each file is looked at; in a bucket there is one request for every thousand objects below it.
     rows : ingestions as the log has them.
     """
-    rows = list(rows)
+    rows, find, root = list(rows), _stat, ""
     if isinstance(place, DirectoryPlace):
-        find, root = _stat, f"{place.root}/"
+        root = f"{place.root}/"
     else:
         of_one = {row.run_id for row in rows}
         found = place.entries(of_one.pop() if len(of_one) == 1 else "")
-        find, root = {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}.get, ""
+        sizes = {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}
+
+        def find(name: str) -> tuple[int, int] | None:
+            return sizes.get(name)
+
     for row in rows:
         states, lost = list[tuple[int, int]](), None
         for name, size_bytes in row.files.items():

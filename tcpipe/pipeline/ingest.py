@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing, nullcontext
 from dataclasses import dataclass, field, fields, replace
 from itertools import chain
@@ -17,7 +17,7 @@ from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
 from tcpipe.formats.commit_log import keep_state_here
-from tcpipe.formats.commits import Call, Entries, Failure, State, Superseded
+from tcpipe.formats.commits import Call, Entries, Failure, Kind, State
 from tcpipe.formats.object_storage import is_presigned, is_url
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
 from tcpipe.formats.robot_files import profiles_of
@@ -27,6 +27,7 @@ from tcpipe.pipeline.calls import INGEST, measure_call, room_of, started
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
 from tcpipe.pipeline.ingest_task import IngestResult, IngestTask, died, result_of, too_young
 from tcpipe.pipeline.log_sources import (
+    FoundLogs,
     LogSource,
     definitions_key,
     find_sources,
@@ -144,48 +145,44 @@ def ingest(
             raise (LogError if found.transient else UsageError)(*chain(*found.problems.values()) or [_NO_LOGS])
         opened = open_store(store, create=True)
         log = open_log(opened)
-        before = log.state.number
-        given = tuple(str(of) if is_url(of) else str(Path(of).absolute()) for of in logs if not is_presigned(of))
-        begin = (INGEST, given, (ingest_key(ruling), robot, shard))
+        before, given = log.state.number, _in_full(logs)
         mine = found.sources if shard is None else in_shard(found.sources, shard)
-        root = opened.root
-        if cluster is not None:  # its workers are elsewhere
-            root = root.absolute() if isinstance(root, Path) else root
-            message_definitions = None if message_definitions is None else message_definitions.absolute()
+        if cluster is not None and message_definitions is not None:  # its workers are elsewhere
+            message_definitions = message_definitions.absolute()
+        root = opened.root.absolute() if cluster is not None and isinstance(opened.root, Path) else opened.root
         common = (root, ruling, robot, dict(tags or {}), force, message_definitions)
-        how = (definitions_key(message_definitions), retry_failed, min_age_s)
+        how = (*common, definitions_key(message_definitions), retry_failed, min_age_s)
         seen = {} if force else log.state.seen
-        tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *common, *how) for source in mine]
+        tasks = [IngestTask(remembered(source, seen.get(source.lineage, ())), *how) for source in mine]
         if on_found:
             sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
             on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
         steps, results = plan(tasks, log.state, broken=find_broken(opened, log.state)), {}
 
-        def tell(index: int, result: IngestResult) -> None:
-            results[index] = result
-            if on_result:
-                on_result(result)
+        def tell(ended: Iterable[tuple[int, IngestResult]]) -> IngestSummary:
+            for index, result in ended:
+                results[index] = result
+                if on_result:
+                    on_result(result)
+            return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
-        for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
-            tell(index, IngestResult(plain_line(path), "failed", problems=lines, transient=True))
-        parties = log.state.parties
-        for index, step in enumerate(steps):
-            if not step.is_todo:
-                tell(index, _result_without_work(log, step, parties))
-        todo = [index for index, step in enumerate(steps) if step.is_todo]
-        summary = IngestSummary(opened.root)
-        if todo:
+        summary = tell(_results_without_work(log, found, steps))
+        work = {index: step.task for index, step in enumerate(steps) if step.is_todo}
+        begin = (INGEST, given, (ingest_key(ruling), robot, shard))
+        if work:
             with begun_call(log, *begin[:2], options=begin[2]) as call:
-                for index, result in _results(log, [tasks[index] for index in todo], jobs=jobs, cluster=cluster):
-                    tell(todo[index], result)
-                summary = replace(summary, results=tuple(results[index] for index in sorted(results)))
+                summary = tell(_results(log, work, jobs=jobs, cluster=cluster))
                 call.end = Entries(calls=(measure_call(watch, _call_of(opened, summary, given, tasks, jobs)),))
         else:
-            summary = replace(summary, results=tuple(results[index] for index in sorted(results)))
             log.commit("ended", Entries(ended=tuple(settled_calls(log.state, new_call(*begin)))))
         if log.state.number != before and log.state.runs:
             opened.write_index(log.state)
         return summary
+
+
+def _in_full(logs: Iterable[str | Path]) -> tuple[str, ...]:
+    """Return logs and folders as they were given, in full; those whose URL is signed are not remembered."""
+    return tuple(str(of) if is_url(of) else str(Path(of).absolute()) for of in logs if not is_presigned(of))
 
 
 def find_broken(store: Store, state: State) -> set[tuple[str, str]]:
@@ -212,49 +209,57 @@ def _call_of(
     )
 
 
-def _result_without_work(log: LogWriter, step: Step, parties: Container[str]) -> IngestResult:
-    """Return the result of a log that is in the store, is known to fail, or has to wait."""
-    source, made = step.task.source, step.made
-    if step.failure is not None:
-        known = {"known": True, "accepted": step.standing == "quarantined"}
-        return IngestResult(source.name, "failed", problems=step.failure.problems, sha256=source.sha256, **known)
-    if made is None:
-        return too_young(step.task) or IngestResult(source.name, "waiting")
-    result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
-    if made.run_id in parties:
-        superseded, notes = superseded_by(log.store, log.state, source, made.run_id, str(source.sha256))
-        log.commit("superseded", Entries(superseded=tuple(superseded)))
-        result = replace(result, notes=(*result.notes, *notes))
-    trouble = bool(result.damage or result.why_empty)
-    return replace(result, known=True, accepted=is_acknowledged(problems_of(made), log.state)) if trouble else result
+def _results_without_work(
+    log: LogWriter, found: FoundLogs, steps: Sequence[Step]
+) -> Iterator[tuple[int, IngestResult]]:
+    """Yield the result of each path that holds no log, and of each log that is in the store, is known to fail, or has to wait."""
+    parties = log.state.parties
+    for index, (path, lines) in enumerate(found.problems.items(), start=-len(found.problems)):
+        yield index, IngestResult(plain_line(path), "failed", problems=lines, transient=True)
+    for index, step in enumerate(steps):
+        source, made = step.task.source, step.made
+        if step.failure is not None:
+            failed = IngestResult(
+                source.name, "failed", problems=step.failure.problems, sha256=source.sha256, known=True
+            )
+            yield index, replace(failed, accepted=step.standing == "quarantined")
+        elif made is not None:
+            result = result_of(source, "unchanged", made, str(source.sha256), same_as=find_twin(made.log, source))
+            if made.run_id in parties:
+                superseded, notes = superseded_by(log.store, log.state, source, made.run_id, str(source.sha256))
+                log.commit("superseded", Entries(superseded=tuple(superseded)))
+                result = replace(result, notes=(*result.notes, *notes))
+            if result.damage or result.why_empty:
+                result = replace(result, known=True, accepted=is_acknowledged(problems_of(made), log.state))
+            yield index, result
+        elif not step.is_todo:
+            yield index, too_young(step.task) or IngestResult(source.name, "waiting")
 
 
 def _results(
-    log: LogWriter, tasks: Sequence[IngestTask], *, jobs: int, cluster: str | None
+    log: LogWriter, work: Mapping[int, IngestTask], *, jobs: int, cluster: str | None
 ) -> Iterator[tuple[int, IngestResult]]:
     """Yield what became of each log by its index, once that is committed; what ends within a second is one commit."""
-    hashed = with_hashes([task.source for task in tasks])
-    tasks = [replace(task, source=source) for task, source in zip(tasks, hashed, strict=True)]
+    indices, hashed = list(work), with_hashes([task.source for task in work.values()])
+    tasks = [replace(task, source=source) for task, source in zip(work.values(), hashed, strict=True)]
     keep_state_here(log.store.place, log.state)
     for turn in in_turns(hashed):
-        waiting, last_s = list[tuple[int, Ingested]](), 0.0
-        with closing(run_all(ingest_one, [tasks[index] for index in turn], jobs=jobs, cluster=cluster)) as outcomes:
+        waiting, last_s = list[tuple[int, IngestTask, Ingested]](), 0.0
+        with closing(run_all(ingest_one, [tasks[at] for at in turn], jobs=jobs, cluster=cluster)) as outcomes:
             for outcome in outcomes:
-                index = turn[outcome.index]
-                waiting.append((index, outcome.result or Ingested(tasks[index].source, died(tasks[index].source))))
+                task = tasks[at := turn[outcome.index]]
+                waiting.append((indices[at], task, outcome.result or Ingested(task.source, died(task.source))))
                 if time.monotonic() - last_s >= _TOGETHER_S:
-                    yield from _commit(log, tasks, waiting)
+                    yield from _commit(log, waiting)
                     waiting, last_s = [], time.monotonic()
-        yield from _commit(log, tasks, waiting)
+        yield from _commit(log, waiting)
 
 
-def _commit(
-    log: LogWriter, tasks: Sequence[IngestTask], ended: Sequence[tuple[int, Ingested]]
-) -> Iterator[tuple[int, IngestResult]]:
+def _commit(log: LogWriter, ended: Sequence[tuple[int, IngestTask, Ingested]]) -> Iterator[tuple[int, IngestResult]]:
     """Commit what became of logs, and yield it with what the log says of it."""
     before, entries, notes = log.state, Entries(), dict[int, tuple[str, ...]]()
-    for index, of in ended:
-        more, notes[index] = _entries_of(log, tasks[index], of)
+    for index, task, of in ended:
+        more, notes[index] = _entries_of(log, task, of)
         entries = Entries(*((*getattr(entries, name.name), *getattr(more, name.name)) for name in fields(Entries)))
     others = dict[str, str]()
 
@@ -267,14 +272,14 @@ def _commit(
         return replace(entries, runs=tuple(row for row in entries.runs if row.run_id not in others))
 
     try:
-        kind = "ingested" if entries.runs else "failed" if entries.failed else "seen"
+        kind: Kind = "ingested" if entries.runs else "failed" if entries.failed else "seen"
         log.commit(kind, make)
     except StoreError as error:
         if entries.runs:
             raise
         logger.error("%s", error)  # noqa: TRY400  one line
     keep_state_here(log.store.place, log.state)
-    for index, of in ended:
+    for index, _, of in ended:
         result = replace(of.result, notes=(*of.result.notes, *notes[index]))
         if by := others.get(str(result.run_id)):
             problem = (
@@ -286,21 +291,20 @@ def _commit(
 
 def _entries_of(log: LogWriter, task: IngestTask, of: Ingested) -> tuple[Entries, tuple[str, ...]]:
     """Return what a commit has of the result of a log, and what is to be said of runs that it supersedes."""
-    source, result, superseded, notes = of.source, of.result, tuple[Superseded, ...](), tuple[str, ...]()
-    sha256 = result.sha256
+    source, result, sha256 = of.source, of.result, of.result.sha256
+    entries, notes = Entries(runs=of.rows), list[str]()
     new = sha256 is not None and bool(source.files) and not log.state.has_seen(source.sighting(sha256))
     if result.run_id and sha256 and (new or result.status != "unchanged" or result.run_id in log.state.parties):
         try:
             superseded, notes = superseded_by(log.store, log.state, source, result.run_id, sha256)
+            entries = replace(entries, superseded=tuple(superseded))
         except StoreError as error:
-            notes = error.problems
-    failed = tuple[Failure, ...]()
+            notes += error.problems
     if result.status == "failed" and not result.transient:
-        task = replace(task, source=replace(source, sha256=sha256))
-        content = sha256 or source.files_digest
-        failed = (Failure(task.failure_key, content, source.origins, result.problems, __version__),)
-    seen = (source.sighting(sha256),) if new and sha256 else ()
-    return Entries(seen=seen, runs=of.rows, failed=failed, superseded=tuple(superseded)), tuple(notes)
+        task, content = replace(task, source=replace(source, sha256=sha256)), sha256 or source.files_digest
+        failure = Failure(task.failure_key, content, source.origins, result.problems, __version__)
+        entries = replace(entries, failed=(failure,))
+    return replace(entries, seen=(source.sighting(sha256),) if new and sha256 else ()), tuple(notes)
 
 
 def _judged(state: State, result: IngestResult, source: LogSource, *, before: State) -> IngestResult:

@@ -72,7 +72,7 @@ def _ingest(task: IngestTask, *, hashed: list[str], rows: list[RunFacts]) -> Ing
     state = read_state_here(store.place)
     with ExitStack() as stack:
         opened = None if source.sha256 else _opened(task, stack)
-        sha256 = _known_as(store, state, opened) if opened else str(source.sha256)
+        sha256 = _known_as(state, opened) if opened else str(source.sha256)
         hashed.append(sha256)
         run_id = state.run_of(sha256) or store.name_run(source.stem, sha256)
         before = store.known_run(run_id)
@@ -108,7 +108,7 @@ def _rows_of(store: Store, state: State, run_id: str, recipe_id: str) -> list[Ru
     return [row for key, row in store.read_rows(run_id).items() if key == recipe_id or (run_id, key) in state.runs]
 
 
-def _known_as(store: Store, state: State, log: AnyLog) -> str:
+def _known_as(state: State, log: AnyLog) -> str:
     """Return the hash by which the store knows a log, or is to know it (ADR 86).
 
     That is the log's own unless the same recording was ingested from elsewhere, where more or less of it was at hand. A run with damage

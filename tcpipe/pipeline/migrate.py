@@ -129,11 +129,11 @@ def _store(source: Place, target: Place) -> Migrated:
     documents = [name for name in names if name.startswith("runs/") and _is_document(name)]
     copied = 0 if target == source else _copy(source, target, documents)
     for name in documents:
+        data = None if target == source else source.read(name)
         try:
             data = _bring(source, name)
         except TcpipeError as error:
             problems += error.problems
-            data = None if target == source else source.read(name)
         if data is not None and target.read(name) != data:
             target.put(name, data)
             migrated += [target.where(name)] if layout_of(source) != DATA_MODEL_VERSION else []

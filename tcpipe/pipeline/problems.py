@@ -1,4 +1,4 @@
-"""Problems of runs, logs and calls: what causes exit code 3 until a person acknowledges it, identified by code and content, never by text."""
+"""Problems of runs, logs and calls: what causes exit code 3 until somebody acknowledges it; identified by code and content."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def acknowledge(names: Sequence[str], *, store: str | Path = "tcpipe-store") -> 
 
     Parameters
     ----------
-    names : runs by their id, logs by path, URL or, where that is enough, file name; killed calls and commits by the name that `status` says.
+    names : runs by their id, logs by path, URL or, where that is enough, file name; killed calls and commits by their name in `status`.
     store : the store that knows the problems.
 
     Raises

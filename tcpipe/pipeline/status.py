@@ -141,16 +141,9 @@ def status(
         raise UsageError(f"{opened.root}: no call of ingest is remembered here; give the logs or their folders")
     with scratch_directory() as staging:
         found = find_sources(given, as_one=as_one, staging=staging, tables=ruling.tables)
-    how = (
-        opened.root,
-        ruling,
-        robot or ruling.robot,
-        {},
-        force,
-        message_definitions,
-        definitions_key(message_definitions),
-        retry_failed,
-    )
+    no_tags: Mapping[str, str] = {}
+    common = (opened.root, ruling, robot or ruling.robot, no_tags, force, message_definitions)
+    how = (*common, definitions_key(message_definitions), retry_failed)
     seen, runs = {} if force else state.seen, opened.ingestions(state=state)
     mine = found.sources if shard is None else in_shard(found.sources, shard)
     tasks = (IngestTask(remembered(source, seen.get(source.lineage, ())), *how, min_age_s) for source in mine)

@@ -49,7 +49,7 @@ from tcpipe.formats.recipe_toml import recipe_of
 from tcpipe.formats.seals import Checksum, file_checksum, file_checksums, sealed_page, write_sealed
 from tcpipe.formats.store_mark import SPOOL
 from tcpipe.pipeline.begun_calls import OpenCall, begun_call
-from tcpipe.pipeline.calls import BUILD, Estimate, Stopwatch, estimate, measure_call, started
+from tcpipe.pipeline.calls import BUILD, Estimate, estimate, measure_call, started
 from tcpipe.pipeline.dataset.added_columns import read_all_covariates
 from tcpipe.pipeline.dataset.balance import BALANCE_COLUMNS, measure_balance
 from tcpipe.pipeline.dataset.card import CARD_COLUMNS, VELOCITY_COLUMN, dataset_card, is_whole
@@ -265,7 +265,11 @@ def build_dataset(
             for entry in workers.waiting.entries():
                 workers.waiting.delete(entry.name)
             result = _result(place, "done", card, problems)
-            _end(call, watch, result, inputs, known, jobs, size=sum(of.size_bytes for of in card.checksums.values()))
+            written = sum(of.size_bytes for of in card.checksums.values())
+            took = Call(
+                BUILD, __version__, result.exit_code, {"runs": len(inputs.runs), "samples": result.samples}, jobs
+            )
+            _end(call, measure_call(watch, replace(took, written_bytes=written)), _dataset_of(result, inputs), known)
     if result.status == "unchanged":
         _refer(open_log(opened), _dataset_of(result, inputs))
     return result
@@ -300,28 +304,10 @@ def _planned(place: Path | str, store: Store, inputs: Inputs, *, jobs: int) -> B
     return BuildResult(str(place), "planned", most, {}, {}, (), *told, exit_code=code, estimate=expected)
 
 
-def _end(
-    opened: OpenCall,
-    watch: Stopwatch,
-    result: BuildResult,
-    inputs: Inputs,
-    known: DatasetCard | None,
-    jobs: int,
-    *,
-    size: int,
-) -> None:
+def _end(opened: OpenCall, call: Call, dataset: Dataset, known: DatasetCard | None) -> None:
     """Let the last commit of the call say which dataset was built, for what it refers to stays, and what the call took."""
-    call = Call(
-        BUILD,
-        __version__,
-        result.exit_code,
-        {"runs": len(inputs.runs), "samples": result.samples},
-        jobs,
-        written_bytes=size,
-    )
-    before = () if known is None or known.inputs == inputs.digest else (Dataset(_lasting(result), known.inputs),)
-    opened.kind = "built"
-    opened.end = Entries(datasets=(_dataset_of(result, inputs),), forgotten=before, calls=(measure_call(watch, call),))
+    before = () if known is None or known.inputs == dataset.inputs else (Dataset(dataset.out, known.inputs),)
+    opened.kind, opened.end = "built", Entries(datasets=(dataset,), forgotten=before, calls=(call,))
 
 
 def _dataset_of(result: BuildResult, inputs: Inputs) -> Dataset:

@@ -1,4 +1,4 @@
-"""The log of a store: commits add up to a state; a snapshot says the same; what is missing or damaged is said; many writers lose nothing."""
+"""The log of a store: commits add up to a state, and a snapshot says the same; what is missing is said; no writer loses anything."""
 
 import json
 import subprocess

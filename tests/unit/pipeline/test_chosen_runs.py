@@ -123,7 +123,7 @@ def test_a_dataset_of_a_store_that_cannot_be_written_says_that_it_leaves_no_comm
     store, tmp_path, caplog, monkeypatch
 ):
     place = type(store.place)
-    monkeypatch.setattr(place, "put_new", lambda self, name, _: (_ for _ in ()).throw(StoreError(f"{name}: read-only")))
+    monkeypatch.setattr(place, "put_new", lambda _, name, __: (_ for _ in ()).throw(StoreError(f"{name}: read-only")))
     for _ in range(2):
         build_dataset(tmp_path / "out", store=store.root, recipe=Recipe())
     assert "so the store does not know how this call ended" in caplog.text
