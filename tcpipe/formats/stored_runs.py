@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -146,21 +146,12 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
     place : ``runs/``. On disk each file is looked at; in a bucket there is one request for every thousand objects below it.
     rows : ingestions as the log has them.
     """
-    rows, find, root = list(rows), _stat, ""
-    if isinstance(place, DirectoryPlace):
-        root = f"{place.root}/"
-    else:
-        of_one = {row.run_id for row in rows}
-        found = place.entries(of_one.pop() if len(of_one) == 1 else "")
-        sizes = {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}
-
-        def find(name: str) -> tuple[int, int] | None:
-            return sizes.get(name)
-
+    rows = list(rows)
+    find = _find_on_disk(place.root) if isinstance(place, DirectoryPlace) else _find_listed(place, rows)
     for row in rows:
         states, lost = list[tuple[int, int]](), None
         for name, size_bytes in row.files.items():
-            seen = find(f"{root}{row.run_id}/{name}")
+            seen = find(f"{row.run_id}/{name}")
             if seen is None or seen[0] != size_bytes:
                 lost = Lost(place.where(f"{row.run_id}/{name}"), size_bytes, seen and seen[0])
                 break
@@ -168,12 +159,24 @@ def look_at_files(place: Place, rows: Iterable[RunFacts]) -> Iterator[tuple[RunF
         yield row, lost, "" if lost else " ".join(f"{size}-{time}" for size, time in states)
 
 
-def _stat(path: str) -> tuple[int, int] | None:
-    try:
-        seen = os.stat(path)  # noqa: PTH116  of ten thousands
-    except OSError:
-        return None
-    return seen.st_size, seen.st_mtime_ns
+def _find_on_disk(root: Path) -> Callable[[str], tuple[int, int] | None]:
+    """Return what tells the size [byte] and modification time [ns] of a file; None where there is none."""
+
+    def find(name: str) -> tuple[int, int] | None:
+        try:
+            seen = os.stat(f"{root}/{name}")  # noqa: PTH116  of ten thousands
+        except OSError:
+            return None
+        return seen.st_size, seen.st_mtime_ns
+
+    return find
+
+
+def _find_listed(place: Place, rows: Sequence[RunFacts]) -> Callable[[str], tuple[int, int] | None]:
+    """Return the same from a listing of the run, or of all."""
+    run_ids = {row.run_id for row in rows}
+    found = place.entries(run_ids.pop() if len(run_ids) == 1 else "") if rows else []
+    return {entry.name: (entry.size_bytes, entry.modified_ns) for entry in found}.get
 
 
 @lru_cache(maxsize=64)
