@@ -51,6 +51,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(with_body=True)
 
     def do_PUT(self) -> None:
+        self.server.fetched.requests += 1
         data = self.rfile.read(int(self.headers["Content-Length"]))
         bucket, _, name = unquote(urlsplit(self.path).path).lstrip("/").partition("/")
         path = self.server.root / bucket / name

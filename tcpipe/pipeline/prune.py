@@ -230,10 +230,20 @@ def _replaced(store: Store, state: State, min_age_s: float, unread: str | None) 
             why = unread
         except StoreError as error:
             named, why = set(), error.problems[0]
+        uncommitted = _uncommitted(numbers(entry.name for entry in entries), rows) if run_id else set()
+        for recipe_id in uncommitted:
+            left = [entry for entry in entries if entry.name.startswith(f"{recipe_id}/")]
+            yield "no commit names it", place, left, "ingest its log again, or remove it"
         young = {_folder(entry.name) for entry in entries if entry.modified_ns >= before_ns}
         content = [of for of in entries if stem_and_number(of.name) or _CONTENT.search(of.name)]
         over = [of for of in content if of.name not in named and _folder(of.name) not in young]
         yield "no document names it", place, over, why
+
+
+def _uncommitted(last: Mapping[str, int], rows: Sequence[RunFacts]) -> set[str]:
+    """Return the recipes of a run with a manifest and no commit."""
+    parted = (stem.partition("/") for stem in last)
+    return {recipe for recipe, _, kind in parted if kind == "manifest"} - {row.recipe_id for row in rows}
 
 
 def _named_in(place: Place, names: Sequence[str], rows: Sequence[RunFacts]) -> Iterator[str]:

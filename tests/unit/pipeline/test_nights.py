@@ -5,15 +5,19 @@ import os
 import shutil
 
 import pytest
+from object_gateway import in_environment
+from storage_server import object_store
 from wheel_drives import START_NS, drive_at, wheel_drive
 
 import tcpipe.pipeline.ingest_run as ingestion
 from tcpipe.errors import UsageError
 from tcpipe.formats.logs.writing import MessageStream, write_bag
 from tcpipe.formats.run_documents import LogOrigin, RunJson
+from tcpipe.pipeline import ingest as ingest_module
 from tcpipe.pipeline import ingest_task
 from tcpipe.pipeline.ingest import ingest
 from tcpipe.pipeline.inspect import inspect
+from tcpipe.pipeline.log_writer import LogWriter
 from tcpipe.pipeline.problems import acknowledge
 from tcpipe.pipeline.status import status
 from tcpipe.pipeline.verify import verify
@@ -239,6 +243,64 @@ def test_what_is_there_already_needs_no_worker_and_no_reader(tmp_path, night, mo
     found, code = night(jobs=8)
     assert code == 0
     assert [result.status for result in found.values()] == ["failed", "unchanged", "unchanged"]
+
+
+class _Killed(BaseException):
+    pass
+
+
+def test_after_a_kill_between_manifest_and_commit_the_run_is_found_and_not_fused_again(tmp_path, night, monkeypatch):
+    real = LogWriter.commit
+
+    def killed(self, kind, entries):
+        if kind == "ingested":
+            raise _Killed
+        real(self, kind, entries)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LogWriter, "commit", killed)
+        with pytest.raises(_Killed):
+            night()
+    assert counted(tmp_path) == set()
+    assert any("no commit names it" in line for line in verify(tmp_path / "store").problems)
+    monkeypatch.setattr(ingestion, "_fuse_and_label", lambda *_: pytest.fail("it is fused again"))
+    assert night()[0]["other.mcap"].status == "done"
+    assert len(counted(tmp_path)) == 1
+    assert verify(tmp_path / "store").problems == ()
+
+
+def test_of_two_calls_that_ingest_one_recording_under_two_names_the_first_commit_wins(tmp_path, night, monkeypatch):
+    shutil.copy(drive_at(tmp_path / "elsewhere" / "first.mcap", seed=7), tmp_path / "logs" / "second.mcap")
+    real = ingest_module._entries_of
+
+    def meanwhile(log, task, of):
+        if of.result.log.endswith("second.mcap") and of.rows:
+            monkeypatch.setattr(ingest_module, "_entries_of", real)
+            ingest([tmp_path / "elsewhere"], store=tmp_path / "store", recipe=Recipe())
+        return real(log, task, of)
+
+    monkeypatch.setattr(ingest_module, "_entries_of", meanwhile)
+    found, code = night()
+    assert (found["second.mcap"].status, found["second.mcap"].transient, code) == ("failed", True, 3)
+    assert "another call ingested the same recording as run first-" in found["second.mcap"].problems[0]
+    found, code = night()
+    assert (found["second.mcap"].status, code) == ("unchanged", 0)
+    assert str(found["second.mcap"].run_id).startswith("first-")
+
+
+def test_a_night_with_nothing_new_asks_a_bucket_the_same_however_many_runs_there_are(tmp_path, monkeypatch):
+    (tmp_path / "served" / "tests").mkdir(parents=True)
+    counts = []
+    with object_store(tmp_path / "served") as (environment, fetched):
+        in_environment(monkeypatch, environment, tmp_path / "cache")
+        for number in range(3):
+            drive_at(tmp_path / "logs" / f"{number}.mcap", seed=number, start_ns=START_NS + number * 10**13)
+            ingest([tmp_path / "logs"], store="s3://tests/store", recipe=Recipe())
+            fetched.requests = 0
+            summary = ingest([tmp_path / "logs"], store="s3://tests/store", recipe=Recipe())
+            assert {result.status for result in summary.results} == {"unchanged"}
+            counts.append(fetched.requests - Store("s3://tests/store").state().number)
+    assert len(set(counts)) == 1, "what is beyond one request for each commit that no snapshot has"
 
 
 # --- names ----------------------------------------------------------------------------------------------------------
