@@ -19,13 +19,12 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
-import msgspec
 import pyarrow as pa
 
 from tcpipe.errors import StoreError
 from tcpipe.formats.bucket import side_by_side
 from tcpipe.formats.commits import Commit, Entries, Kind, Problem, Process, State, compact, fold
-from tcpipe.formats.json_files import of_json, parse_json, to_json, to_json_line, typed
+from tcpipe.formats.json_files import compact_json, of_json, parse_json, to_json, typed
 from tcpipe.formats.place import Place
 from tcpipe.formats.seals import SEAL, proved, sealed
 from tcpipe.tables.findings import Subject, make_finding
@@ -188,10 +187,7 @@ def _list_snapshots(log: Place) -> list[str]:
 
 def _encode_snapshot(state: State, stamp: Stamp) -> bytes:
     commit = Commit(state.number, state.digest, "snapshot", stamp.who, stamp.at, compact(state))
-    try:
-        text = msgspec.json.encode(commit)
-    except UnicodeEncodeError:  # the name of a file is no text
-        text = to_json_line(commit).encode()
+    text = compact_json(commit)
     sink = pa.BufferOutputStream()
     with pa.CompressedOutputStream(sink, "zstd") as stream:
         stream.write(hashlib.sha256(text).hexdigest().encode() + b"\n" + text)

@@ -160,7 +160,7 @@ _SCHEMA = pa.schema({
 def write_index(place: Place, rows: Iterable[RunFacts]) -> None:
     """Write ``runs.parquet``, unless that cannot be: it is written again after the next commit."""
     rows = list(rows)
-    columns = [column_of([_cell(row, of.name) for row in rows], of.type) for of in _SCHEMA]
+    columns = [_column([_cell(row, of.name) for row in rows], of.type) for of in _SCHEMA]
     table = pa.table(columns, schema=_SCHEMA.with_metadata({_ABOUT: _VERSION}))
     with suppress(StoreError), place.workshop() as directory:
         write_table(table, directory / RUNS)
@@ -168,18 +168,24 @@ def write_index(place: Place, rows: Iterable[RunFacts]) -> None:
 
 
 def _cell(row: RunFacts, name: str) -> object:
-    """Return a value as Arrow takes it: names of files that are no text with escapes."""
     value = getattr(row, name)
-    if name == "log":
-        value = value and {"source": {of: _text(getattr(value.source, of)) for of in ("paths", "sha256", "size_bytes")}}
-    elif name == "tags":
-        return {_text(key): _text(of) for key, of in value.items()}
-    elif name == "warnings":
-        value = list(map(str, value))
-    return _text(value)
+    if name == "log" and value is not None:
+        source = value.source
+        return {"source": {"paths": source.paths, "sha256": source.sha256, "size_bytes": source.size_bytes}}
+    return list(map(str, value)) if name == "warnings" else value
+
+
+def _column(values: list[object], kind: pa.DataType) -> pa.Array:
+    """Return values as Arrow takes them: names of files that are no text with escapes."""
+    try:
+        return column_of(values, kind)
+    except UnicodeEncodeError:
+        return column_of([_text(value) for value in values], kind)
 
 
 def _text(value: object) -> object:
     if isinstance(value, str):
-        return value if value.isascii() else value.encode("utf-8", "backslashreplace").decode()
-    return [_text(of) for of in value] if isinstance(value, tuple) else value
+        return value.encode("utf-8", "backslashreplace").decode()
+    if isinstance(value, Mapping):
+        return {str(_text(key)): _text(of) for key, of in value.items()}
+    return [_text(of) for of in value] if isinstance(value, tuple | list) else value

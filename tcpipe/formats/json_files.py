@@ -57,6 +57,14 @@ def recast(record: object, cls: Callable[..., T], **more: object) -> T:
     return cls(**(known | more))
 
 
+def compact_json(value: object) -> bytes:
+    """Return the JSON of dataclasses whose numbers are finite, for `of_json`, in a tenth of the time of `to_json_line`."""
+    try:
+        return msgspec.json.encode(value)
+    except UnicodeEncodeError:  # the name of a file is no text
+        return to_json_line(value).encode()
+
+
 def to_json(value: Any) -> str:
     """Return canonical JSON text: sorted keys, two-space indent, final newline; file names that are no text as escapes."""
     text = json.dumps(plain(value), sort_keys=True, indent=2, ensure_ascii=False, allow_nan=False) + "\n"

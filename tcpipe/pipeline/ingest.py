@@ -16,12 +16,13 @@ from tcpipe import __version__
 from tcpipe.errors import LogError, StoreError, UsageError, plain_line
 from tcpipe.execution import run_all
 from tcpipe.formats.atomic import scratch_directory
-from tcpipe.formats.commit_log import keep_state_here
+from tcpipe.formats.commit_log import keep_state_here, uncollected
 from tcpipe.formats.commits import Call, Entries, Failure, Kind, State
 from tcpipe.formats.object_storage import is_presigned, is_url
 from tcpipe.formats.recipe_toml import ingest_key, recipe_of
 from tcpipe.formats.robot_files import profiles_of
 from tcpipe.formats.store_mark import gone_if_empty
+from tcpipe.formats.stored_runs import look_at_files
 from tcpipe.pipeline.begun_calls import begun_call, new_call, settled_calls
 from tcpipe.pipeline.calls import INGEST, measure_call, room_of, started
 from tcpipe.pipeline.ingest_run import Ingested, find_twin, ingest_one
@@ -157,7 +158,9 @@ def ingest(
         if on_found:
             sizes = {task.source.name: sum(size for size, _ in task.source.files) for task in tasks}
             on_found({**dict.fromkeys(map(plain_line, found.problems), 0), **sizes})
-        steps, results = plan(tasks, log.state, broken=find_broken(opened, log.state)), {}
+        with uncollected():
+            steps = plan(tasks, log.state, broken=find_broken(opened, log.state, tasks))
+        results: dict[int, IngestResult] = {}
 
         def tell(ended: Iterable[tuple[int, IngestResult]]) -> IngestSummary:
             for index, result in ended:
@@ -166,7 +169,8 @@ def ingest(
                     on_result(result)
             return IngestSummary(opened.root, tuple(results[index] for index in sorted(results)))
 
-        summary = tell(_results_without_work(log, found, steps))
+        with uncollected():
+            summary = tell(_results_without_work(log, found, steps))
         work = {index: step.task for index, step in enumerate(steps) if step.is_todo}
         begin = (INGEST, given, (ingest_key(ruling), robot, shard))
         if work:
@@ -185,9 +189,16 @@ def _in_full(logs: Iterable[str | Path]) -> tuple[str, ...]:
     return tuple(str(of) if is_url(of) else str(Path(of).absolute()) for of in logs if not is_presigned(of))
 
 
-def find_broken(store: Store, state: State) -> set[tuple[str, str]]:
-    """Return the runs and recipes of which a file is gone; in a bucket nobody looks, as that takes a request for every thousand files."""
-    return set() if isinstance(store.root, str) else set(store.ingestions(state=state).lost)
+def find_broken(store: Store, state: State, tasks: Iterable[IngestTask]) -> set[tuple[str, str]]:
+    """Return the ingestions of these logs of which a file is gone.
+
+    In a bucket nobody looks, as that takes a request for every thousand files.
+    """
+    if isinstance(store.root, str):
+        return set()
+    contents = {task.source.sha256 for task in tasks} - {None}
+    rows = [row for row in state.runs.values() if row.log and row.log.source.sha256 in contents]
+    return {(row.run_id, row.recipe_id) for row, lost, _ in look_at_files(store.runs_place, rows) if lost}
 
 
 def _call_of(

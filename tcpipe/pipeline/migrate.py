@@ -115,7 +115,7 @@ def _one(path: Path, document: Path) -> Migrated:
 def _bring_card(path: Path) -> bool:
     """Bring a dataset's card to this data model; return False where it was."""
     found = read_sealed(path)
-    document = bring_document(found, str(path))
+    document = _bring_document(found, str(path))
     if document is found:
         return False
     write_sealed(path, document)
@@ -171,14 +171,14 @@ def _bring(place: Place, name: str) -> bytes:
     """Return a document of a run as this data model has it; `StoreError` where it is damaged or of no data model that is known."""
     where, kind = place.where(name), name.rpartition("/")[2].partition("-")[0]
     found = read_sealed_at(place, name)
-    document = bring_document(found, where) if kind == "manifest" else bring_run(found) if kind == "run" else found
+    document = _bring_document(found, where) if kind == "manifest" else _bring_run(found) if kind == "run" else found
     if document is found:
         return place.read(name) or b""
     typed(document, Manifest if kind == "manifest" else RunJson, where)
     return to_json(sealed(document)).encode()
 
 
-def bring_run(found: Document) -> Document:
+def _bring_run(found: Document) -> Document:
     """Return what is known of a log, with ``findings`` as ``report``."""
     return (
         {**_without(found, "findings"), "report": _report(found["findings"], "run", "")}
@@ -187,7 +187,7 @@ def bring_run(found: Document) -> Document:
     )
 
 
-def bring_document(found: Document, where: str) -> Document:
+def _bring_document(found: Document, where: str) -> Document:
     """Return a manifest or card of this data model; `StoreError` where it is of none that is known."""
     version = found.get("data_model_version", "")
     if version == DATA_MODEL_VERSION:

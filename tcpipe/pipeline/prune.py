@@ -222,9 +222,12 @@ def _replaced(store: Store, state: State, min_age_s: float, unread: str | None) 
     that are whole and that no commit names, since ingesting the log again finds them.
     """
     before_ns = time.time_ns() - int(min_age_s * 1e9)
+    by_run: dict[str, list[RunFacts]] = {}
+    for row in state.runs.values():
+        by_run.setdefault(row.run_id, []).append(row)
     for run_id in (None, *store.run_ids()):
         place = store.place.below("maps") if run_id is None else store.runs_place.below(run_id)
-        entries, rows = place.entries(), [] if run_id is None else state.rows_of(run_id)
+        entries, rows = place.entries(), by_run.get(run_id or "", [])
         try:
             named = set(_named_in(place, [entry.name for entry in entries], rows))
             why = unread

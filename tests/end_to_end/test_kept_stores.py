@@ -21,10 +21,11 @@ from tcpipe.formats.json_files import to_json
 from tcpipe.formats.maps.map_files import open_map
 from tcpipe.formats.place import DirectoryPlace
 from tcpipe.formats.seals import sealed, write_sealed
+from tcpipe.pipeline import migrate as migrating
 from tcpipe.pipeline.dataset.build import build_dataset
 from tcpipe.pipeline.explain import explain
 from tcpipe.pipeline.inspect import inspect
-from tcpipe.pipeline.migrate import bring_document, migrate
+from tcpipe.pipeline.migrate import migrate
 from tcpipe.pipeline.report import report
 from tcpipe.pipeline.verify import verify
 from tcpipe.recipe import Recipe
@@ -167,24 +168,24 @@ def test_sentences_of_manifests_and_cards_become_findings():
         "data_model_version": "2.1", "run_id": "a", "warnings": list(WARNED),
         "info": {"findings": {"warnings": [], "facts": {"n": 1}}, "datum": None},
     }  # fmt: skip
-    brought = bring_document(manifest, "manifest-1.json")
+    brought = migrating._bring_document(manifest, "manifest-1.json")
     assert (brought["data_model_version"], brought["info"]["report"]["facts"]) == (DATA_MODEL_VERSION, {"n": 1})
     assert [
         (of["code"], of["subject"]["name"], of["names"]["text"]) for of in brought["info"]["report"]["findings"]
     ] == [("earlier-warning", "a", line) for line in WARNED]
     assert brought["verdict"]["position"] == "usable", "a note changes no verdict"
-    assert bring_document(brought, "manifest-1.json") is brought
+    assert migrating._bring_document(brought, "manifest-1.json") is brought
     card = {
         "data_model_version": "2.2", "name": "d", "problems": [WARNED[0]], "warnings": [WARNED[1]], "findings": [{"example": "x"}],
         "runs": [{"run_id": "a", "warnings": list(WARNED)}], "maps": [{"name": "m", "warnings": []}],
     }  # fmt: skip
-    brought = bring_document(card, "dataset.json")
+    brought = migrating._bring_document(card, "dataset.json")
     assert [of["names"]["text"] for of in brought["findings"]] == list(WARNED)
     assert ([len(of["findings"]) for of in brought["runs"]], brought["maps"]) == ([2], [{"name": "m", "findings": []}])
     with pytest.raises(
         StoreError, match=r"of data model 4\.0, this version knows 2\.0, 2\.1, 2\.2, 3\.0; left as it is"
     ):
-        bring_document({"data_model_version": "4.0"}, "dataset.json")
+        migrating._bring_document({"data_model_version": "4.0"}, "dataset.json")
 
 
 def test_what_is_remembered_becomes_commits(untouched):
